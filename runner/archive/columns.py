@@ -74,6 +74,7 @@ class Shape:
             *(table(layout.ARRAYS, "/array"), table(layout.FRAMES, "/train/frame", "/eval/frame"), log),
             table(layout.EXTRA_COLUMNS, "/extra"),
             *((table(layout.EXTRAS, "/train/extra", "/eval/extra"),) if self.extras else ()),
+            table(layout.RESET_STATES, "/train/reset_state", "/eval/reset_state"),
         )
 
     def schema_of(self, message: MessageType) -> pa.Schema:

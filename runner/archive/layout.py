@@ -12,7 +12,8 @@
     <run id>/arrays.parquet          the recorded arrays,
     <run id>/frames.parquet          the pictures,
     <run id>/extra_columns.parquet   the names of the values that the loop recorded with its steps,
-    <run id>/extras.parquet          and these values
+    <run id>/extras.parquet          these values,
+    <run id>/reset_states.parquet    and what resets without a seed depend on
     <run id>/log.parquet             lines of text
     <run id>/run.parquet             one row: what the run is, its configuration and provenance
     <run id>/transitions.parquet     the environment's possible outcomes, with their events
@@ -58,6 +59,7 @@ ARRAYS: Final = "arrays.parquet"
 FRAMES: Final = "frames.parquet"
 EXTRA_COLUMNS: Final = "extra_columns.parquet"
 EXTRAS: Final = "extras.parquet"
+RESET_STATES: Final = "reset_states.parquet"
 LOG: Final = "log.parquet"
 RUN: Final = "run.parquet"
 TRANSITIONS: Final = "transitions.parquet"
@@ -106,11 +108,17 @@ SCHEMAS: Final = {
         ]
     ),
     EXTRA_COLUMNS: pa.schema([*_PLACED, ("json", pa.string())]),
+    RESET_STATES: pa.schema(
+        [
+            *(*PLACED_IN_PHASE, ("reset", pa.int64()), ("environment", pa.int32())),
+            *((name, pa.binary()) for name in ("np_random_seed", "bit_generator", "ale_state")),
+        ]
+    ),
     FRAMES: pa.schema([*PLACED_IN_PHASE, ("format", pa.string()), ("data", pa.binary())]),
 }
 """The columns of the tables that are the same in every archive."""
 
-LEFT_OUT_IF_EMPTY: Final = frozenset({EXTRA_COLUMNS, EXTRAS})
+LEFT_OUT_IF_EMPTY: Final = frozenset({EXTRA_COLUMNS, EXTRAS, RESET_STATES})
 """The tables that an archive need not have."""
 EXTRA_PREFIX: Final = "extra_"
 _MAY_BE_NULL: Final = frozenset({"data", "seed"})

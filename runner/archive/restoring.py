@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import pyarrow as pa
 from blake3 import blake3
 
 from runner.archive import layout
@@ -205,7 +206,8 @@ class _Restorer:
     def _rows(self, table: Table) -> Iterator[dict[str, Any]]:
         """Yield the rows of a table."""
         limit = BLOCK_BYTES // layout.row_bytes(table.columns)
-        n = 1 if "data" in table.columns.names else max(1, min(limit, _ROWS_AT_ONCE))
+        has_bytes = any(map(pa.types.is_binary, table.columns.types))
+        n = 1 if has_bytes else max(1, min(limit, _ROWS_AT_ONCE))
         for batch in self._archive.batches(table.name, table.columns, self._archive.count(*table.topics), n):
             yield from batch.to_pylist()
 

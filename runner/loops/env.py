@@ -7,6 +7,7 @@ import os
 import sys
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Generic, Literal, Self
 
 import gymnasium
@@ -14,6 +15,7 @@ from gymnasium.vector import VectorEnv
 
 from runner.errors import ConfigError
 from runner.loops.description import describe
+from runner.loops.generators import GeneratorWatch
 from runner.loops.loop import Loop, R, check_phase
 from runner.loops.makers import checked_make, maker_of
 from runner.loops.messages import Messages
@@ -178,11 +180,13 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
         self._env_step = env.step
         self._has_messages = bool(loop.options.info or loop.options.frames_every)
         self._until_frame = 0
+        self._watch = GeneratorWatch(env)
         self._record_into(loop, is_owner=owner is None)
         self._enter(phase)
 
     def _enter(self, phase: str) -> None:
         super()._enter(phase)
+        self._watch.due = 0
         self._take, self._take_extras = self._rows.take, self._loop.extras.take
         self._lock = self._loop.lock
 
@@ -210,11 +214,15 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Reset the environment, and record it: the seed, the options, the observation."""
         before = dict(options) if options else None  # the environment may change them
+        state = self._watch.before(self._rows.place[0]) if seed is None else None
         result = self.env.reset(**given(seed=seed, options=options))
+        state = self._watch.after(state, seed)
         observation, info = result
         with self._lock:
             self._loop.activate(self._rows)
             self._rows.reset(observation, seed)
+            if state is not None:
+                self._messages.reset_state(self._phase, replace(state, reset=self._rows.resets - 1))
         self._messages.reset_info(self._phase, info, before, seed)
         if self._options.frames_every:
             self._until_frame = self._options.frames_every

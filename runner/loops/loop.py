@@ -45,6 +45,8 @@ class _IgnoredRows:
 
     filled = 0
     place = (0, 0)
+    resets = 0
+    is_any_over = False
 
     def ignore(self, *_: object) -> None:
         """Do nothing."""

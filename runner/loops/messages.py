@@ -19,6 +19,7 @@ from runner.loops.values import MAX_ARRAY_BYTES, arrays_of, check_log_name, logg
 from runner.recording import schema
 from runner.recording.messages import encode, encode_image, encode_log, scalar_encoder
 from runner.recording.recorder import Recorder
+from runner.recording.reset_states import ResetState
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.util.jsonable import as_json
 from runner.util.values import is_utf8
@@ -199,6 +200,13 @@ class Messages:
             size += len(text)
             pieces.append(f"{json.dumps(str(key))}: {text}")
         return "{" + ", ".join(pieces) + "}"
+
+    def reset_state(self, phase: str, state: ResetState) -> None:
+        """Record what a reset depended on, of the reset that was just put down."""
+        with self._loop.lock:
+            if self._loop.records():
+                topic = self._topics[f"/{phase}/reset_state"]
+                self._recorder.append(topic, state.to_payload(), self._loop.position)
 
     def frame(self, phase: str, image: Any) -> None:
         """Record a picture, [height, width, 3] of uint8; another thread encodes it.

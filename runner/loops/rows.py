@@ -108,6 +108,11 @@ class Rows:
         """Put down a step."""
         raise NotImplementedError
 
+    @property
+    def resets(self) -> int:
+        """The number of resets so far."""
+        return self._reset_count + len(self._reset_rows)
+
     def reset(self, observation: Any, seed: int | None) -> None:
         """Put down a reset; it ends an episode in progress, neither terminated nor truncated."""
         if not self._fresh:

@@ -249,6 +249,11 @@ class VariableRows(Rows):
         return _VARIABLE_ROWS, _VARIABLE_ROWS
 
     @property
+    def resets(self) -> int:
+        """The number of resets so far."""
+        return self._reset_count
+
+    @property
     def _coming_episode(self) -> int:
         """The number of the episode that the next step belongs to."""
         return self._episode + len(self._begins) + self._fresh

@@ -19,6 +19,7 @@ from runner.environments.mdp import MAX_AGENTS
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, describe, kind_of
 from runner.loops.env import Recorded, given
+from runner.loops.generators import GeneratorWatch, VectorWatch
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, game_maker_of, vector_maker_of
 from runner.loops.options import options_of
@@ -31,9 +32,12 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
 
     env: VectorEnv[Any, Any, Any]
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], loop: Loop[VectorRows], mode: AutoresetMode) -> None:
+    def __init__(
+        self, env: VectorEnv[Any, Any, Any], loop: Loop[VectorRows], mode: AutoresetMode, watch: VectorWatch
+    ) -> None:
         VectorWrapper.__init__(self, env)
         self._has_finals = mode == AutoresetMode.SAME_STEP
+        self._watch = watch
         self._record_into(loop)
         self._phase, self._rows = "train", loop.rows("train")
 
@@ -42,18 +46,24 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
             over = self._rows.over
             super()._enter(phase)
             self._rows.over = over  # the environments are the same ones
+            self._watch.phase_began()
 
     def step(
         self, actions: Any, extras: Mapping[str, Any] | None = None
     ) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Take a step in every environment, and record it, with arrays [N, ...] of your own by name."""
+        watch = self._watch
+        watch.steps += 1
+        states = None
+        if watch.steps > watch.due and self._rows.is_any_over:
+            states = watch.before_step(self._rows.over)
         result = self.env.step(actions)
         observations, rewards, terminated, truncated, infos = result
         final = _final_observations(infos) if self._has_finals else None
         with self._loop.lock:
             if self._loop.active is not self._rows:
                 self._loop.activate(self._rows)
-            self._rows.take(actions, observations, rewards, terminated, truncated, final)
+            self._rows.take(actions, observations, rewards, terminated, truncated, final, states)
             if extras is not None:
                 self._loop.extras.take(self._phase, self._rows, extras)
         if self._options.info:
@@ -67,11 +77,13 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
         n, others = self.env.num_envs, dict(options) if options else {}
         mask = others.pop("reset_mask", None)
         which = np.ones(n, np.bool_) if mask is None else np.array(mask, np.bool_)
-        result = self.env.reset(**given(seed=seed, options=options))
         seeds = [seed + i for i in range(n)] if isinstance(seed, int) else list(seed or ())
+        states = self._watch.before_reset(which, seeds)
+        result = self.env.reset(**given(seed=seed, options=options))
+        states = self._watch.after_reset(states, which, seeds)
         with self._loop.lock:
             self._loop.activate(self._rows)
-            self._rows.reset(result[0], seeds, which)
+            self._rows.reset(result[0], seeds, which, states)
         self._messages.reset_info(self._phase, _by_environment(result[1]), others, None)
         return result
 
@@ -122,9 +134,11 @@ def record_vector(
         described = _described_vector(envs, first)
         _require_fixed(described)
         maker = vector_maker_of(envs, first, mode, checked_make(make))
+        watch = VectorWatch(envs, first, mode)
     options = options_of(recordings, name, seed, config, info, packing)
     rows = partial(VectorRows, next_step=mode == AutoresetMode.NEXT_STEP)
-    return RecordedVector(envs, Loop(described, options, maker, rows, (described.environments,)), mode)
+    loop = Loop(described, options, maker, rows, (described.environments,))
+    return RecordedVector(envs, loop, mode, watch)
 
 
 def _autoreset_mode(envs: VectorEnv[Any, Any, Any], chosen: AutoresetMode | str | None) -> AutoresetMode:
@@ -207,8 +221,13 @@ class RecordedParallel(Recorded[AgentRows]):
 
     def __init__(self, env: Any, loop: Loop[AgentRows]) -> None:
         self.env = env
+        self._watch = GeneratorWatch(env)
         self._record_into(loop)
         self._enter("train")
+
+    def _enter(self, phase: str) -> None:
+        super()._enter(phase)
+        self._watch.due = 0
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_") or name == "env":
@@ -249,10 +268,14 @@ class RecordedParallel(Recorded[AgentRows]):
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
         """Reset the environment, and record it."""
+        state = self._watch.before(self._rows.place[0]) if seed is None else None
         result = self.env.reset(**given(seed=seed, options=options))
+        state = self._watch.after(state, seed)
         with self._loop.lock:
             self._loop.activate(self._rows)
             self._rows.reset(result[0], seed)
+            if state is not None:
+                self._messages.reset_state(self._phase, replace(state, reset=self._rows.resets - 1))
         self._messages.reset_info(self._phase, _by_field(result[1]), options, seed)
         return result  # type: ignore[no-any-return]
 

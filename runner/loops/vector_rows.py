@@ -8,20 +8,24 @@ episodes, the resets that environments do by themselves) is computed for a block
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.loops.description import Described
+from runner.loops.generators import States
 from runner.loops.rows import MAX_SEED
 from runner.loops.values import require_reset, warn_user
 from runner.recording import schema
 from runner.recording.gym_values import filler, leaves_of, put_chosen
 from runner.recording.recorder import Recorder
+from runner.recording.reset_states import ResetState
 from runner.recording.schema import Topic
 
 Flags = NDArray[np.bool_]
+_TRUE: Final = b"\1"
 _MAX_STEPS: Final = 2048
 """The most steps of the vector environment in a block; fewer if the recorder's blocks hold fewer records."""
 
@@ -34,6 +38,8 @@ class _Reset(NamedTuple):
     which: NDArray[np.intp]
     observation: NDArray[Any]
     seeds: Sequence[int | None]
+    states: States
+    """What it depended on, where that is to be recorded."""
 
 
 class _Counts(NamedTuple):
@@ -79,6 +85,7 @@ class VectorRows:
         self._steps = topics[f"/{phase}/step"]
         self._episodes = topics[f"/{phase}/episode"]
         self._resets = topics[f"/{phase}/reset"]
+        self._reset_states = topics[f"/{phase}/reset_state"]
         self._discrete = described.kind == "step"
         self._next_step = next_step
         self._state_start, self._action_start = (
@@ -102,6 +109,8 @@ class VectorRows:
         self._block_resets: list[_Reset] = []
         self._finals: list[tuple[int, NDArray[np.intp], NDArray[Any]]] = []
         """Rows whose observations are of the next episodes; environments, and the last ones of the ended."""
+        self._autoreset_states: dict[int, States] = {}
+        """Rows with resets in place of steps, and what those depended on."""
         self._counted, self._ended_here = 0, 0
         """Rows of the block of which `place` has counted the ends of episodes, and those ends."""
         self.reshape(described)
@@ -143,6 +152,14 @@ class VectorRows:
         return self._recorder.steps[self._phase] + self.filled, self._ended + self._ended_here
 
     @property
+    def is_any_over(self) -> bool:
+        """Whether `over` may be true of an environment; this takes less time."""
+        row = self._filled - 1
+        if row < 0:
+            return bool(self._over.any())
+        return _TRUE in self._terminated[row].tobytes() or _TRUE in self._truncated[row].tobytes()
+
+    @property
     def over(self) -> Flags:
         """[N]: the environments whose episode ended with the last step and that were not reset since."""
         if not self._filled:
@@ -159,7 +176,14 @@ class VectorRows:
         self._over = over
 
     def take(
-        self, actions: Any, observations: Any, rewards: Any, terminated: Any, truncated: Any, final: Any
+        self,
+        actions: Any,
+        observations: Any,
+        rewards: Any,
+        terminated: Any,
+        truncated: Any,
+        final: Any,
+        states: States | None = None,
     ) -> None:
         """Record a step of all environments.
 
@@ -171,6 +195,7 @@ class VectorRows:
             truncated: [N].
             final: the last observations of episodes that ended, where `observations` are already of the
                 next ones; None where they are not.
+            states: what the resets in place of steps depended on, if it is to be recorded.
         """
         if not self._room:
             self._first_action(actions)
@@ -192,20 +217,29 @@ class VectorRows:
             put_chosen(self._observation_leaves, final, last, which)
             self._finals.append((row, which, last[which]))
             after = self._observations[row, which]
-            self._block_resets.append(_Reset(row + 1, which, after, [None] * len(which)))
+            self._block_resets.append(_Reset(row + 1, which, after, [None] * len(which), {}))
+        if states:
+            self._autoreset_states[row] = states
         self._filled = row + 1
         if self._filled == self._room:
             self.commit()
 
-    def reset(self, observation: Any, seeds: Sequence[int | None], which: Flags) -> None:
-        """Record a reset of some environments; it ends episodes in progress in them."""
+    def reset(self, observation: Any, seeds: Sequence[int | None], which: Flags, states: States) -> None:
+        """Record a reset of some environments; it ends episodes in progress in them.
+
+        Args:
+            observation: batched.
+            seeds: of all environments; empty for none.
+            which: [N], the environments.
+            states: what the reset depended on, if it is to be recorded.
+        """
         chosen = np.flatnonzero(which)
         own = [seeds[i] if len(seeds) else None for i in chosen.tolist()]
         now = np.zeros(self._n, self._observation_dtype)
         filler(self._observation_leaves, now[np.newaxis], (self._n,))(0, observation)
         over = self.over
         if self._filled and over[chosen].all():
-            self._block_resets.append(_Reset(self._filled, chosen, now[chosen], own))
+            self._block_resets.append(_Reset(self._filled, chosen, now[chosen], own, states))
             return
         self.commit()
         self._abandon(chosen)
@@ -213,7 +247,8 @@ class VectorRows:
         if self._discrete:
             self._state[chosen] = now[chosen].astype(np.int64) - self._state_start
         steps = np.full(len(chosen), self._recorder.steps[self._phase])
-        self._put_resets(chosen, now[chosen], own, self._episode[chosen], steps)
+        own_states = [states.get(i) for i in chosen.tolist()]
+        self._put_resets(chosen, now[chosen], own, self._episode[chosen], steps, own_states)
 
     def _abandon(self, which: NDArray[np.intp]) -> None:
         """End the episodes in progress of these environments, neither terminated nor truncated."""
@@ -253,7 +288,7 @@ class VectorRows:
         self._return = np.where(ended, 0.0, counts.returns[-1])
         self._over = over_after
         self._filled = self._counted = self._ended_here = 0
-        self._block_resets, self._finals = [], []
+        self._block_resets, self._finals, self._autoreset_states = [], [], {}
 
     def _count(self) -> _Counts:
         rows, n = self._filled, self._n
@@ -329,20 +364,33 @@ class VectorRows:
         # NEXT_STEP: resets in place of a step come after those that the user called before it.
         only_rows, only = np.nonzero(counts.only_reset)
         observed = self._observations[only_rows, only]
-        resets = [*self._block_resets, _Reset(0, only, observed, [None] * len(only))]
+        resets = [*self._block_resets, _Reset(0, only, observed, [None] * len(only), {})]
         rows = np.concatenate(
             [*(np.full(len(reset.which), reset.row) for reset in self._block_resets), only_rows]
         )
         order = np.argsort(rows, kind="stable")
         which = np.concatenate([reset.which for reset in resets])[order]
         seeds = [seed for reset in resets for seed in reset.seeds]
+        states = self._states_of(only_rows, only)
         self._put_resets(
             which,
             np.concatenate([reset.observation for reset in resets])[order],
             [seeds[i] for i in order.tolist()],
             self._episode[which] + counts.ended_before[rows[order], which],
             first + rows[order] * self._n,
+            [states[i] for i in order.tolist()] if states else (),
         )
+
+    def _states_of(self, only_rows: NDArray[np.intp], only: NDArray[np.intp]) -> list[ResetState | None]:
+        """Return what each reset of the block depended on, in the order of `_put_block_resets`.
+
+        The list is empty if nothing of it is to be recorded.
+        """
+        if not self._autoreset_states and not any(reset.states for reset in self._block_resets):
+            return []
+        called = [reset.states.get(i) for reset in self._block_resets for i in reset.which.tolist()]
+        alone = zip(only_rows.tolist(), only.tolist(), strict=True)
+        return called + [self._autoreset_states.get(row, {}).get(i) for row, i in alone]
 
     def _put_ends(
         self,
@@ -371,6 +419,7 @@ class VectorRows:
         seeds: Sequence[int | None],
         episode: NDArray[Any],
         steps: NDArray[Any],
+        states: Sequence[ResetState | None] = (),
     ) -> None:
         """Record resets in their order; `steps` are the steps of the phase before each."""
         valid = [seed if seed is not None and 0 <= seed <= MAX_SEED else None for seed in seeds]
@@ -384,6 +433,11 @@ class VectorRows:
             "seeded": np.array([seed is not None for seed in valid], np.bool_),
         }
         self._record(self._resets, columns, steps)
+        other = sum(self._recorder.steps.values()) - self._recorder.steps[self._phase]
+        for k, state in enumerate(states):
+            if state is not None:
+                payload = replace(state, reset=self._reset_count + k).to_payload()
+                self._recorder.append(self._reset_states, payload, other + int(steps[k]))
         self._reset_count += len(which)
 
     def _record(self, topic: Topic, columns: Mapping[str, NDArray[Any]], steps: NDArray[Any]) -> None:

@@ -8,6 +8,7 @@ the last reset with a seed, at or before its own reset.
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -30,17 +31,17 @@ _PCG64: Final = struct.Struct("<16s16sII")
 class ResetState:
     """What one reset without a seed depends on.
 
-    To repeat the episode that begins with it: set `bit_generator` and the ALE's state, as far as they are
-    there, and call `reset()` without a seed. If neither is there, call `reset(seed=np_random_seed)`.
+    To repeat the episode that begins with it, call `reset(seed=np_random_seed)` if that is there; otherwise
+    set `bit_generator` and `ale_state`, as far as they are there, and call `reset()`.
     """
 
-    reset: int
+    reset: int = -1
     """The number of the reset in its phase, as in `dualtaxi.Reset`."""
-    environment: int
+    environment: int = 0
     """Which environment of a vector; 0 for a generator that all environments share."""
     np_random_seed: int | None = None
-    """The seed that the reset drew for the environment's generator; None if it drew none."""
-    bit_generator: dict[str, Any] | None = None
+    """The seed of the generator that the reset made, drawn by NumPy; None if it made none."""
+    bit_generator: Mapping[str, Any] | None = None
     """The state of `unwrapped.np_random` before the reset, as `numpy.random.PCG64.state` takes it."""
     ale_state: bytes = b""
     """The state of an Atari environment's emulator before the reset, as `ale_py.ALEState` takes it, with its
@@ -62,7 +63,7 @@ class ResetState:
         )
 
 
-def packed_generator(state: dict[str, Any]) -> bytes:
+def packed_generator(state: Mapping[str, Any]) -> bytes:
     """Return the state of a PCG64 as bytes."""
     inner = state["state"]
     return _PCG64.pack(

@@ -142,6 +142,8 @@ _MESSAGES: Final = {
     "/train/extra": "steps with extras",
     "/eval/extra": "evaluation steps with extras",
     "/checkpoint": "checkpoints",
+    "/train/reset_state": "states before resets",
+    "/eval/reset_state": "states before evaluation resets",
 }
 
 

@@ -168,6 +168,20 @@ def test_every_table_is_read_by_others(loop):
         assert duckdb.execute(f"SELECT count(*) FROM '{file}'").fetchall() == [(expected,)]
 
 
+def test_states_before_resets_are_restored(tmp_path):
+    with runner.record(make("CartPole-v1"), tmp_path) as rec:
+        rec.reset()
+        for _ in range(1200):
+            *_, terminated, truncated, _ = rec.step(rec.action_space.sample())
+            if terminated or truncated:
+                rec.reset()
+    restore(archived(rec.run.recording, tmp_path / "archive"), tmp_path / "back.mcap")
+    with open_recording(rec.run.recording) as recording, open_recording(tmp_path / "back.mcap") as restored:
+        assert len(list(recording.reset_states("train"))) == 3
+        assert list(restored.reset_states("train")) == list(recording.reset_states("train"))
+        assert restored.maker == recording.maker
+
+
 def test_every_number_of_an_observation_has_a_column(tmp_path):
     path = LOOPS["pole"](tmp_path)
     folder = archived(path, tmp_path / "archive")

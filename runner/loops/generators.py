@@ -1,0 +1,161 @@
+"""What resets without a seed depend on, read from environments without changing them.
+
+Gymnasium's property `np_random` makes a generator where there is none, so only the attributes that it keeps
+are read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from numpy.typing import NDArray
+
+from runner.recording.reset_states import ALE_STEPS_BETWEEN, SEED_BYTES, STEPS_BETWEEN, ResetState
+
+States = dict[int, ResetState]
+"""What resets depend on, by the index of the environment."""
+
+
+class GeneratorWatch:
+    """The generator of one environment: read at the resets at which its state is recorded.
+
+    Args:
+        env: the environment, wrapped or not.
+    """
+
+    def __init__(self, env: Any) -> None:
+        self._attributes: Mapping[str, Any] = getattr(getattr(env, "unwrapped", env), "__dict__", {})
+        ale = self._attributes.get("ale")
+        self._ale: Any = ale if type(ale).__module__.partition(".")[0] == "ale_py" else None
+        self._between = STEPS_BETWEEN if self._ale is None else ALE_STEPS_BETWEEN
+        self._generator: Any = None
+        """The generator at the last reset."""
+        self.due: float = 0
+        """The number of steps from which on a state is recorded again."""
+
+    def _now(self) -> Any:
+        """Return the generator: of Gymnasium's environments, else of PettingZoo's."""
+        generator = self._attributes.get("_np_random")
+        return self._attributes.get("np_random") if generator is None else generator
+
+    def before(self, steps: int) -> ResetState | None:
+        """Return what a reset without a seed is going to depend on; None if it is not to be recorded.
+
+        Args:
+            steps: the number of steps of the environment so far.
+        """
+        generator, last = self._now(), self._generator
+        self._generator = generator
+        if steps < self.due and generator is last:
+            return None
+        ale_state = b"" if self._ale is None else self._ale.cloneState(include_rng=True).serialize()
+        bits = getattr(generator, "bit_generator", None)
+        state: Any = bits.state if type(bits) is np.random.PCG64 else None
+        self.due = steps + self._between
+        if state is None and not ale_state:
+            return None
+        return ResetState(bit_generator=state, ale_state=ale_state)
+
+    def after(self, state: ResetState | None, seed: int | None) -> ResetState | None:
+        """Return what a reset depended on; None if it is not to be recorded.
+
+        Args:
+            state: what `before` returned; None for a reset with a seed.
+            seed: the seed of the reset.
+        """
+        generator, before = self._now(), self._generator
+        self._generator = generator
+        if seed is None and generator is not before and (drawn := seed_of(generator)) is not None:
+            return ResetState(np_random_seed=drawn)
+        return state
+
+
+class VectorWatch:
+    """The generators of a vector environment.
+
+    Those of a `SyncVectorEnv` are read, or that of a vector environment of its own class. An `AsyncVectorEnv`
+    is asked for the seeds of its generators once, after its first reset without seeds.
+
+    Args:
+        envs: the vector environment.
+        first: its first environment, or one made as that was; the vector itself if there is none.
+        autoreset: how its environments reset themselves.
+    """
+
+    def __init__(self, envs: VectorEnv[Any, Any, Any], first: Any, autoreset: AutoresetMode) -> None:
+        base = envs.unwrapped
+        self._watches: list[GeneratorWatch] = []
+        self._async: Any = None
+        self._resets_itself = isinstance(base, SyncVectorEnv) and autoreset == AutoresetMode.NEXT_STEP
+        if isinstance(base, SyncVectorEnv):
+            self._watches = [GeneratorWatch(env) for env in base.envs]
+        elif not isinstance(base, AsyncVectorEnv):
+            self._watches = [GeneratorWatch(base)]
+        elif isinstance(first, gymnasium.Env) and "ale" not in vars(first.unwrapped):
+            self._async = base  # the seed of an Atari environment's generator does not determine its emulator
+        self.steps = 0
+        """The steps of the vector."""
+        self.due: float = 0 if self._resets_itself else math.inf
+        """The number of steps from which on `before_step` is to be called before each step."""
+
+    def phase_began(self) -> None:
+        """Record states at the next resets: those of the phase so far are in another topic."""
+        for watch in self._watches:
+            watch.due = 0
+        self.due = 0 if self._resets_itself else math.inf
+
+    def before_step(self, over: NDArray[np.bool_]) -> States:
+        """Return what the resets that a step does in place of steps are going to depend on.
+
+        Args:
+            over: [N], the environments whose episodes are over.
+        """
+        states = self._before(np.flatnonzero(over).tolist())
+        self.due = min(watch.due for watch in self._watches)
+        return states
+
+    def before_reset(self, which: NDArray[np.bool_], seeds: Sequence[int | None]) -> States:
+        """Return what a reset is going to depend on, where it has no seed.
+
+        Args:
+            which: [N], the environments that are reset.
+            seeds: of all environments; empty for none.
+        """
+        unseeded = [i for i in np.flatnonzero(which).tolist() if not seeds or seeds[i] is None]
+        return self._before(unseeded)
+
+    def _before(self, which: Sequence[int]) -> States:
+        states: States = {}
+        for i in which:
+            if i < len(self._watches) and (state := self._watches[i].before(self.steps)) is not None:
+                states[i] = replace(state, environment=i)
+        return states
+
+    def after_reset(self, states: States, which: NDArray[np.bool_], seeds: Sequence[int | None]) -> States:
+        """Return what a reset depended on; arguments as for `before_reset`, and what that returned."""
+        chosen = {i: seeds[i] if seeds else None for i in np.flatnonzero(which).tolist()}
+        if self._async is not None and None in chosen.values():
+            generators = self._async.get_attr("_np_random")
+            self._async = None
+            drawn = {i: seed_of(generators[i]) for i, seed in chosen.items() if seed is None}
+            return {i: ResetState(environment=i, np_random_seed=s) for i, s in drawn.items() if s is not None}
+        found = {
+            i: self._watches[i].after(states.get(i), seed)
+            for i, seed in chosen.items()
+            if i < len(self._watches)
+        }
+        return {i: replace(state, environment=i) for i, state in found.items() if state is not None}
+
+
+def seed_of(generator: Any) -> int | None:
+    """Return the seed that a generator was made from; None if it is unknown."""
+    sequence = getattr(getattr(generator, "bit_generator", None), "seed_seq", None)
+    entropy = getattr(sequence, "entropy", None)
+    is_seed = isinstance(entropy, int) and 0 <= entropy < 256**SEED_BYTES
+    return entropy if is_seed and not getattr(sequence, "spawn_key", ()) else None
