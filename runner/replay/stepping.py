@@ -131,9 +131,7 @@ class Stepper(ABC):
         if state.ale_state:
             import ale_py
 
-            emulator = ale_py.ALEState.__new__(ale_py.ALEState)
-            emulator.__setstate__(state.ale_state)  # type: ignore[arg-type]
-            base.ale.restoreState(emulator)
+            base.ale.restoreState(ale_py.ALEState(state.ale_state))
         return None
 
     def draw(self) -> Frame:
