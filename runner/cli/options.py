@@ -166,6 +166,13 @@ def _picture_size(text: str) -> str:
     return text
 
 
+def _grid(text: str) -> tuple[int, int]:
+    rows, _, columns = text.partition("x")
+    if not 1 <= _number(rows) <= 8 >= _number(columns) >= 1:
+        raise ValueError(text)
+    return _number(rows), _number(columns)
+
+
 def _step(text: str) -> tuple[int, ...]:
     from runner.analysis.step_reference import parse_step_reference
 
@@ -179,6 +186,7 @@ TRIAL: Final = Parsed("N:TRIAL", "N:TRIAL, such as 3000:0", _trial)
 RANGES: Final = Parsed("ranges", "START:STOP or N, such as 0:20,49980:50000", _ranges)
 NUMBERS: Final = Parsed("numbers", "numbers such as 1000,49000", _numbers)
 PICTURE_SIZE: Final = Parsed("WxH", "WIDTHxHEIGHT up to 8192x8192, such as 1600x900", _picture_size)
+GRID: Final = Parsed("RxC", "ROWSxCOLUMNS up to 8x8, such as 3x3", _grid)
 STEP: Final = Parsed("step", "EPISODE:T, or eval:N:TRIAL:T", _step)
 DIRECTORY: Final = click.Path(file_okay=False, path_type=Path)
 FILE: Final = click.Path(dir_okay=False, path_type=Path)

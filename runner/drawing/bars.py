@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from runner.drawing import palette
 from runner.drawing.raster import Pixels, font, shortened
+from runner.util.humanize import UNKNOWN
 
 MAX_BARS: Final = 24
 """The most values that a picture shows."""
@@ -63,7 +64,8 @@ class BarRaster:
                 ends = sorted((float(self._zero[k]), float(self._zero[k] + value * self._scale[k])))
                 colour = palette.BLUE if value > 0 else palette.ORANGE
                 pen.rectangle((ends[0], _middle(k) - 6, ends[1], _middle(k) + 6), colour)
-            pen.text((_BARS[1] + _MARGIN, _middle(k)), f"{value:.4g}", palette.INK, font(_TEXT), anchor="lm")
+            text = UNKNOWN if np.isnan(value) else f"{value:.4g}"
+            pen.text((_BARS[1] + _MARGIN, _middle(k)), text, palette.INK, font(_TEXT), anchor="lm")
         return np.asarray(picture)
 
 

@@ -165,6 +165,19 @@ def shortened(text: str, width: float, size: int, bold: bool = False) -> str:
     return f"{text}…"
 
 
+def wrapped(text: str, width: float, size: int, lines: int, bold: bool = False) -> list[str]:
+    """Return a text in at most `lines` lines that are at most `width` pixels wide."""
+    words = text[: lines * int(width)].split()
+    found: list[str] = []
+    while words and len(found) < lines - 1:
+        count = 1
+        while count < len(words) and font(size, bold).getlength(" ".join(words[: count + 1])) <= width:
+            count += 1
+        found.append(shortened(" ".join(words[:count]), width, size, bold))
+        words = words[count:]
+    return [*found, shortened(" ".join(words), width, size, bold)] if words else found
+
+
 def _rendered(content: str, box: str, width: int, height: int) -> Image.Image:
     """Return elements as an RGBA image of the part of the plane in a box."""
     head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{box}" width="{width}" height="{height}">'

@@ -84,12 +84,14 @@ class Pictures:
         source: what they are made from.
         reason: why they are not made from anything better; empty for a scene and for frames.
         steps: steps of the episode; there is one more picture, unless one has a note.
+        learners: the names of the learners, one for each reward.
     """
 
     def __init__(self, recording: Recording, phase: str, episode: int) -> None:
         require_packages()
         require_steps(recording, "show")
         self._recording, self._phase, self._episode = recording, phase, episode
+        self.learners = recording.agents
         self.steps = len(recording.episode_span(phase, episode))
         self.source, self.reason = source_of(recording, phase)
         self._pictures = self._generate()

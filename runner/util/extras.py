@@ -21,6 +21,7 @@ _PACKAGES: Final = {
     "rerun_notebook": "rerun-notebook",
     "resvg_py": "resvg-py",
     "sklearn": "scikit-learn",
+    "textual_image": "textual-image",
 }
 """Module -> its package, where the names differ."""
 

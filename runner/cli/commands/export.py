@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli import Group
-from runner.cli.commands import export_gif, export_tables, export_tools
+from runner.cli.commands import export_film, export_tables, export_tools
 from runner.cli.options import (
     EXPORTS,
     Ranges,
@@ -130,7 +130,7 @@ def mcap(
 
 
 for _command in (
-    export_gif.command,
+    export_film.command,
     export_tables.parquet,
     export_tables.csv,
     export_tools.minari,

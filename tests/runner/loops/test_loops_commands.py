@@ -157,7 +157,6 @@ def test_verify_finds_a_digest_that_does_not_match_the_messages(folder, tmp_path
         ("qtable", "lake"),
         ("play", "pole"),
         ("play", "rooms"),
-        ("export", "gif", "pole", "-o", "x.gif"),
     ],
     ids=" ".join,
 )
@@ -168,12 +167,12 @@ def test_commands_that_need_a_job_refuse_a_loop(folder, words):
 
 
 def test_the_grid_of_a_loop_becomes_a_film(folder, tmp_path):
-    done = dualtaxi(folder, "export", "gif", "lake", "-o", str(tmp_path / "trial.gif"))
+    done = dualtaxi(folder, "export", "film", "lake", "-o", str(tmp_path / "trial.gif"))
     assert done.exit_code == 0, done.output
     played = dualtaxi(folder, "play", "lake").stdout.splitlines()[0]
     assert "trial 0 of the evaluation after" in played
     assert played.removeprefix("lake, seed 0: ") in done.stdout
-    done = dualtaxi(folder, "export", "gif", "lake", "--episode", "2", "-o", str(tmp_path / "film.gif"))
+    done = dualtaxi(folder, "export", "film", "lake", "--episode", "2", "-o", str(tmp_path / "film.gif"))
     assert done.exit_code == 0, done.output
     with open_recording(runner.find_run("lake", folder).recording) as recording:
         steps = len(recording.episode_steps("train", 2))
@@ -284,7 +283,7 @@ def test_a_loop_without_steps_gets_no_impossible_hints(tmp_path):
     with runner.record(make("FrozenLake-v1"), tmp_path, name="none") as env:
         env.reset(seed=0)
         env._loop.close("failed")
-    for words in (("rerecord", "none"), ("export", "gif", "none", "-o", str(tmp_path / "x.gif"))):
+    for words in (("rerecord", "none"), ("export", "film", "none", "-o", str(tmp_path / "x.gif"))):
         done = dualtaxi(tmp_path, *words)
         assert done.exit_code == 2
         assert "loop" in done.output

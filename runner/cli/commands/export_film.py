@@ -1,0 +1,146 @@
+"""`dualtaxi export film`: a film of an episode, or of several side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from runner.cli import Command
+from runner.cli.options import (
+    EXPORTS,
+    GRID,
+    episode_option,
+    force_option,
+    output_option,
+    recordings_option,
+    run_argument,
+    trial_option,
+)
+from runner.cli.output import say
+from runner.cli.progress import count_line
+from runner.cli.runs import opened_run
+from runner.util.humanize import size
+
+if TYPE_CHECKING:
+    from runner.export.episodes import EpisodeChoice
+    from runner.recording.reader import Recording
+
+_SCENE_FPS = 4.0
+"""Frames per second of a drawn scene, whose steps are large."""
+_FPS = 30.0
+
+
+@click.command("film", cls=Command, short_help="A film of an episode: MP4, WebM, GIF or WebP.")
+@run_argument
+@episode_option
+@trial_option
+@click.option("--best", is_flag=True, help="The episode of the highest return.")
+@click.option("--worst", is_flag=True, help="The episode of the lowest return.")
+@click.option(
+    "--grid",
+    type=GRID,
+    metavar="RxC",
+    help="Several episodes side by side, evenly from the best to the worst, such as 3x3.",
+)
+@output_option("exports/NAME-RUN.mp4", "FILE")
+@click.option(
+    "--fps",
+    type=click.FloatRange(0.1, 240),
+    metavar="STEPS",
+    help="Steps per second.  [default: 4 of a drawn scene, else 30]",
+)
+@click.option(
+    "--width",
+    type=click.IntRange(160, 4096),
+    metavar="PIXELS",
+    help="Width of the film.  [default: about that of the pictures]",
+)
+@force_option
+@recordings_option
+def command(
+    run_name: str,
+    episode: int | None,
+    trial: tuple[int, int] | None,
+    best: bool,
+    worst: bool,
+    grid: tuple[int, int] | None,
+    output: Path | None,
+    fps: float | None,
+    width: int | None,
+    force: bool,
+    recordings: Path | None,
+) -> None:
+    """Make a film of a recorded episode of RUN; the ending of the file chooses the format.
+
+    Each frame has step, action, rewards and events written below it. What it shows is the best that the run
+    has: the scene of a tabular environment, recorded frames, observations that are images, or else the
+    observation's numbers as bars.
+
+    By default it is the typical trial of the last evaluation: the median by success, return and length; of
+    your own loop the first trial of its last evaluation; of a run without evaluations the last training
+    episode. --best, --worst and --grid choose among the trials of all evaluations, or, if there are none,
+    among the training episodes: by success, return and length.
+
+    Examples:
+      dualtaxi export film @latest
+      dualtaxi export film k3v9m2xq --eval 3000:7 -o trial.gif
+      dualtaxi export film k3v9m2xq --grid 3x3 -o nine.webm --fps 60
+    """
+    choices = {"--episode": episode, "--eval": trial, "--best": best, "--worst": worst, "--grid": grid}
+    given = [name for name, value in choices.items() if value is not None and value is not False]
+    if len(given) > 1:
+        raise click.UsageError(f"{' and '.join(given[:2])} exclude each other: choose one.")
+    from runner.export import film
+    from runner.export.episodes import chosen_episode
+    from runner.export.pictures import Source, pictures, source_of
+    from runner.export.places import require_new, write_new
+
+    with opened_run(run_name, recordings, needs_steps=True) as (run, recording):
+        path = output or EXPORTS / f"{run.file_stem}.mp4"
+        film.format_of(path)
+        require_new(path, force)
+        if grid or best or worst:
+            shown = _ranked(recording, grid, best)
+        else:
+            shown = [chosen_episode(recording, episode, trial)]
+        source, reason = source_of(recording, shown[0].phase)
+        if reason:
+            say(f"The film shows {source}, because {reason}.")
+        speed = fps or (_SCENE_FPS if source is Source.SCENE else _FPS)
+        shots = (
+            film.Shot(f"{run.title}: {one.title}", pictures(recording, one.phase, one.number))
+            for one in shown
+        )
+        steps = sum(len(recording.episode_span(one.phase, one.number)) for one in shown)
+        made: list[film.Film] = []
+        with count_line("frames", steps + len(shown)) as progress:
+
+            def write(path: Path) -> None:
+                if grid:
+                    made.append(film.write_grid(path, shots, grid[1], speed, width, progress))
+                else:
+                    made.append(film.write_film(path, next(shots), speed, width, progress))
+
+            write_new(path, force, write)
+    for note in made[0].notes:
+        say(note)
+    what = shown[0].title if len(shown) == 1 else f"{len(shown)} episodes"
+    facts = f"{made[0].frames:,} frames of {made[0].width}x{made[0].height}, {size(path.stat().st_size)}"
+    click.echo(f"{path}: {what}, {facts}")
+
+
+def _ranked(recording: Recording, grid: tuple[int, int] | None, best: bool) -> list[EpisodeChoice]:
+    """Return the best episode, the worst, or those of a grid from the best to the worst."""
+    from runner.export.episodes import named_episode, ranked_episodes
+
+    phase, ranked = ranked_episodes(recording)
+    if grid is None:
+        return [named_episode(recording, phase, int(ranked[-1 if best else 0]))]
+    cells = grid[0] * grid[1]
+    if len(ranked) < cells:
+        say(f"There are only {len(ranked):,} episodes: {cells - len(ranked)} cells of the grid are empty.")
+    count = min(cells, len(ranked))
+    places = [round((len(ranked) - 1) * (1 - k / max(count - 1, 1))) for k in range(count)]
+    return [named_episode(recording, phase, int(ranked[place])) for place in places]

@@ -1,0 +1,259 @@
+"""Films, decoded: number of frames, their size, and what they show."""
+
+from __future__ import annotations
+
+import re
+
+import av
+import gymnasium
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+import runner
+from runner.cli import cli
+from runner.export import film as films
+from runner.export.episodes import ranked_episodes
+from runner.export.pictures import pictures
+from runner.export.reports.episode import typical_trial
+from runner.recording.reader import open_recording
+from tests.runner.loops.making import make, play
+
+ENDINGS = tuple(films.FORMATS)
+
+
+def film(*words):
+    return CliRunner().invoke(cli, ["export", "film", *map(str, words)])
+
+
+def frames_of(path):
+    """Return the frames of a film, uint8 [frames, height, width, 3]; of a WebP picture by Pillow."""
+    if path.suffix == ".webp":
+        with Image.open(path) as picture:
+            frames = []
+            for number in range(picture.n_frames):
+                picture.seek(number)
+                frames.append(np.asarray(picture.convert("RGB")))
+            return np.array(frames)
+    with av.open(path) as container:
+        return np.array([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+
+
+def assert_shows(frame, picture):
+    """Assert that a frame shows a picture of its width somewhere, but for what a codec loses."""
+    height, expected = len(picture), picture.astype(np.int16)
+    differences = [
+        np.abs(frame[top : top + height].astype(np.int16) - expected)
+        for top in range(len(frame) - height + 1)
+    ]
+    best = min(differences, key=np.mean)
+    assert best.mean() < 4
+    assert (best.max(axis=2) > 100).mean() < 0.01
+
+
+@pytest.fixture(scope="module")
+def pole(tmp_path_factory):
+    """Return a loop over CartPole with frames, and the pictures that the environment drew, by episode."""
+    drawn, env = [], gymnasium.make("CartPole-v1", render_mode="rgb_array")
+    with runner.record(env, tmp_path_factory.mktemp("pole"), seed=0, frames_every=1) as rec:
+        for entry in play(rec, 200):
+            if entry[0] == "reset":
+                drawn.append([])
+            drawn[-1].append(env.render())
+    return rec.run, drawn
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_film_shows_what_the_environment_drew(pole, tmp_path, ending):
+    run, drawn = pole
+    path = tmp_path / f"film{ending}"
+    result = film(run.recording, "--episode", 1, "-o", path)
+    assert result.exit_code == 0, result.output
+    frames = frames_of(path)
+    assert (
+        f"training episode 1, {len(drawn[1])} frames of {frames.shape[2]}x{frames.shape[1]}" in result.stdout
+    )
+    assert frames.shape[1] % 2 == frames.shape[2] % 2 == 0
+    if ending == ".webp":  # equal frames are one, shown for longer
+        assert len(frames) <= len(drawn[1])
+    else:
+        assert len(frames) == len(drawn[1])
+    for shown, expected in ((frames[0], drawn[1][0]), (frames[-1], drawn[1][-1])):
+        assert_shows(shown, expected)
+    assert (np.abs(frames[0].astype(int) - frames[-1]) > 50).any()
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_job_becomes_a_film_of_its_scene(pictured, tmp_path, ending):
+    run, path = pictured("lake"), tmp_path / f"film{ending}"
+    result = film(run.recording, "--eval", "40:2", "-o", path, "--width", 300)
+    assert result.exit_code == 0, result.output
+    with open_recording(run.recording) as recording:
+        shown = list(pictures(recording, "eval", 14))
+    frames = frames_of(path)
+    assert frames.shape[2] == 300
+    assert ending == ".webp" or len(frames) == len(shown)
+    expected = np.asarray(Image.fromarray(shown[-1].pixels).resize((300, 300), Image.Resampling.LANCZOS))
+    assert_shows(frames[-1], expected)
+    assert not (frames[0] == frames[len(frames) // 2]).all()
+
+
+@pytest.mark.parametrize("world", ["lake", "corridor", "rivals"])
+def test_every_world_becomes_a_film(pictured, tmp_path, world):
+    path = tmp_path / "film.mp4"
+    result = film(pictured(world).recording, "--episode", 3, "-o", path, "--fps", 12.5)
+    assert result.exit_code == 0, result.output
+    with open_recording(pictured(world).recording) as recording:
+        assert len(frames_of(path)) == len(recording.episode_steps("train", 3)) + 1
+    with av.open(path) as container:
+        assert container.streams.video[0].average_rate == 12.5
+        assert container.streams.video[0].codec_context.name == "h264"
+        assert container.streams.video[0].codec_context.pix_fmt == "yuv420p"
+
+
+def test_values_and_their_reason_are_shown(tmp_path):
+    with runner.record(make("Blackjack-v1"), tmp_path / "runs") as rec:
+        list(play(rec, 30))
+    result = film(rec.run.recording, "--episode", 2, "-o", tmp_path / "film.webm")
+    assert result.exit_code == 0, result.output
+    assert "The film shows values, because" in result.stderr
+    assert len(frames_of(tmp_path / "film.webm")) >= 2
+
+
+def test_best_and_worst_are_chosen_by_return(pictured, tmp_path):
+    run = pictured("taxi")
+    with open_recording(run.recording) as recording:
+        records = recording.episodes("eval")
+        phase, ranked = ranked_episodes(recording)
+    assert phase == "eval"
+    returns = records["returns"].sum(axis=1)
+    assert returns[ranked[0]] == returns[~records["success"]].min()
+    for flag, number in (("--best", ranked[-1]), ("--worst", ranked[0])):
+        result = film(run.recording, flag, "-o", tmp_path / "film.mp4", "--force")
+        assert f"trial {number % 6} of the evaluation after {20 * (number // 6)} episodes" in result.stdout
+
+
+def test_without_evaluations_training_episodes_are_ranked(pole, tmp_path):
+    run, drawn = pole
+    result = film(run.recording, "--best", "-o", tmp_path / "film.mp4")
+    with open_recording(run.recording) as recording:
+        best = recording.episodes("train")["returns"].sum(axis=1).argmax()
+    assert f"training episode {best}, {len(drawn[best])} frames" in result.stdout
+
+
+def test_a_grid_shows_episodes_from_best_to_worst_side_by_side(pole, tmp_path):
+    run, drawn = pole
+    path = tmp_path / "grid.mp4"
+    result = film(run.recording, "--grid", "2x2", "-o", path, "--width", 1200)
+    assert result.exit_code == 0, result.output
+    with open_recording(run.recording) as recording:
+        _, ranked = ranked_episodes(recording)
+    shown = [drawn[ranked[place]] for place in np.linspace(len(ranked) - 1, 0, 4).round().astype(int)]
+    frames = frames_of(path)
+    assert len(frames) == max(map(len, shown))
+    height, width = frames.shape[1] // 2, frames.shape[2] // 2
+    assert width == 600
+    for place, episode in enumerate(shown):
+        row, column = divmod(place, 2)
+        cell = frames[-1][row * height : (row + 1) * height, column * width : (column + 1) * width]
+        assert_shows(cell, episode[-1])
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_grid_larger_than_the_run_has_empty_cells(pictured, tmp_path):
+    run = pictured("lake", evaluation=None, episodes=3)
+    result = film(run.recording, "--grid", "2x2", "-o", tmp_path / "grid.mp4")
+    assert result.exit_code == 0, result.output
+    assert "only 3 episodes: 1 cells" in result.stderr
+    frames = frames_of(tmp_path / "grid.mp4")
+    corner = frames[-1][frames.shape[1] // 2 :, frames.shape[2] // 2 :]
+    assert corner.min() > 240
+
+
+def test_an_episode_that_never_ended_is_shown_up_to_its_last_step(tmp_path):
+    env = runner.record(make("FrozenLake-v1"), tmp_path / "runs")
+    env.reset(seed=0)
+    env.step(1)
+    env._loop.close("interrupted")
+    result = film(env.run.recording, "--episode", 0, "-o", tmp_path / "film.gif")
+    assert result.exit_code == 0, result.output
+    assert len(frames_of(tmp_path / "film.gif")) == 2
+    assert "did not finish (interrupted)" in result.stderr
+
+
+def test_without_a_choice_it_is_the_median_trial(pictured, tmp_path):
+    run = pictured("lake")
+    result = film(run.recording, "-o", tmp_path / "film.gif")
+    with open_recording(run.recording) as recording:
+        after, number = typical_trial(recording)
+        records = recording.episodes("eval", 12, 18)
+    assert f"trial {number} of the evaluation after {after} episodes" in result.stdout
+    ranks = [(r["success"], r["returns"].sum(), -int(r["length"])) for r in records]
+    assert sorted(ranks)[3] == ranks[number]
+
+
+def test_a_run_without_evaluations_shows_its_last_training_episode(pictured, tmp_path):
+    result = film(pictured("lake", evaluation=None).recording, "-o", tmp_path / "film.gif")
+    assert result.exit_code == 0, result.stderr
+    assert "training episode 39" in result.stdout
+
+
+REFUSED = {
+    "no such episode": (("--episode", 9999), "has no training episode 9999; there are 40, from 0"),
+    "no such evaluation": (("--eval", "7:0"), r"no evaluation after 7 episodes.*nearest after 0"),
+    "no such trial": (("--eval", "40:99"), "no trial 99 of the evaluation after 40 episodes; it has 6"),
+    "no trial at all": (("--eval", "x"), "expected N:TRIAL"),
+    "both": (("--eval", "0:0", "--episode", 0), "--episode and --eval exclude each other"),
+    "best of a grid": (("--best", "--grid", "2x2"), "--best and --grid exclude each other"),
+    "a grid of nothing": (("--grid", "0x3"), "expected ROWSxCOLUMNS"),
+    "an unknown ending": (
+        ("-o", "film.avi"),
+        "found the ending '.avi', expected one of .mp4, .webm, .gif, .webp",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_shown_is_refused(pictured, tmp_path, case, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words, message = REFUSED[case]
+    result = film(pictured("lake").recording, "-o", "film.gif", *words)
+    assert result.exit_code == 2
+    assert re.search(message, " ".join(result.stderr.split()))
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_steps_the_error_names_the_command_that_records_them(pictured, tmp_path):
+    run = pictured("lake", recording={"steps": "none"})
+    result = film(run.recording, "-o", tmp_path / "film.gif")
+    assert result.exit_code == 2
+    assert "dualtaxi rerecord" in result.stderr
+
+
+def test_a_file_is_replaced_by_force_only(pictured, tmp_path):
+    path = tmp_path / "film.gif"
+    path.write_text("mine")
+    result = film(pictured("lake").recording, "-o", path)
+    assert (result.exit_code, path.read_text()) == (2, "mine")
+    assert "--force" in result.stderr
+    assert film(pictured("lake").recording, "-o", path, "--force").exit_code == 0
+
+
+def test_a_film_that_fails_leaves_no_file(pole, tmp_path, monkeypatch):
+    run, _ = pole
+    monkeypatch.setattr(films.Encoder, "add", lambda self, pixels: (_ for _ in ()).throw(OSError(28, "full")))
+    result = film(run.recording, "--episode", 1, "-o", tmp_path / "film.mp4")
+    assert result.exit_code == 1
+    assert "cannot be written (full)" in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("module", ["av", "resvg_py"])
+def test_a_missing_package_is_named(pictured, tmp_path, monkeypatch, module):
+    monkeypatch.setitem(__import__("sys").modules, module, None)
+    result = film(pictured("lake").recording, "-o", tmp_path / "film.gif")
+    assert module.replace("_", "-") in result.stderr
+    assert "pip install" in result.stderr
+    assert "[film]" in result.stderr or "[plots]" in result.stderr
