@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -19,7 +19,38 @@ OVER: Final = ("finished", "failed", "cancelled")
 """The states of a job in which nothing more happens unless a user resumes it."""
 
 EventKind = Literal["state", "run", "log", "progress"]
-"""What happened to a job: a change of its state, the start of a run, a line of its log, or progress."""
+"""The types of events, as they are named in a stream of events and in the server's database."""
+
+
+@dataclass(frozen=True)
+class StateEvent:
+    """A job's state changed."""
+
+    state: str
+    error: str | None = None
+    """Why the job failed."""
+    time: str | None = None
+
+
+@dataclass(frozen=True)
+class RunEvent:
+    """A run of a job started, for the first time or again."""
+
+    run_id: str
+    seed: int
+    time: str | None = None
+
+
+@dataclass(frozen=True)
+class LogEvent:
+    """A line of a job's log."""
+
+    text: str
+    run_id: str | None = None
+    """The run that it comes from; None for the job itself."""
+    seed: int | None = None
+    """The seed of that run."""
+    time: str | None = None
 
 
 @dataclass(frozen=True)
@@ -67,6 +98,53 @@ class SweepProgress:
 
 
 JobProgress = RunProgress | SweepProgress
+EventData = StateEvent | RunEvent | LogEvent | JobProgress
+_KINDS: Final[Mapping[type[EventData], EventKind]] = {
+    StateEvent: "state",
+    RunEvent: "run",
+    LogEvent: "log",
+    RunProgress: "progress",
+    SweepProgress: "progress",
+}
+
+
+@dataclass(frozen=True)
+class JobEvent:
+    """An event of a job. Only the latest progress counts, so it is not stored."""
+
+    data: EventData
+    id: str = ""
+    """Where to continue from; empty for progress."""
+
+    @property
+    def kind(self) -> EventKind:
+        """The name of its type."""
+        return _KINDS[type(self.data)]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return its data as a JSON object, without what is unknown; `from_json` is the reverse."""
+        values = asdict(self.data)
+        if self.kind == "progress":
+            return values
+        return {key: value for key, value in values.items() if value is not None}
+
+    @classmethod
+    def from_json(cls, kind: str, values: Mapping[str, Any], event_id: str = "") -> JobEvent:
+        """Return an event from a stream or the database.
+
+        Raises:
+            RunnerError: it is none.
+        """
+        try:
+            found: type[EventData] = SweepProgress if "done" in values else RunProgress
+            if kind != "progress":
+                found = next(each for each, name in _KINDS.items() if name == kind)
+            known = {field.name: values[field.name] for field in fields(found) if field.name in values}
+            if known.get("best") is not None:
+                known["best"] = BestTrial(**known["best"])
+            return cls(found(**known), event_id)
+        except (StopIteration, TypeError) as error:
+            raise RunnerError(f"found an event {kind[:20]!r} of a job that is not as expected.") from error
 
 
 @dataclass(frozen=True)
@@ -107,16 +185,6 @@ class RemoteJob:
             ) from error
 
 
-@dataclass(frozen=True)
-class JobEvent:
-    """An event of a job."""
-
-    kind: EventKind
-    data: dict[str, Any]
-    id: str = ""
-    """Where to continue from; empty for progress."""
-
-
 def watch(client: Connection, number: int) -> Iterator[JobEvent]:
     """Yield the events of a job until it is over; continue when a connection breaks.
 
@@ -147,13 +215,12 @@ def watch(client: Connection, number: int) -> Iterator[JobEvent]:
 
 def parse_events(lines: Iterable[str]) -> Iterator[JobEvent]:
     """Yield the server-sent events of a stream's lines, apart from an incomplete last one."""
-    fields: dict[str, str] = {}
+    parts: dict[str, str] = {}
     for line in lines:
         if line:
             key, _, value = line.partition(":")
-            fields[key] = value.removeprefix(" ")
+            parts[key] = value.removeprefix(" ")
             continue
-        if "data" in fields:
-            kind: Any = fields.get("event", "")
-            yield JobEvent(kind, json.loads(fields["data"]), fields.get("id", ""))
-        fields = {}
+        if "data" in parts:
+            yield JobEvent.from_json(parts.get("event", ""), json.loads(parts["data"]), parts.get("id", ""))
+        parts = {}

@@ -139,8 +139,8 @@ def rerun_view(
         RecordingError: a recording cannot be read, or does not have these episodes.
     """
     notebook = require("rerun_notebook", extra="notebook", purpose="the Rerun viewer in a notebook")
+    from runner.export.rerun.cache import cached_export
     from runner.export.rerun.selection import Request
-    from runner.export.rerun.writing import cached_export
 
     path, _ = cached_export(runs, Request(episodes=tuple(episodes), evaluations=tuple(evaluations)))
     viewer = notebook.Viewer(width=width, height=height)

@@ -24,7 +24,7 @@ from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CatalogueOf, SettingsOf
 from runner.service.fragments import load_sweep_libraries
 from runner.service.guard import Guard
-from runner.service.jobs.pool import JobPool
+from runner.service.jobs.queue import JobQueue
 from runner.service.logs import LOG, AccessLog
 from runner.service.problems import add_error_handlers, error_docs
 from runner.service.processes import ProcessPool
@@ -125,7 +125,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         stack.callback(app.state.catalogue.close)
         app.state.catalogue.prepare()
         app.state.jobs = stack.enter_context(
-            JobPool(settings.recordings[0], settings.workers, max_unfinished=limits.jobs, ray=settings.ray)
+            JobQueue(settings.recordings[0], settings.workers, max_unfinished=limits.jobs, ray=settings.ray)
         )
         app.state.writers = anyio.CapacityLimiter(uploads.WRITERS)
         app.state.uploads = Uploads(settings.recordings[0], limits, log_upload)
@@ -168,7 +168,7 @@ def readyz(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Re
         "recordings_can_be_written": os.access(folder, os.R_OK | os.W_OK | os.X_OK),
         "disk_has_space": has_space,
         "runs_can_be_listed": catalogue.can_list(),
-        "jobs_can_be_started": request.app.state.jobs.is_working,
+        "jobs_can_be_started": request.app.state.jobs.pool.is_working,
     }
     ready = all(checks.values())
     status = HTTPStatus.OK if ready else HTTPStatus.SERVICE_UNAVAILABLE

@@ -29,6 +29,7 @@ from runner.errors import RunnerError
 from runner.export.plots.curves import curves_sheet
 from runner.export.plots.image import check_suffix, save
 from runner.export.plots.metrics import panels_of
+from runner.export.rerun.cache import cached_export
 from runner.export.rerun.selection import Request
 from runner.export.rerun.viewer import require_rerun
 from runner.recording.reader import open_recording
@@ -228,8 +229,6 @@ def replay(runs: Sequence[Run], request: Request) -> bytes:
         StorageError: the cache cannot be written.
     """
     require_rerun("a replay")
-    from runner.export.rerun.writing import cached_export  # loads Rerun
-
     return os.fsencode(cached_export(runs, request)[0])
 
 

@@ -12,7 +12,7 @@ from runner.errors import RecordingError
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.catalogue import Catalogue
-from runner.service.jobs.pool import JobPool
+from runner.service.jobs.queue import JobQueue
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ALWAYS, ResponseCache
 from runner.service.settings import Settings
@@ -33,7 +33,7 @@ CatalogueOf = Annotated[Catalogue, _state("catalogue")]
 ProcessesOf = Annotated[ProcessPool, _state("processes")]
 SweepProcesses = Annotated[ProcessPool, _state("sweep_processes")]
 CacheOf = Annotated[ResponseCache, _state("cache")]
-JobsOf = Annotated[JobPool, _state("jobs")]
+JobsOf = Annotated[JobQueue, _state("jobs")]
 UploadsOf = Annotated[Uploads, _state("uploads")]
 RunName = Annotated[
     str,

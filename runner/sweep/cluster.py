@@ -66,7 +66,7 @@ class RayActor:
 
     def __init__(self) -> None:
         self._stopping = threading.Event()
-        self._messages: list[tuple[str, Any]] = []
+        self._messages: list[Any] = []
         self._lock = threading.Lock()
 
     def run(self, function: Callable[Concatenate[RayActor, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
@@ -81,12 +81,12 @@ class RayActor:
         """Return whether the function must stop."""
         return self._stopping.is_set()
 
-    def send(self, kind: str, data: Any) -> None:
+    def send(self, message: object) -> None:
         """Keep a message of the function until it is fetched."""
         with self._lock:
-            self._messages.append((kind, data))
+            self._messages.append(message)
 
-    def take_messages(self) -> list[tuple[str, Any]]:
+    def take_messages(self) -> list[Any]:
         """Return the messages since the last call."""
         with self._lock:
             messages, self._messages = self._messages, []

@@ -313,12 +313,14 @@ def resume(number: int, accept_changes: bool, server: Server, as_json: bool) -> 
 
 def _watched(client: Client, number: int) -> RemoteJob:
     """Print the events of a job on stderr until it is over, and return it."""
+    from runner.client.jobs import LogEvent, StateEvent
+
     for event in client.watch(number):
-        if event.kind == "log":
-            seed = f"seed {event.data['seed']}: " if "seed" in event.data else ""
-            say(f"{seed}{event.data['text']}")
-        elif event.kind == "state":
-            say(event.data["state"])
+        if isinstance(event.data, LogEvent):
+            seed = "" if event.data.seed is None else f"seed {event.data.seed}: "
+            say(f"{seed}{event.data.text}")
+        elif isinstance(event.data, StateEvent):
+            say(event.data.state)
     return client.job(number)
 
 

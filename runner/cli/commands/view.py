@@ -93,8 +93,8 @@ def view_command(
         require_new(screenshot, force)
     runs = [find_recorded(name, recordings) for name in run_names]
     with stage_line("loading Rerun") as stage:
+        from runner.export.rerun.cache import cached_export
         from runner.export.rerun.selection import Request, locate, locate_divergence
-        from runner.export.rerun.writing import cached_export
 
         request = Request(episodes or (), evaluations or (), every or 0, everything)
 

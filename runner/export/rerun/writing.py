@@ -1,15 +1,13 @@
-"""Exporting runs to one `.rrd` file, or into the user's cache."""
+"""Exporting runs to one `.rrd` file."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import itertools
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final
 
 import rerun as rr
 
@@ -20,14 +18,9 @@ from runner.export.rerun.layout import blueprint, loop_blueprint
 from runner.export.rerun.loops import LoopExporter
 from runner.export.rerun.runs import RunExporter, Source
 from runner.export.rerun.selection import Request, Selection, select
-from runner.recording.reader import open_recording
+from runner.recording.reader import Recording
 from runner.runs.run import Run
-from runner.util import files
-from runner.util.files import CACHE_VARIABLE, EXPORTS, RUN_SEPARATOR, storage_errors
-from runner.util.version import __version__
-
-MAX_CACHED: Final = 20
-"""Exports in the cache; those that were not used for longest are removed."""
+from runner.util.files import storage_errors
 
 
 def export(sources: Sequence[Source], request: Request, path: Path) -> list[Selection]:
@@ -65,46 +58,21 @@ def export(sources: Sequence[Source], request: Request, path: Path) -> list[Sele
     return selections
 
 
-def cached_export(runs: Sequence[Run], request: Request) -> tuple[Path, list[Selection]]:
-    """Return the export of these runs in the user's cache, made now if missing, and the selection of each.
-
-    Raises:
-        RecordingError: a recording cannot be read, or does not have what is requested.
-        StorageError: the cache cannot be written.
-    """
-    folder = files.cache_folder() / EXPORTS
-    path = folder / f"{RUN_SEPARATOR.join(run.run_id for run in runs)}-{_cache_key(runs, request)}.rrd"
-    with contextlib.ExitStack() as stack:
-        recordings = [stack.enter_context(open_recording(run.recording)) for run in runs]
-        if path.exists():
-            path.touch()
-            return path, [select(recording, request) for recording in recordings]
+def export_runs(
+    runs: Sequence[Run], recordings: Sequence[Recording], request: Request, path: Path
+) -> list[Selection]:
+    """Write runs and their opened recordings as `export` does; several have different colours."""
+    sources = [
+        Source(recording, f"{run.title} ({run.run_id})")
+        for run, recording in zip(runs, recordings, strict=True)
+    ]
+    if len(runs) > 1:
+        colours = itertools.cycle(palette.COMPARED)
         sources = [
-            Source(recording, f"{run.title} ({run.run_id})")
-            for run, recording in zip(runs, recordings, strict=True)
+            dataclasses.replace(source, root=f"/{run.run_id}", tint=next(colours))
+            for source, run in zip(sources, runs, strict=True)
         ]
-        if len(runs) > 1:
-            colours = itertools.cycle(palette.COMPARED)
-            sources = [
-                dataclasses.replace(source, root=f"/{run.run_id}", tint=next(colours))
-                for source, run in zip(sources, runs, strict=True)
-            ]
-        with storage_errors(folder, f"set {CACHE_VARIABLE} to another folder"):
-            folder.mkdir(parents=True, exist_ok=True)
-            cached = sorted(folder.glob("*.rrd"), key=lambda file: file.stat().st_mtime, reverse=True)
-            for old in cached[MAX_CACHED - 1 :]:
-                old.unlink(missing_ok=True)
-        return path, export(sources, request, path)
-
-
-def _cache_key(runs: Sequence[Run], request: Request) -> str:
-    """Return a hash of the recordings as they are now, the request, and the code."""
-    parts = [__version__, repr(request)]
-    for run in runs:
-        stat = run.recording.stat()
-        parts += [str(run.recording.absolute()), str(stat.st_size), str(stat.st_mtime_ns)]
-    parts += [str(file.stat().st_mtime_ns) for file in sorted(Path(__file__).parent.glob("*.py"))]
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+    return export(sources, request, path)
 
 
 @contextlib.contextmanager

@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Mapping
-from dataclasses import asdict
+from collections.abc import AsyncIterator
 from http import HTTPStatus
 from typing import Annotated, Any, Final
 
@@ -15,11 +14,11 @@ from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
 
-from runner.client.jobs import EventKind, JobProgress
+from runner.client.jobs import JobEvent, JobProgress
 from runner.service.dependencies import JobsOf
 from runner.service.errors import JobNotFound, Refused
 from runner.service.jobs.checking import DEFAULT_SOURCE
-from runner.service.jobs.pool import JobPool, QueueStatus
+from runner.service.jobs.queue import JobQueue, QueueStatus
 from runner.service.jobs.store import Job, Kind, State
 from runner.service.problems import error_docs, media_docs
 
@@ -251,20 +250,20 @@ async def watch(
     )
 
 
-async def _events(jobs: JobPool, number: int, last: int, stopping: asyncio.Event) -> AsyncIterator[str]:
+async def _events(jobs: JobQueue, number: int, last: int, stopping: asyncio.Event) -> AsyncIterator[str]:
     jobs.watchers += 1
     try:
         yield f"retry: {RETRY_MILLISECONDS}\n\n"
         progress, sent = None, time.monotonic()
         while not stopping.is_set():
             job = jobs.store.job(number)  # before its events, so that none is missed
-            before, progress = progress, jobs.progress(number)
+            before, progress = progress, jobs.pool.progress(number)
             events, last = await run_sync(jobs.store.events, number, last)
             has_moved = progress is not None and progress is not before
             if progress is not None and has_moved:
-                yield _event("progress", asdict(progress))
+                yield _as_text(JobEvent(progress))
             for event in events:
-                yield _event(event.kind, event.data, event.id)
+                yield _as_text(event)
             if not events and job.is_over:
                 return
             if not (events or has_moved):
@@ -280,14 +279,14 @@ async def _events(jobs: JobPool, number: int, last: int, stopping: asyncio.Event
         jobs.watchers -= 1
 
 
-def _event(kind: EventKind, data: Mapping[str, Any], id_: int | None = None) -> str:
+def _as_text(event: JobEvent) -> str:
     """Return a server-sent event."""
-    head = "" if id_ is None else f"id: {id_}\n"
-    return f"{head}event: {kind}\ndata: {json.dumps(data, ensure_ascii=False)}\n\n"
+    head = f"id: {event.id}\n" if event.id else ""
+    return f"{head}event: {event.kind}\ndata: {json.dumps(event.as_json(), ensure_ascii=False)}\n\n"
 
 
-def job_response(job: Job, jobs: JobPool) -> JobResponse:
+def job_response(job: Job, jobs: JobQueue) -> JobResponse:
     """Return the response about a job."""
     begun = [{"seed": seed, "run_id": run_id} for seed, run_id in jobs.store.run_ids(job.number).items()]
-    progress = jobs.progress(job.number) if job.state == "running" else None
+    progress = jobs.pool.progress(job.number) if job.state == "running" else None
     return JobResponse.model_validate(vars(job) | {"progress": progress, "begun": begun})

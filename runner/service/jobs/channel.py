@@ -12,6 +12,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol
 
+from runner.client.jobs import JobProgress, LogEvent, RunEvent
 from runner.errors import RunnerError
 from runner.runs.run import Run, run_at
 
@@ -48,10 +49,21 @@ class Outcome:
     error: str = ""
 
 
+@dataclass(frozen=True)
+class Slots:
+    """How many processes a job uses, or is allowed to use if it uses fewer."""
+
+    count: int
+
+
+Message = Outcome | Slots | JobProgress | RunEvent | tuple[LogEvent, ...]
+"""What a worker sends to the server."""
+
+
 class JobChannel(Protocol):
     """Where a run sends its messages, and learns that it must stop."""
 
-    def send(self, kind: str, data: Any) -> None:
+    def send(self, message: Message) -> None:
         """Send a message to the server."""
 
     def stop(self) -> bool:
@@ -61,8 +73,8 @@ class JobChannel(Protocol):
 class PipeChannel:
     """The worker's end of the pipe to the server.
 
-    The server sends how many processes the job may use, and when to stop. If the server dies, the worker
-    stops as well: it closes its recording, so that the next server of the folder can resume it.
+    The server sends how many `Slots` the job may use, and None when it must stop. If the server dies, the
+    worker stops as well: it closes its recording, so that the next server of the folder can resume it.
     """
 
     def __init__(self, pipe: Connection) -> None:
@@ -74,10 +86,10 @@ class PipeChannel:
         self._lock = threading.Lock()
         threading.Thread(target=self._receive, name="channel", daemon=True).start()
 
-    def send(self, kind: str, data: Any) -> None:
+    def send(self, message: Message) -> None:
         """Send a message to the server; nothing happens if it is gone."""
         with self._lock, contextlib.suppress(OSError):
-            self._pipe.send((kind, data))
+            self._pipe.send(message)
 
     def stop(self) -> bool:
         """Return whether the job must stop."""
@@ -89,12 +101,8 @@ class PipeChannel:
 
     def _receive(self) -> None:
         with contextlib.suppress(EOFError, OSError):
-            while True:
-                kind, value = self._pipe.recv()
-                if kind == "slots":
-                    self.slots = value
-                else:
-                    self.request_stop()
+            while (slots := self._pipe.recv()) is not None:
+                self.slots = slots.count
         self.request_stop()
 
 

@@ -15,7 +15,7 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 from peewee import (
     AutoField,
@@ -29,7 +29,7 @@ from peewee import (
     TextField,
 )
 
-from runner.client.jobs import OVER, EventKind
+from runner.client.jobs import OVER, EventData, JobEvent, LogEvent, RunEvent, StateEvent
 from runner.config.document import read_yaml, write_yaml
 from runner.errors import RunnerError, StorageError
 from runner.runs.locking import acquired
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 
 Kind = Literal["config", "sweep"]
 State = Literal["queued", "running", "interrupted", "finished", "failed", "cancelled"]
-EventData: TypeAlias = Mapping[str, Any]
 
 FOLDER: Final = ".jobs"
 DATABASE_FILE: Final = "jobs.sqlite"
@@ -76,15 +75,6 @@ class Job:
     def is_over(self) -> bool:
         """Whether nothing more happens unless a user resumes it."""
         return self.state in OVER
-
-
-@dataclass(frozen=True)
-class Event:
-    """A stored event of a job: of progress, only the latest is of interest, and none is stored."""
-
-    id: int
-    kind: EventKind
-    data: dict[str, Any]
 
 
 class _JobRow(Model):
@@ -151,7 +141,8 @@ class JobStore:
     def __init__(self, recordings: Path, max_unfinished: int = 1000, max_over: int = 1000) -> None:
         self.recordings, self.path = recordings, recordings / FOLDER / DATABASE_FILE
         self._max_unfinished, self._max_over = max_unfinished, max_over
-        self._lock = threading.RLock()
+        self.lock = threading.RLock()
+        """Held by the methods; to be held by callers over several calls that belong together."""
         self._file_lock = lock_folder(recordings, LOCK_FILE)
         # With exclusive locking the write-ahead log needs no shared memory, so network disks will do.
         pragmas = {"locking_mode": "exclusive", "journal_mode": "wal", "synchronous": "full"}
@@ -179,13 +170,13 @@ class JobStore:
 
     def close(self) -> None:
         """Close the database, and release the folder for other processes."""
-        with self._lock:
+        with self.lock:
             self._database.close()
             self._file_lock.release()
 
     def jobs(self) -> list[Job]:
         """Return all jobs, in the order of submission."""
-        with self._lock:
+        with self.lock:
             return list(self._jobs.values())
 
     def job(self, number: int) -> Job:
@@ -194,7 +185,7 @@ class JobStore:
         Raises:
             JobNotFound: there is none.
         """
-        with self._lock:
+        with self.lock:
             if number not in self._jobs:
                 raise JobNotFound(f"no job {number}; `dualtaxi remote jobs` and the page /queue list them.")
             return self._jobs[number]
@@ -222,7 +213,7 @@ class JobStore:
             QueueFull: there are too many unfinished jobs.
             StorageError: it cannot be written; then it is not in the queue.
         """
-        with self._lock:
+        with self.lock:
             unfinished = sum(not job.is_over for job in self._jobs.values())
             if unfinished >= self._max_unfinished:
                 raise QueueFull(
@@ -252,7 +243,7 @@ class JobStore:
         Raises:
             StorageError: it cannot be written; it is changed until the next start all the same.
         """
-        with self._lock:
+        with self.lock:
             before = self.job(number)
             job = self._jobs[number] = replace(before, **changes)
             with self._transaction("free some disk"):
@@ -262,13 +253,19 @@ class JobStore:
                     self._insert_state(job)
             return job
 
-    def add_events(self, number: int, kind: EventKind, data: Sequence[EventData]) -> None:
-        """Add events to a job; those beyond the limit, or that cannot be written, are dropped."""
-        with self._lock, contextlib.suppress(StorageError), self._transaction():
-            limit = max(0, MAX_EVENTS - self._event_counts[number])
-            self._insert_events(number, kind, data[:limit])
+    def set_state(self, number: int, state: State, **changes: Any) -> Job:
+        """Do as `update`; if the disk is full, the change holds until the next start."""
+        with contextlib.suppress(StorageError):
+            return self.update(number, state=state, **changes)
+        return self.job(number)
 
-    def events(self, number: int, after: int = 0) -> tuple[list[Event], int]:
+    def log(self, number: int, lines: Sequence[LogEvent]) -> None:
+        """Add lines to the log of a job; those beyond the limit, or that cannot be written, are dropped."""
+        with self.lock, contextlib.suppress(StorageError), self._transaction():
+            limit = max(0, MAX_EVENTS - self._event_counts[number])
+            self._insert_events(number, [replace(line, time=now()) for line in lines[:limit]])
+
+    def events(self, number: int, after: int = 0) -> tuple[list[JobEvent], int]:
         """Return a job's next events, not all if there are many, and the id of the last one.
 
         Args:
@@ -278,23 +275,24 @@ class JobStore:
         Raises:
             JobNotFound: there is no such job.
         """
-        with self._lock:
+        with self.lock:
             self.job(number)
             columns = (_EventRow.id, _EventRow.kind, _EventRow.data)
             own = _EventRow.select(*columns).where(_EventRow.job == number)
             if after and not self._tuples(own.where(_EventRow.id == after)):
                 after = 0
             query = own.where(_EventRow.id > after).order_by(_EventRow.id).limit(EVENTS_PER_READ)
-            events = [Event(id_, kind, json.loads(data)) for id_, kind, data in self._tuples(query)]
-            return events, events[-1].id if events else after
+            rows = self._tuples(query)
+            events = [JobEvent.from_json(kind, json.loads(data), str(id_)) for id_, kind, data in rows]
+            return events, rows[-1][0] if rows else after
 
-    def last_events(self, number: int, limit: int) -> tuple[list[Event], int]:
+    def last_events(self, number: int, limit: int) -> tuple[list[JobEvent], int]:
         """Return the last events of a job, and the id of the last one.
 
         Raises:
             JobNotFound: there is no such job.
         """
-        with self._lock:
+        with self.lock:
             self.job(number)
             query = _EventRow.select(_EventRow.id).where(_EventRow.job == number)
             ids = self._tuples(query.order_by(_EventRow.id.desc()).limit(1).offset(limit))
@@ -302,7 +300,7 @@ class JobStore:
 
     def run_ids(self, number: int, started: bool = True) -> dict[int, str]:
         """Return the run ids of a configuration's job by seed: of started runs, or all reserved ones."""
-        with self._lock:
+        with self.lock:
             query = _RunRow.select(_RunRow.seed, _RunRow.run_id).where(_RunRow.job == number)
             query = query.where(_RunRow.started) if started else query
             return dict(sorted((int(seed), run_id) for seed, run_id in self._tuples(query)))
@@ -313,15 +311,15 @@ class JobStore:
         Raises:
             StorageError: they cannot be written.
         """
-        with self._lock, self._transaction("free some disk"):
+        with self.lock, self._transaction("free some disk"):
             for seed, run_id in run_ids.items():
                 self._insert_run(number, seed, run_id, started=False)
 
     def start_run(self, number: int, seed: int, run_id: str) -> None:
         """Store that a run was started, as an event too."""
-        with self._lock, contextlib.suppress(StorageError), self._transaction():
+        with self.lock, contextlib.suppress(StorageError), self._transaction():
             self._insert_run(number, seed, run_id, started=True)
-            self._insert_events(number, "run", [{"run_id": run_id, "seed": seed, "time": now()}])
+            self._insert_events(number, [RunEvent(run_id, seed, now())])
 
     def submitted(self, number: int) -> str:
         """Return the text of a job as it was submitted.
@@ -337,7 +335,7 @@ class JobStore:
         return dict(read_yaml(self._column(number, _JobRow.values), f"job {number}").value)
 
     def _column(self, number: int, column: TextField) -> str:
-        with self._lock:
+        with self.lock:
             ((text,),) = self._tuples(_JobRow.select(column).where(_JobRow.number == number))
             return str(text)
 
@@ -345,15 +343,15 @@ class JobStore:
         return list(query.tuples().execute(self._database))
 
     def _insert_state(self, job: Job) -> None:
-        error = {"error": job.error} if job.error else {}
-        self._insert_events(job.number, "state", [{"state": job.state, "time": now()} | error])
+        self._insert_events(job.number, [StateEvent(job.state, job.error or None, now())])
 
     def _insert_run(self, number: int, seed: int, run_id: str, started: bool) -> None:
         row = {"job": number, "seed": str(seed), "run_id": run_id, "started": started}
         _RunRow.insert(row).on_conflict_replace().execute(self._database)
 
-    def _insert_events(self, number: int, kind: EventKind, data: Sequence[EventData]) -> None:
-        rows = [{"job": number, "kind": kind, "data": json.dumps(each)} for each in data]
+    def _insert_events(self, number: int, data: Sequence[EventData]) -> None:
+        events = map(JobEvent, data)
+        rows = [{"job": number, "kind": each.kind, "data": json.dumps(each.as_json())} for each in events]
         if rows:
             _EventRow.insert_many(rows).execute(self._database)
             self._event_counts[number] += len(rows)

@@ -7,13 +7,14 @@ import math
 import time
 from collections.abc import Callable, Iterator
 
-from runner.client.jobs import BestTrial, SweepProgress
+from runner.client.jobs import BestTrial, LogEvent, SweepProgress
 from runner.service.jobs.channel import (
     OTHER_OWNER_SECONDS,
     REPORT_SECONDS,
     JobSpec,
     Outcome,
     PipeChannel,
+    Slots,
     wait_for_owners,
 )
 from runner.sweep import state, sweeps_in
@@ -133,7 +134,7 @@ class SlottedWorkers:
         """Confirm the number of slots, and report how many are in use, if either has changed."""
         if self._sent != (slots, self._busy):
             self._sent = slots, self._busy
-            self._channel.send("slots", max(slots, self._busy))
+            self._channel.send(Slots(max(slots, self._busy)))
 
 
 class _SweepReporter:
@@ -155,7 +156,7 @@ class _SweepReporter:
         if best is not None and best.number != self._best:
             self._best = best.number
             text = f"trial {best.number} is the best so far: {best.value:g}"
-            self._channel.send("log", [{"text": text}])
+            self._channel.send((LogEvent(text),))
         shown = None
         if best is not None:
             # A level that was never reached is infinite or None; JSON has no infinity.
@@ -170,4 +171,4 @@ class _SweepReporter:
             bytes=status.bytes,
             best=shown,
         )
-        self._channel.send("progress", progress)
+        self._channel.send(progress)

@@ -10,7 +10,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
-from runner.client.jobs import RunProgress
+from runner.client.jobs import LogEvent, RunEvent, RunProgress
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
 from runner.errors import RunnerError
@@ -44,12 +44,12 @@ def work(pipe: Connection, spec: JobSpec) -> None:
     channel = PipeChannel(pipe)
     signal.signal(signal.SIGTERM, channel.request_stop)
     try:
-        with announced(lambda: channel.send("log", [{"text": MESSAGE}])):
+        with announced(lambda: channel.send((LogEvent(MESSAGE),))):
             outcome = (run_sweep_job if spec.kind == "sweep" else run_config_job)(spec, channel)
     except RunnerError as error:
         message = "\n".join([str(error), *getattr(error, "__notes__", [])])
         outcome = Outcome("failed", without_folders(message, spec.recordings))
-    channel.send("over", outcome)
+    channel.send(outcome)
 
 
 def run_config_job(spec: JobSpec, channel: JobChannel) -> Outcome:
@@ -104,11 +104,9 @@ class Reporter:
     def __init__(self, channel: JobChannel, run_id: str, config: ExperimentConfig, seed: int) -> None:
         self._channel = channel
         self._run_id, self._seed, self._seeds = run_id, seed, config.seeds
-        self._source = {"run_id": run_id, "seed": seed}
-        """What an event says of the run that it comes from."""
         self._sent, self._logged = 0.0, 0
         self._progress: Progress | None = None
-        channel.send("run", self._source)
+        channel.send(RunEvent(run_id, seed))
 
     def report(self, progress: Progress) -> None:
         """Accept the run's progress."""
@@ -122,7 +120,7 @@ class Reporter:
         if (progress := self._progress) is None:
             return
         if lines := progress.log[self._logged :]:
-            self._channel.send("log", [self._source | {"text": text[:MAX_TEXT]} for text in lines])
+            self._channel.send(tuple(LogEvent(text[:MAX_TEXT], self._run_id, self._seed) for text in lines))
         self._logged = len(progress.log)
         sent = RunProgress(
             run_id=self._run_id,
@@ -136,7 +134,7 @@ class Reporter:
             bytes=progress.bytes_written,
             last_evaluation=evaluation_brief(progress.evaluations[-1]) if progress.evaluations else None,
         )
-        self._channel.send("progress", sent)
+        self._channel.send(sent)
 
 
 def run_seed_on_ray(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed: int) -> str:
@@ -152,8 +150,8 @@ def run_seed_on_ray(spec: JobSpec, channel: JobChannel, config: ExperimentConfig
         is_over = False
         while not is_over:
             is_over = bool(ray.wait([result], timeout=REPORT_SECONDS)[0])
-            for kind, data in ray.get(actor.take_messages.remote()):
-                channel.send(kind, data)
+            for message in ray.get(actor.take_messages.remote()):
+                channel.send(message)
             if channel.stop():
                 actor.request_stop.remote()
         status, error_message = ray.get(result)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
-from runner.client.jobs import SweepProgress
+from runner.client.client import UploadStatus
+from runner.client.jobs import JobEvent, SweepProgress
 from runner.export.reports.rendering import View
 from runner.service.addresses import Paging
 from runner.service.api.jobs import JobResponse, Number, job_response
@@ -20,7 +20,7 @@ from runner.service.dependencies import JobsOf, UploadsOf
 from runner.service.pages.rendering import page
 
 if TYPE_CHECKING:
-    from runner.service.jobs.pool import JobPool, QueueStatus
+    from runner.service.jobs.queue import JobQueue, QueueStatus
     from runner.service.jobs.store import Job
 
 router = APIRouter(prefix="/queue", include_in_schema=False)
@@ -55,14 +55,14 @@ class _QueueRowsView(View):
 @dataclass(frozen=True)
 class _QueueView(_QueueRowsView):
     TEMPLATE: ClassVar = "queue.html"
-    uploads: list[Any]
+    uploads: list[UploadStatus]
 
 
 @dataclass(frozen=True)
 class _JobView(View):
     TEMPLATE: ClassVar = "job.html"
     job: ShownJob
-    log: list[Mapping[str, Any]]
+    log: list[JobEvent]
     place: int
     """Number of the first event after the log."""
     submitted: str
@@ -93,7 +93,7 @@ def job(request: Request, jobs: JobsOf, number: Number) -> Response:
     found = jobs.store.job(number)  # read after its log: the script of the page receives later events
     view = _JobView(
         job=shown_job(found, jobs),
-        log=[{"kind": event.kind, **event.data} for event in events],
+        log=events,
         place=place,
         submitted=jobs.store.submitted(number),
         is_over=found.is_over,
@@ -116,7 +116,7 @@ def resume(jobs: JobsOf, number: Number) -> Response:
     return RedirectResponse(f"/queue/{number}", HTTPStatus.SEE_OTHER)
 
 
-def shown_job(job: Job, jobs: JobPool) -> ShownJob:
+def shown_job(job: Job, jobs: JobQueue) -> ShownJob:
     """Return a job with its progress."""
     facts = job_response(job, jobs)
     now = facts.progress
@@ -129,7 +129,7 @@ def shown_job(job: Job, jobs: JobPool) -> ShownJob:
     return ShownJob(facts, share, f"{now.episode:,} of {now.episodes:,} episodes{run}")
 
 
-def _rows(jobs: JobPool, number: int) -> tuple[list[ShownJob], QueueStatus, bool, Paging]:
+def _rows(jobs: JobQueue, number: int) -> tuple[list[ShownJob], QueueStatus, bool, Paging]:
     """Return the fields of `_QueueRowsView`."""
     newest_first = list(reversed(jobs.store.jobs()))
     shown = [shown_job(job, jobs) for job in newest_first[(number - 1) * ROWS : number * ROWS]]

@@ -45,7 +45,7 @@ from runner.service.pages.rendering import Form, message_of, page
 from runner.util import humanize
 
 if TYPE_CHECKING:
-    from runner.service.jobs.pool import JobPool
+    from runner.service.jobs.queue import JobQueue
     from runner.service.processes import ProcessPool
     from runner.service.response_cache import ResponseCache
     from runner.service.settings import Settings
@@ -236,12 +236,12 @@ async def _random_policy(run: Run, cache: ResponseCache, processes: ProcessPool)
 
 
 def _overview(
-    run: Run, jobs: JobPool, settings: Settings, random_policy: str = "", problem: str = ""
+    run: Run, jobs: JobQueue, settings: Settings, random_policy: str = "", problem: str = ""
 ) -> _OverviewView:
     return _OverviewView(head_of(run), "", _status(run, jobs, settings), random_policy, problem)
 
 
-def _status(run: Run, jobs: JobPool, settings: Settings) -> Status:
+def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:
     number, live = _job_of(run, jobs)
     summary = live or run.summary
     episodes = summary.get("episode", summary.get("episodes"))
@@ -293,11 +293,11 @@ def _results(run: Run, last: EvaluationMetrics) -> dict[str, str]:
     return {name: text for name, text in measures.items() if humanize.UNKNOWN not in text} | logged
 
 
-def _job_of(run: Run, jobs: JobPool) -> tuple[int | None, dict[str, Any]]:
+def _job_of(run: Run, jobs: JobQueue) -> tuple[int | None, dict[str, Any]]:
     """Return the job that makes a run, or will resume it, and the run's progress in it."""
     for job in jobs.store.jobs():
         if not job.is_over and run.run_id in jobs.store.run_ids(job.number).values():
-            progress = jobs.progress(job.number) if job.state == "running" else None
+            progress = jobs.pool.progress(job.number) if job.state == "running" else None
             is_at_run = isinstance(progress, RunProgress) and progress.run_id == run.run_id
             return job.number, vars(progress) if is_at_run else {}
     return None, {}

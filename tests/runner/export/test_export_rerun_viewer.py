@@ -22,9 +22,9 @@ from runner.cli import cli, progress
 from runner.errors import RunnerError, StorageError
 from runner.export.rerun import live as live_view
 from runner.export.rerun import viewer, writing
+from runner.export.rerun.cache import cached_export
 from runner.export.rerun.live import LiveView
 from runner.export.rerun.selection import Request, locate
-from runner.export.rerun.writing import cached_export
 from runner.recording import schema
 from runner.recording.reader import open_recording
 

@@ -13,8 +13,8 @@ from submitted import ENDLESS, ICY
 import runner
 from runner.config import from_mapping
 from runner.runs.run import list_runs
-from runner.service.jobs import pool
-from runner.service.jobs.pool import JobPool
+from runner.service.jobs import queue, workers
+from runner.service.jobs.queue import JobQueue
 from tests.waiting import until
 
 CONFIG = ICY | {"episodes": 200, "evaluation": {"every": 100, "trials": 5}}
@@ -214,11 +214,12 @@ def test_a_text_can_be_checked_without_being_queued(client):
 
 
 def test_a_job_that_is_too_large_is_refused_and_a_full_disk_delays_jobs(client, submit, monkeypatch):
-    monkeypatch.setattr(pool, "free_bytes", lambda _: 1000)
+    monkeypatch.setattr(queue, "free_bytes", lambda _: 1000)
     refused = client.post("/api/v1/jobs", content=json.dumps(CONFIG))
     assert refused.status_code == 507
     assert "its recordings need about" in refused.json()["error"]["message"]
-    monkeypatch.setattr(pool, "free_bytes", lambda _: pool.RESERVE_BYTES - 1)
+    for module in (queue, workers):
+        monkeypatch.setattr(module, "free_bytes", lambda _: workers.RESERVE_BYTES - 1)
     number = submit(CONFIG | {"seeds": [0]})
     time.sleep(0.5)
     assert job(client, number)["state"] == "queued"
@@ -243,10 +244,10 @@ def test_the_submitted_text_is_returned(client, submit):
 @pytest.mark.parametrize("folder", ["missing", "there"])
 def test_a_reserved_run_that_was_never_made_is_made(tmp_path, folder):
     """The server reserved the run's id, or the worker made its folder as well, and was killed."""
-    with JobPool(tmp_path, 1) as jobs:
+    with JobQueue(tmp_path, 1) as jobs:
         if folder == "there":
             (jobs.recordings / "abcdefgh").mkdir()
-        with jobs._lock:
+        with jobs.store.lock:
             queued = jobs.store.add(
                 "config", "icy", 1, "", from_mapping(CONFIG | {"seeds": [3]}).to_mapping()
             )
@@ -265,7 +266,7 @@ def test_a_worker_that_cannot_be_started_is_retried_and_readiness_reports_it(
     def refused(_):
         raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
 
-    monkeypatch.setattr(pool, "RETRY_SECONDS", 0.05)
+    monkeypatch.setattr(workers, "RETRY_SECONDS", 0.05)
     with monkeypatch.context() as full:
         full.setattr(SpawnProcess, "start", refused)
         number = jobs_of(client).store.add("config", "icy", 1, "", one_seed()).number
@@ -282,14 +283,14 @@ def test_a_worker_that_cannot_be_started_is_retried_and_readiness_reports_it(
 
 def test_an_error_of_one_job_does_not_stop_the_others(client, submit, monkeypatch):
     jobs = jobs_of(client)
-    add_events = jobs.store.add_events
+    log = jobs.store.log
 
-    def failing(number, *facts):
+    def failing(number, lines):
         if number == 1:
             raise RuntimeError("our own fault")
-        add_events(number, *facts)
+        log(number, lines)
 
-    monkeypatch.setattr(jobs.store, "add_events", failing)
+    monkeypatch.setattr(jobs.store, "log", failing)
     numbers = [submit(CONFIG | {"seeds": [0]}) for _ in range(2)]
     for number in numbers:
         job_until(client, number, lambda job: job["state"] == "finished")
@@ -302,7 +303,7 @@ def test_readiness_reports_a_dead_job_thread(client, monkeypatch):
         raise SystemExit
 
     jobs = jobs_of(client)
-    monkeypatch.setattr(jobs, "_receive", fatal)
+    monkeypatch.setattr(jobs.pool, "_receive", fatal)
     until(lambda ready: ready.status_code == 503, lambda: client.get("/readyz"))
     assert client.get("/readyz").json()["checks"]["jobs_can_be_started"] is False
 
@@ -312,7 +313,7 @@ def test_a_cancelled_job_is_not_forgotten_while_its_worker_closes(client, submit
     jobs.store._max_over = 0
     number = submit(ENDLESS)
     job_until(client, number, lambda job: job["progress"] is not None)
-    with jobs._lock:  # the worker's end is not taken in before the next job is there
+    with jobs.store.lock:  # the worker's end is not taken in before the next job is there
         jobs.cancel(number)
         other = jobs.store.add("config", "icy", 1, "", one_seed()).number
     job_until(client, other, lambda job: job["state"] == "finished")

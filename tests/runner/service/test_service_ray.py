@@ -11,7 +11,7 @@ import runner
 from runner.recording.reader import open_recording
 from runner.runs.run import list_runs
 from runner.service.jobs.checking import check
-from runner.service.jobs.pool import JobPool
+from runner.service.jobs.queue import JobQueue
 from tests.waiting import until
 
 pytest.importorskip("ray")
@@ -35,7 +35,7 @@ def cluster():
 
 def test_a_job_on_ray_gives_the_same_runs_and_can_be_cancelled(cluster, tmp_path):
     here = runner.run_all(ICY, recordings=tmp_path / "here")
-    with JobPool(tmp_path / "far", 1, ray=cluster) as jobs:
+    with JobQueue(tmp_path / "far", 1, ray=cluster) as jobs:
         number = submit(jobs, ICY).number
         over = until(lambda job: job.is_over, lambda: jobs.store.job(number))
         assert over.state == "finished", over.error

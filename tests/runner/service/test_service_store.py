@@ -7,6 +7,7 @@ import os
 import peewee
 import pytest
 
+from runner.client.jobs import LogEvent
 from runner.errors import RunnerError, StorageError
 from runner.service.errors import JobNotFound, QueueFull
 from runner.service.jobs import store as stores
@@ -20,7 +21,7 @@ def added(store, name="tiny"):
 
 
 def texts(events):
-    return [event.data.get("text", event.data.get("state")) for event in events]
+    return [getattr(event.data, "text", getattr(event.data, "state", None)) for event in events]
 
 
 @pytest.fixture
@@ -33,7 +34,7 @@ def test_jobs_their_runs_and_events_outlive_the_process(tmp_path):
     with JobStore(tmp_path) as store:
         first, second = added(store), added(store, "other")
         store.update(first.number, state="failed", error="no luck")
-        store.add_events(second.number, "log", [{"text": "hello"}])
+        store.log(second.number, [LogEvent("hello")])
         store.reserve_runs(second.number, {2**64 - 1: "aaaa", 3: "bbbb"})
         store.start_run(second.number, 3, "bbbb")
         before, events = store.jobs(), store.events(second.number)
@@ -89,11 +90,11 @@ def test_a_file_that_is_no_database_is_reported_and_kept(tmp_path):
 
 def test_a_reader_continues_after_the_last_event_it_saw(store):
     number, other = added(store).number, added(store).number
-    store.add_events(number, "log", [{"text": "one"}])
+    store.log(number, [LogEvent("one")])
     seen, last = store.events(number)
-    store.add_events(number, "log", [{"text": "two — ü"}])
+    store.log(number, [LogEvent("two — ü")])
     assert texts(seen) == ["queued", "one"]
-    assert seen[-1].id == last
+    assert int(seen[-1].id) == last
     assert texts(store.events(number, last)[0]) == ["two — ü"]
     for id_ in (last + 3, 10**9, store.events(other)[1]):
         assert store.events(number, id_)[0] == store.events(number)[0], "it is no event of the job"
@@ -104,7 +105,7 @@ def test_many_events_are_read_in_parts_and_too_many_are_dropped(store, monkeypat
     monkeypatch.setattr(stores, "MAX_EVENTS", 100)
     number = added(store).number
     for i in range(0, 200, 4):
-        store.add_events(number, "log", [{"text": f"line {i + j}"} for j in range(4)])
+        store.log(number, [LogEvent(f"line {i + j}") for j in range(4)])
     store.update(number, state="finished")
     found, last = [], 0
     while (part := store.events(number, last))[0]:
@@ -139,7 +140,7 @@ def test_on_a_full_disk_a_job_is_not_queued_and_a_change_counts_until_the_next_s
 def test_the_last_events_are_read(store):
     number = added(store).number
     assert texts(store.last_events(number, 10)[0]) == ["queued"]
-    store.add_events(number, "log", [{"text": f"line {i}"} for i in range(100)])
+    store.log(number, [LogEvent(f"line {i}") for i in range(100)])
     found, last = store.last_events(number, 10)
     assert texts(found) == [f"line {i}" for i in range(90, 100)]
     assert store.events(number, last) == ([], last)

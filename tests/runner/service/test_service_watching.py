@@ -11,7 +11,7 @@ from submitted import ENDLESS, ICY
 
 from runner.client.client import Client
 from runner.client.connection import ServerError
-from runner.client.jobs import JobEvent, RemoteJob, parse_events
+from runner.client.jobs import BestTrial, JobEvent, LogEvent, RemoteJob, SweepProgress, parse_events
 from runner.errors import RunnerError
 from runner.runs.run import list_runs
 
@@ -35,11 +35,11 @@ def test_a_watcher_receives_every_event_once_although_the_server_is_killed(tmp_p
         server.start()
         watcher.join(60)
         assert not watcher.is_alive()
-    states = [event.data["state"] for event in seen if event.kind == "state"]
+    states = [event.data.state for event in seen if event.kind == "state"]
     assert states[0] == "queued"
     assert states.count("finished") == 1
     assert states[-1] == "finished"
-    lines = [event.data["text"] for event in seen if event.kind == "log"]
+    lines = [event.data.text for event in seen if event.kind == "log"]
     evaluations = [text for text in lines if text.startswith("evaluation")]
     assert len(evaluations) == len(set(evaluations)) > 3
     places = [int(event.id) for event in seen if event.id]
@@ -55,8 +55,8 @@ def test_jobs_are_submitted_listed_cancelled_and_resumed(tmp_path):
         assert [job.number for job in client.jobs()] == [second.number, first.number]
         assert client.cancel(first.number).is_over
         *_, last = client.watch(second.number)
-        assert last == JobEvent("state", last.data, last.id)
-        assert last.data["state"] == "finished"
+        assert last.kind == "state"
+        assert last.data.state == "finished"
         done = client.job(second.number)
         assert sorted(done.begun.values()) == sorted(
             run.run_id for run in list_runs(tmp_path) if run.status == "finished"
@@ -71,9 +71,23 @@ def test_jobs_are_submitted_listed_cancelled_and_resumed(tmp_path):
 def test_events_are_parsed_without_an_incomplete_last_one():
     lines = ["retry: 1000", "", ": still here", "", "id: 7", "event: log", 'data: {"text": "a: b"}', ""]
     cut_off = ["id: 9", "event: state", 'data: {"sta']
-    assert list(parse_events([*lines, *cut_off])) == [JobEvent("log", {"text": "a: b"}, "7")]
+    assert list(parse_events([*lines, *cut_off])) == [JobEvent(LogEvent("a: b"), "7")]
 
 
 def test_a_response_without_a_job_is_reported():
     with pytest.raises(RunnerError, match="found an unexpected response"):
         RemoteJob.from_json({"number": 1})
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"), [("log", {"line": 1}), ("gossip", {}), ("progress", {"done": 1}), ("state", [])]
+)
+def test_an_event_that_is_none_is_reported(kind, values):
+    with pytest.raises(RunnerError, match="that is not as expected"):
+        JobEvent.from_json(kind, values)
+
+
+def test_progress_is_the_same_after_a_round_trip():
+    best = BestTrial(3, None, {"step_size": 0.5})
+    event = JobEvent(SweepProgress(done=1, runs=4, running=2, pruned=0, failed=0, bytes=10, best=best))
+    assert JobEvent.from_json("progress", json.loads(json.dumps(event.as_json()))) == event

@@ -1,7 +1,4 @@
-"""The jobs of a recordings folder, run by worker processes next to the server.
-
-One thread starts the workers and receives their messages; the other methods read, or store a request.
-"""
+"""The processes that run jobs, next to the server: started, sent messages, and received from."""
 
 from __future__ import annotations
 
@@ -9,24 +6,20 @@ import contextlib
 import multiprocessing
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from multiprocessing import connection
-from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final
 
-from runner.client.jobs import JobProgress
+from runner.client.jobs import JobProgress, LogEvent, RunEvent
 from runner.config import from_mapping
 from runner.errors import StorageError
 from runner.execution.estimate import free_bytes
 from runner.runs.run import new_run_id
-from runner.service.errors import JobStateConflict
-from runner.service.jobs.channel import JobSpec, Outcome
-from runner.service.jobs.checking import CheckedJob, JobChecker
+from runner.service.jobs.channel import JobSpec, Message, Outcome, Slots
 from runner.service.jobs.store import Job, JobStore, now
 from runner.service.jobs.worker import work
 from runner.service.logs import LOG
-from runner.sweep.cluster import require_ray
 
 STOP_SECONDS: Final = 15.0
 """How long a worker may take to close its recording before it is killed."""
@@ -53,168 +46,70 @@ class _Worker:
     stopped: float | None = None
     """When the request to stop was sent."""
 
-    def send(self, kind: str, value: Any = None) -> None:
+    def send(self, slots: Slots | None) -> None:
         with contextlib.suppress(OSError):  # it is dead
-            self.pipe.send((kind, value))
+            self.pipe.send(slots)
 
     def stop(self) -> None:
         self.stopped = self.stopped or time.monotonic()
-        self.send("stop")
+        self.send(None)
 
 
-@dataclass(frozen=True)
-class QueueStatus:
-    """The state of the queue."""
+class WorkerPool:
+    """Runs the queued jobs of a store, each in a worker process.
 
-    workers: int
-    """How many processes may train at once."""
-    running: int
-    queued: int
-    free_bytes: int
-    """Of the disk of the recordings."""
-    waiting_for: str
-    """Why no further job is started although there is a worker; empty if one would be."""
-
-
-class JobPool:
-    """The jobs of a recordings folder; thread-safe.
+    One thread starts the workers and receives their messages; the other methods read, or send a request.
 
     Args:
-        recordings: the folder; created if it is missing.
-        workers: how many processes train at once.
-        max_unfinished: the maximum number of unfinished jobs.
+        store: the jobs.
+        size: how many processes train at once.
         ray: the address of a Ray cluster that does the work instead.
-
-    Raises:
-        RunnerError: another process serves the folder, or Ray is not installed.
-        StorageError: the folder cannot be written.
     """
 
-    def __init__(
-        self, recordings: Path, workers: int, *, max_unfinished: int = 1000, ray: str | None = None
-    ) -> None:
-        if ray is not None:
-            require_ray()
-        self.recordings, self.workers, self._ray = recordings.absolute(), workers, ray
-        self.store = JobStore(self.recordings, max_unfinished)
-        self.checker = JobChecker(self.recordings)
+    def __init__(self, store: JobStore, size: int, ray: str | None) -> None:
+        self.size, self._store, self._ray, self._lock = size, store, ray, store.lock
         self._context = multiprocessing.get_context("spawn")
-        self.watchers = 0
-        """Number of open event streams."""
         self._busy: dict[int, _Worker] = {}
         self._progress: dict[int, JobProgress] = {}
         """The last progress that each job's worker sent, also when the job is over."""
-        self._lock = threading.RLock()
         self._start_problem, self._retry_at = "", 0.0
         """Why the last attempt to start a worker failed, and when to try again (monotonic seconds)."""
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="jobs", daemon=True)
 
-    def __enter__(self) -> Self:
-        """Start working: jobs that the last server left running or interrupted come first."""
-        for job in self.store.jobs():
-            if job.state in ("running", "interrupted"):
-                self._update(job.number, state="queued")
+    def start(self) -> None:
+        """Start running jobs."""
         self._thread.start()
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        """Have every worker close its recording; the next server of the folder resumes its job."""
+    def stop(self) -> None:
+        """Have every worker close its recording, and wait until all have ended."""
         self._stopping.set()
         if self._thread.is_alive():
             self._thread.join()
-        self.checker.close()
-        self.store.close()
 
     @property
     def is_working(self) -> bool:
         """Whether queued jobs are started: the thread that does so is alive and can start workers."""
         return self._thread.is_alive() and not self._start_problem
 
-    def add(self, text: str, checked: CheckedJob) -> Job:
-        """Queue a text that was checked.
+    @property
+    def busy(self) -> Container[int]:
+        """The numbers of the jobs that have a worker."""
+        return self._busy
 
-        Raises:
-            QueueFull: there are too many unfinished jobs.
-            StorageError: the disk would not hold its recordings.
-            JobStateConflict: a sweep of this name is unfinished.
-        """
-        free = free_bytes(self.recordings)
-        if checked.bytes > free:
-            raise StorageError(
-                f"{checked.name}: its recordings need about {checked.bytes / 1e9:,.1f} GB, and "
-                f"{free / 1e9:,.1f} GB are free: free some, or record less (recording.steps, seeds)."
-            )
+    def stop_job(self, number: int) -> None:
+        """Have the worker of a job, if it has one, close its recording."""
         with self._lock:
-            if checked.kind == "sweep":
-                self._refuse_running_sweep(checked.name)
-            return self.store.add(
-                checked.kind, checked.name, checked.runs, text, checked.values, keep=self._busy
-            )
-
-    def cancel(self, number: int) -> Job:
-        """Cancel a job; its worker closes its recording, which stays.
-
-        Raises:
-            JobNotFound: there is none.
-            JobStateConflict: it is over.
-        """
-        with self._lock:
-            job = self.store.job(number)
-            if job.is_over:
-                raise JobStateConflict(f"job {number} is {job.state} already; there is nothing to cancel.")
-            job = self._update(number, state="cancelled", ended=now())
             if number in self._busy:
                 self._busy[number].stop()
-            return job
-
-    def resume(self, number: int, accept_changes: bool = False) -> Job:
-        """Queue a failed or cancelled job again; it continues where it stopped.
-
-        Args:
-            number: the job's number.
-            accept_changes: resume runs that were started by other code.
-
-        Raises:
-            JobNotFound: there is none.
-            JobStateConflict: it is finished, or not over yet.
-        """
-        with self._lock:
-            job = self.store.job(number)
-            if job.state not in ("failed", "cancelled"):
-                hint = "there is nothing to do" if job.state == "finished" else "wait for its end"
-                raise JobStateConflict(f"job {number} is {job.state}; {hint}.")
-            if job.kind == "sweep":
-                self._refuse_running_sweep(job.name)
-            options = {"accept_changes": accept_changes, "retry": True}
-            return self._update(number, state="queued", error="", ended="", deaths=0, **options)
 
     def progress(self, number: int) -> JobProgress | None:
         """Return the progress that a job's worker last sent, also when it is over; None if none did."""
-        with self._lock:
-            return self._progress.get(number)
+        return self._progress.get(number)
 
-    def status(self) -> QueueStatus:
-        """Return the state of the queue."""
-        with self._lock:
-            states = [job.state for job in self.store.jobs()]
-            return QueueStatus(
-                self.workers,
-                states.count("running"),
-                states.count("queued"),
-                free_bytes(self.recordings),
-                self._start_problem or self._short_of_disk(),
-            )
-
-    def _update(self, number: int, **changes: Any) -> Job:
-        with contextlib.suppress(StorageError):  # a full disk does not stop the other jobs
-            return self.store.update(number, **changes)
-        return self.store.job(number)
-
-    def _refuse_running_sweep(self, name: str) -> None:
-        for job in self.store.jobs():
-            if job.kind == "sweep" and job.name == name and not job.is_over:
-                raise JobStateConflict(f"job {job.number} does the sweep {name!r} already.")
+    def waiting_for(self) -> str:
+        """Return why no further job is started although there is a worker; empty if one would be."""
+        return self._start_problem or self._short_of_disk()
 
     def _run(self) -> None:
         """Start workers and receive their messages, until the server stops."""
@@ -233,12 +128,12 @@ class JobPool:
 
     def _start_next(self) -> None:
         """Start a worker for the first queued job, if there is a slot."""
-        job = next((job for job in self.store.jobs() if job.state == "queued"), None)
+        job = next((job for job in self._store.jobs() if job.state == "queued"), None)
         if job is None:
             self._start_problem = ""
             return
         slots = sum(max(worker.slots, worker.confirmed) for worker in self._busy.values())
-        if slots >= self.workers or job.number in self._busy or self._short_of_disk():
+        if slots >= self.size or job.number in self._busy or self._short_of_disk():
             return
         if time.monotonic() < self._retry_at:
             return
@@ -252,12 +147,12 @@ class JobPool:
             return
         except Exception as error:
             problem = f"its worker cannot be started: {error}"
-            self._update(job.number, state="failed", error=problem, ended=now())
+            self._store.set_state(job.number, "failed", error=problem, ended=now())
             raise
         self._start_problem = ""
-        remembered = {each.number for each in self.store.jobs()} - {job.number}
+        remembered = {each.number for each in self._store.jobs()} - {job.number}
         self._progress = {number: last for number, last in self._progress.items() if number in remembered}
-        self._update(job.number, state="running", started=job.started or now())
+        self._store.set_state(job.number, "running", started=job.started or now())
 
     def _start_worker(self, job: Job) -> _Worker:
         """Start the worker process of a job.
@@ -266,14 +161,14 @@ class JobPool:
             OSError: the system has no process, pipe or memory for it.
             StorageError: the ids of its runs cannot be stored.
         """
-        values = self.store.values(job.number)
+        values = self._store.values(job.number)
         spec = JobSpec(
             number=job.number,
             kind=job.kind,
             name=job.name,
             values=values,
             run_ids=self._reserved_runs(job, values),
-            recordings=self.recordings,
+            recordings=self._store.recordings,
             accept_changes=job.accept_changes,
             retry=job.retry,
             ray=self._ray,
@@ -293,29 +188,29 @@ class JobPool:
         """Return the run id of each seed, stored before the run exists: so no run is started twice."""
         if job.kind == "sweep":
             return {}
-        run_ids = self.store.run_ids(job.number, started=False)
+        run_ids = self._store.run_ids(job.number, started=False)
         seeds = [seed for seed in from_mapping(values).seeds if seed not in run_ids]
-        missing = {seed: new_run_id(self.recordings) for seed in seeds}
-        self.store.reserve_runs(job.number, missing)
+        missing = {seed: new_run_id(self._store.recordings) for seed in seeds}
+        self._store.reserve_runs(job.number, missing)
         return run_ids | missing
 
     def _share_slots(self) -> None:
         """Give the slots that no job waits for to the first sweep, and take them back when one does."""
         if self._ray is not None:
             return  # a sweep's workers are the cluster's
-        jobs = {job.number: job for job in self.store.jobs()}
+        jobs = {job.number: job for job in self._store.jobs()}
         is_waiting = any(job.state == "queued" for job in jobs.values()) and not self._short_of_disk()
-        spare = max(0, self.workers - len(self._busy) - is_waiting)
+        spare = max(0, self.size - len(self._busy) - is_waiting)
         for number, worker in sorted(self._busy.items()):
             slots = 1
             if jobs[number].kind == "sweep":
                 slots, spare = 1 + spare, 0
             if slots != worker.slots:
                 worker.slots = slots
-                worker.send("slots", slots)
+                worker.send(Slots(slots))
 
     def _short_of_disk(self) -> str:
-        free = free_bytes(self.recordings)
+        free = free_bytes(self._store.recordings)
         if free >= RESERVE_BYTES:
             return ""
         needed = f"{RESERVE_BYTES / 1e6:,.0f} MB"
@@ -337,7 +232,7 @@ class JobPool:
     def _receive_from(self, worker: _Worker) -> None:
         """Handle one message of a worker, or its end."""
         try:
-            kind, value = worker.pipe.recv()
+            message: Message = worker.pipe.recv()
         except Exception as error:
             if not isinstance(error, EOFError | OSError):  # after an unpicklable message the pipe is useless
                 LOG.exception("jobs")
@@ -346,26 +241,26 @@ class JobPool:
             return
         number = worker.number
         with self._lock:
-            if kind == "over":
-                worker.outcome = value
-                self._store_outcome(self.store.job(number), value)
-            elif kind == "progress":
-                self._progress[number] = value
-            elif kind == "slots":
-                worker.confirmed = value
-            elif kind == "run":
-                self.store.start_run(number, value["seed"], value["run_id"])
+            if isinstance(message, Outcome):
+                worker.outcome = message
+                self._store_outcome(self._store.job(number), message)
+            elif isinstance(message, Slots):
+                worker.confirmed = message.count
+            elif isinstance(message, RunEvent):
+                self._store.start_run(number, message.seed, message.run_id)
+            elif isinstance(message, tuple):
+                self._store.log(number, message)
             else:
-                self.store.add_events(number, kind, [data | {"time": now()} for data in value])
+                self._progress[number] = message
 
     def _store_outcome(self, job: Job, outcome: Outcome) -> None:
         """Store the outcome of a job; one that was cancelled, and perhaps queued again, keeps its state."""
         if job.state != "running":
             return
         if outcome.state == "interrupted":
-            self._update(job.number, state="interrupted" if self._stopping.is_set() else "queued")
+            self._store.set_state(job.number, "interrupted" if self._stopping.is_set() else "queued")
         else:
-            self._update(job.number, state=outcome.state, error=outcome.error, ended=now())
+            self._store.set_state(job.number, outcome.state, error=outcome.error, ended=now())
 
     def _remove(self, worker: _Worker) -> None:
         """Remove a worker whose process has ended, or is about to; queue its job again if it died, once."""
@@ -376,17 +271,16 @@ class JobPool:
             worker.process.join()
         with self._lock:
             del self._busy[worker.number]
-            job = self.store.job(worker.number)
+            job = self._store.job(worker.number)
             if worker.outcome is not None or job.state != "running":
                 return
             code, deaths = worker.process.exitcode, job.deaths + 1
-            death = {"text": f"the worker died (exit code {code})", "time": now()}
-            self.store.add_events(job.number, "log", [death])
+            self._store.log(job.number, [LogEvent(f"the worker died (exit code {code})")])
             if deaths < MAX_DEATHS:
-                self._update(job.number, state="queued", deaths=deaths)
+                self._store.set_state(job.number, "queued", deaths=deaths)
                 return
             error = f"its worker died {deaths} times, at last with exit code {code}; was there enough memory?"
-            self._update(job.number, state="failed", deaths=deaths, error=error, ended=now())
+            self._store.set_state(job.number, "failed", deaths=deaths, error=error, ended=now())
 
 
 @contextlib.contextmanager

@@ -1,0 +1,143 @@
+"""The queue of jobs: what can be requested of it; `WorkerPool` runs them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from runner.errors import StorageError
+from runner.execution.estimate import free_bytes
+from runner.service.errors import JobStateConflict
+from runner.service.jobs.checking import CheckedJob, JobChecker
+from runner.service.jobs.store import Job, JobStore, now
+from runner.service.jobs.workers import WorkerPool
+from runner.sweep.cluster import require_ray
+
+
+@dataclass(frozen=True)
+class QueueStatus:
+    """The state of the queue."""
+
+    workers: int
+    """How many processes may train at once."""
+    running: int
+    queued: int
+    free_bytes: int
+    """Of the disk of the recordings."""
+    waiting_for: str
+    """Why no further job is started although there is a worker; empty if one would be."""
+
+
+class JobQueue:
+    """The jobs of a recordings folder; thread-safe.
+
+    Args:
+        recordings: the folder; created if it is missing.
+        workers: how many processes train at once.
+        max_unfinished: the maximum number of unfinished jobs.
+        ray: the address of a Ray cluster that does the work instead.
+
+    Raises:
+        RunnerError: another process serves the folder, or Ray is not installed.
+        StorageError: the folder cannot be written.
+    """
+
+    def __init__(
+        self, recordings: Path, workers: int, *, max_unfinished: int = 1000, ray: str | None = None
+    ) -> None:
+        if ray is not None:
+            require_ray()
+        self.recordings = recordings.absolute()
+        self.store = JobStore(self.recordings, max_unfinished)
+        self.pool = WorkerPool(self.store, workers, ray)
+        self.checker = JobChecker(self.recordings)
+        self.watchers = 0
+        """Number of open event streams."""
+
+    def __enter__(self) -> Self:
+        """Start working: jobs that the last server left running or interrupted come first."""
+        for job in self.store.jobs():
+            if job.state in ("running", "interrupted"):
+                self.store.set_state(job.number, "queued")
+        self.pool.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Have every worker close its recording; the next server of the folder resumes its job."""
+        self.pool.stop()
+        self.checker.close()
+        self.store.close()
+
+    def add(self, text: str, checked: CheckedJob) -> Job:
+        """Queue a text that was checked.
+
+        Raises:
+            QueueFull: there are too many unfinished jobs.
+            StorageError: the disk would not hold its recordings.
+            JobStateConflict: a sweep of this name is unfinished.
+        """
+        free = free_bytes(self.recordings)
+        if checked.bytes > free:
+            raise StorageError(
+                f"{checked.name}: its recordings need about {checked.bytes / 1e9:,.1f} GB, and "
+                f"{free / 1e9:,.1f} GB are free: free some, or record less (recording.steps, seeds)."
+            )
+        with self.store.lock:
+            if checked.kind == "sweep":
+                self._refuse_running_sweep(checked.name)
+            return self.store.add(
+                checked.kind, checked.name, checked.runs, text, checked.values, keep=self.pool.busy
+            )
+
+    def cancel(self, number: int) -> Job:
+        """Cancel a job; its worker closes its recording, which stays.
+
+        Raises:
+            JobNotFound: there is none.
+            JobStateConflict: it is over.
+        """
+        with self.store.lock:
+            job = self.store.job(number)
+            if job.is_over:
+                raise JobStateConflict(f"job {number} is {job.state} already; there is nothing to cancel.")
+            job = self.store.set_state(number, "cancelled", ended=now())
+            self.pool.stop_job(number)
+            return job
+
+    def resume(self, number: int, accept_changes: bool = False) -> Job:
+        """Queue a failed or cancelled job again; it continues where it stopped.
+
+        Args:
+            number: the job's number.
+            accept_changes: resume runs that were started by other code.
+
+        Raises:
+            JobNotFound: there is none.
+            JobStateConflict: it is finished, or not over yet.
+        """
+        with self.store.lock:
+            job = self.store.job(number)
+            if job.state not in ("failed", "cancelled"):
+                hint = "there is nothing to do" if job.state == "finished" else "wait for its end"
+                raise JobStateConflict(f"job {number} is {job.state}; {hint}.")
+            if job.kind == "sweep":
+                self._refuse_running_sweep(job.name)
+            fresh = {"error": "", "ended": "", "deaths": 0, "retry": True}
+            return self.store.set_state(number, "queued", accept_changes=accept_changes, **fresh)
+
+    def status(self) -> QueueStatus:
+        """Return the state of the queue."""
+        states = [job.state for job in self.store.jobs()]
+        return QueueStatus(
+            self.pool.size,
+            states.count("running"),
+            states.count("queued"),
+            free_bytes(self.recordings),
+            self.pool.waiting_for(),
+        )
+
+    def _refuse_running_sweep(self, name: str) -> None:
+        for job in self.store.jobs():
+            if job.kind == "sweep" and job.name == name and not job.is_over:
+                raise JobStateConflict(f"job {job.number} does the sweep {name!r} already.")
