@@ -1,17 +1,16 @@
 """References to a step of an episode, as commands (`view --at`) and addresses of pages (`?at=`) have them.
 
-    120:5            step 5 of training episode 120; `120` is its first step
-    eval:3000:17:5   step 5 of trial 17 of the evaluation after 3,000 training episodes;
-                     `eval:3000` is the first step of its first trial
-
-Parsed it is (episode, t), or (training episodes before the evaluation, trial, t).
+120:5            step 5 of training episode 120; `120` is its first step
+eval:3000:17:5   step 5 of trial 17 of the evaluation after 3,000 training episodes;
+`eval:3000` is the first step of its first trial
 """
 
 from __future__ import annotations
 
+import dataclasses
 import re
-from collections.abc import Sequence
-from typing import Final
+from dataclasses import dataclass
+from typing import Final, Self
 
 from runner.errors import RunnerError
 
@@ -21,23 +20,52 @@ _TRAINING: Final = re.compile(f"{_NUMBER}(?::{_NUMBER})?")
 _EVALUATION: Final = re.compile(f"eval:{_NUMBER}(?::{_NUMBER})?(?::{_NUMBER})?")
 
 
-def parse_step_reference(text: str) -> tuple[int, ...]:
-    """Return (episode, t), or (training episodes, trial, t) of an evaluation.
+@dataclass(frozen=True)
+class StepRef:
+    """A step of a training episode, or of a trial of an evaluation."""
 
-    Raises:
-        RunnerError: the text is no step reference.
-    """
-    match = _TRAINING.fullmatch(text) or _EVALUATION.fullmatch(text)
-    if match is None:
+    episode: int
+    """The training episode, or the trial."""
+    t: int = 0
+    after: int | None = None
+    """The training episodes before the evaluation; None for a training episode."""
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Return the step that a text refers to.
+
+        Raises:
+            RunnerError: the text is no step reference.
+        """
+        if match := _TRAINING.fullmatch(text):
+            return cls(*(int(part or 0) for part in match.groups()))
+        if match := _EVALUATION.fullmatch(text):
+            after, trial, t = (int(part or 0) for part in match.groups())
+            return cls(trial, t, after)
         raise RunnerError(f"found {text[:60]!r}, expected {EXPECTED}.")
-    return tuple(int(part or 0) for part in match.groups())
 
+    def __str__(self) -> str:
+        """Return the text that `parse` takes."""
+        return f"{self.episode_text}:{self.t}"
 
-def step_reference(step: Sequence[int]) -> str:
-    """Return the text that `parse_step_reference` parses to this step."""
-    return f"{episode_reference(step)}:{step[-1]}"
+    @property
+    def episode_text(self) -> str:
+        """The part of the text that names the episode: all without the `:T`."""
+        return str(self.episode) if self.after is None else f"eval:{self.after}:{self.episode}"
 
+    @property
+    def episode_path(self) -> str:
+        """The address of the episode, below that of its run's replay: `train/120`, `eval/3000/17`."""
+        return f"train/{self.episode}" if self.after is None else f"eval/{self.after}/{self.episode}"
 
-def episode_reference(step: Sequence[int]) -> str:
-    """Return the part of a step's reference that names the episode: all without the `:T`."""
-    return ":".join(map(str, step[:-1] if len(step) == 2 else ["eval", *step[:-1]]))
+    @property
+    def episode_name(self) -> str:
+        """The name of the episode."""
+        if self.after is None:
+            return f"Training episode {self.episode:,}"
+        return f"Trial {self.episode} of the evaluation after {self.after:,} episodes"
+
+    @property
+    def outcome(self) -> StepRef:
+        """The frame after the step, which shows its outcome."""
+        return dataclasses.replace(self, t=self.t + 1)

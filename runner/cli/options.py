@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 from click.shell_completion import CompletionItem
 
 from runner.errors import RunnerError
+
+if TYPE_CHECKING:
+    from runner.analysis.step_reference import StepRef
 
 EXPORTS: Final = Path("exports")
 """Where commands write files by default; Git ignores it in a clone."""
@@ -173,10 +176,10 @@ def _grid(text: str) -> tuple[int, int]:
     return _number(rows), _number(columns)
 
 
-def _step(text: str) -> tuple[int, ...]:
-    from runner.analysis.step_reference import parse_step_reference
+def _step(text: str) -> StepRef:
+    from runner.analysis.step_reference import StepRef
 
-    return parse_step_reference(text)
+    return StepRef.parse(text)
 
 
 SHIPPED: Final = Completed("name", _shipped)

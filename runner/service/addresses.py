@@ -1,15 +1,14 @@
-"""Addresses of pages, and of steps of episodes in them.
-
-A step is a parsed step reference: (episode, t), or (training episodes before an evaluation, trial, t).
-"""
+"""Addresses of pages, and of steps of episodes in them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlencode
+
+from runner.analysis.step_reference import StepRef
 
 
 @dataclass(frozen=True)
@@ -51,23 +50,6 @@ def link(path: str, values: Mapping[str, Any]) -> str:
     return f"{path}?{urlencode(query, doseq=True)}" if query else path
 
 
-def after_step(step: Sequence[int]) -> tuple[int, ...]:
-    """Return the frame after a step, which shows its outcome."""
-    return (*step[:-1], step[-1] + 1)
-
-
-def episode_path(step: Sequence[int]) -> str:
-    """Return the address of a step's episode, below that of its run's replay."""
-    return "/".join(["train" if len(step) == 2 else "eval", *map(str, step[:-1])])
-
-
-def replay_address(run_id: str, step: Sequence[int]) -> str:
+def replay_address(run_id: str, step: StepRef) -> str:
     """Return the page of the replay at the frame after a step."""
-    return f"/runs/{run_id}/replay/{episode_path(step)}?t={after_step(step)[-1]}"
-
-
-def episode_in_words(step: Sequence[int]) -> str:
-    """Return the name of a step's episode."""
-    if len(step) == 2:
-        return f"Training episode {step[0]:,}"
-    return f"Trial {step[1]} of the evaluation after {step[0]:,} episodes"
+    return f"/runs/{run_id}/replay/{step.episode_path}?t={step.outcome.t}"

@@ -18,7 +18,7 @@ from markupsafe import Markup
 
 from runner.analysis.diff import diff, with_seconds, without_ignored
 from runner.analysis.sections import Grid, Section
-from runner.analysis.step_reference import step_reference
+from runner.analysis.step_reference import StepRef
 from runner.analysis.summary import random_policy_sentence
 from runner.drawing import svg
 from runner.errors import RecordingError, RunnerError
@@ -31,7 +31,7 @@ from runner.export.reports.rendering import Link, partials
 from runner.export.rerun.selection import Request, locate
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
-from runner.service.addresses import after_step, link
+from runner.service.addresses import link
 from runner.service.settings import without_folders
 from runner.sweep.charts import learning, picture_of, picture_plots
 from runner.sweep.page import sweep_legend
@@ -103,8 +103,8 @@ def difference(a: Run, b: Run) -> bytes:
 
     def linked(shown: ShownDivergence) -> ShownDivergence:
         runs = [a.run_id, b.run_id]
-        both = link("/compare/replay", {"run": runs, "at": step_reference(after_step(shown.step))})
-        at = step_reference(shown.step)
+        both = link("/compare/replay", {"run": runs, "at": str(shown.step.outcome)})
+        at = str(shown.step)
         viewers = [
             Link(f"{letter} in Rerun", link(f"/runs/{run}/rerun", {"at": at}))
             for letter, run in zip("AB", runs, strict=True)
@@ -117,16 +117,16 @@ def difference(a: Run, b: Run) -> bytes:
     found = {
         "lead": view.lead,
         "notes": view.notes,
-        "first_step": view.divergences[0].step if view.divergences else None,
+        "first_step": str(view.divergences[0].step) if view.divergences else None,
         "body": "".join(body),
         "tables": shown.tables(view.tables, view.table_figures),
     }
     return json.dumps(found).encode()
 
 
-def timeline_step(run: Run, at: tuple[int, ...]) -> bytes:
-    """Return the step of the viewer's timeline at (episode, t) or (training episodes before, trial, t)."""
-    return str(locate(run, Request(), at or None).time).encode()
+def timeline_step(run: Run, at: StepRef | None) -> bytes:
+    """Return the step of the viewer's timeline at a step."""
+    return str(locate(run, Request(), at).time).encode()
 
 
 def load_sweep_libraries() -> None:

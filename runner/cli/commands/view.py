@@ -16,6 +16,7 @@ from runner.cli.output import say
 from runner.cli.runs import find_recorded
 
 if TYPE_CHECKING:
+    from runner.analysis.step_reference import StepRef
     from runner.export.rerun.selection import Location
 
 
@@ -57,7 +58,7 @@ if TYPE_CHECKING:
 @recordings_option
 def view_command(
     run_names: tuple[str, ...],
-    step: tuple[int, ...] | None,
+    step: StepRef | None,
     web: bool,
     port: int,
     screenshot: Path | None,

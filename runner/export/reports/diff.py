@@ -23,6 +23,7 @@ from runner.analysis.diff.tables import common_snapshots
 from runner.analysis.groups import Group
 from runner.analysis.sections import Grid, Section
 from runner.analysis.series import read_series
+from runner.analysis.step_reference import StepRef
 from runner.drawing import svg, svg_maps
 from runner.environments.mdp import Mdp
 from runner.environments.naming import deeds_in_words, exploration_in_words, spoken, states_in_words
@@ -52,8 +53,7 @@ class ShownDivergence:
     """The first step that differs, on the page."""
 
     id: str
-    step: list[int]
-    """(episode, t) of training, or (training episodes before, trial, t) of an evaluation."""
+    step: StepRef
     title: str
     where: str
     cause: str
@@ -162,10 +162,9 @@ def _divergence(
     difference: RunDiff, divergence: Divergence, cause: Cause, a: Recording, b: Recording
 ) -> ShownDivergence:
     where, is_training = where_in_words(divergence), divergence.phase == "train"
-    before = [] if divergence.after is None else [divergence.after]
     return ShownDivergence(
         id=f"divergence-{divergence.phase}",
-        step=[*before, divergence.episode, divergence.t],
+        step=StepRef(divergence.episode, divergence.t, divergence.after),
         title="Where training diverges" if is_training else "Where an evaluation diverges",
         where=where[0].upper() + where[1:],
         cause=cause.text[0].upper() + cause.text[1:],

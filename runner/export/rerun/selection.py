@@ -14,6 +14,7 @@ from runner.analysis.diff import can_compare_steps
 from runner.analysis.diff.divergence import evaluation_divergences, training_divergence
 from runner.analysis.diff.sections import where_in_words
 from runner.analysis.evaluations import Evaluation, evaluation_after, evaluations_of
+from runner.analysis.step_reference import StepRef
 from runner.errors import RecordingError
 from runner.export.contents import require_steps, shortcomings, whole_ranges, why_no_steps
 from runner.recording import schema
@@ -140,14 +141,14 @@ def select(recording: Recording, request: Request) -> Selection:
     return selection
 
 
-def locate(run: Run, request: Request, step: tuple[int, ...] | None) -> Location:
+def locate(run: Run, request: Request, step: StepRef | None) -> Location:
     """Return where a step is on the timeline.
 
     Args:
         run: the run.
         request: what is exported anyway.
-        step: a parsed step reference, `runner.analysis.step_reference`; None for the first
-            step of the last evaluation exported, or of the last training episode if there is none.
+        step: the step; None for the first step of the last evaluation exported, or of the last training
+            episode if there is none.
 
     Raises:
         RecordingError: there is no such step, or none at all.
@@ -156,10 +157,10 @@ def locate(run: Run, request: Request, step: tuple[int, ...] | None) -> Location
         if step is None:
             return Location(_default_time(recording, request), request)
         require_steps(recording, "look at")
-        phase = "train" if len(step) == 2 else "eval"
-        episodes, t = episodes_of(recording, phase), step[-1]
-        if phase == "train":
-            number, more = step[0], Request(episodes=((step[0], step[0] + 1),))
+        phase = "train" if step.after is None else "eval"
+        episodes, t = episodes_of(recording, phase), step.t
+        if step.after is None:
+            number, more = step.episode, Request(episodes=((step.episode, step.episode + 1),))
             if number >= episodes.count:
                 raise RecordingError(
                     f"{recording.path}: found no training episode {number}; there are {episodes.count:,}, "
@@ -170,8 +171,10 @@ def locate(run: Run, request: Request, step: tuple[int, ...] | None) -> Location
             if recording.is_job:
                 evaluations = _evaluations_with_steps(recording, episodes_of(recording, "train"), episodes)
             where = str(recording.path)
-            number = evaluation_after(evaluations, step[0], where).trial(step[1], where)
-            more = Request(evaluations=(step[0],) if recording.is_job else ())  # a loop's are always exported
+            number = evaluation_after(evaluations, step.after, where).trial(step.episode, where)
+            more = Request(
+                evaluations=(step.after,) if recording.is_job else ()
+            )  # a loop's are always exported
         first, stop = episodes.first_step[number : number + 2].tolist()
         if first + t >= stop:
             raise RecordingError(
@@ -189,7 +192,7 @@ def locate(run: Run, request: Request, step: tuple[int, ...] | None) -> Location
     return Location(time, added)
 
 
-def locate_divergence(runs: Sequence[Run]) -> tuple[tuple[int, ...] | None, str]:
+def locate_divergence(runs: Sequence[Run]) -> tuple[StepRef | None, str]:
     """Return the step at which two runs diverge, as `locate` takes it, and a sentence about it.
 
     That is the first step of training that differs, or else the first evaluation's. None if they do not
@@ -209,9 +212,7 @@ def locate_divergence(runs: Sequence[Run]) -> tuple[tuple[int, ...] | None, str]
             divergence = next(evaluation_divergences(a, b), None)
             if divergence is None:
                 return None, f"They never diverge: every step is the same{suffix}."
-    step: tuple[int, ...] = (divergence.episode, divergence.t)
-    if divergence.after is not None:
-        step = (divergence.after, *step)
+    step = StepRef(divergence.episode, divergence.t, divergence.after)
     return step, f"They diverge {where_in_words(divergence)}."
 
 

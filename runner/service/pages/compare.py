@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Final
 
 from fastapi import APIRouter, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.groups import flat_config
-from runner.analysis.step_reference import episode_reference, parse_step_reference, step_reference
+from runner.analysis.step_reference import StepRef
 from runner.drawing import svg
 from runner.errors import RunnerError
 from runner.export.reports.rendering import View
@@ -18,7 +18,7 @@ from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service import fragments
-from runner.service.addresses import after_step, episode_in_words, episode_path, link
+from runner.service.addresses import link
 from runner.service.api.comparing import found_runs
 from runner.service.api.replay import LONG
 from runner.service.dependencies import CacheOf, CatalogueOf, ProcessesOf, timed_recording_state
@@ -167,24 +167,25 @@ async def replay(
 ) -> Response:
     """Show an episode of two runs, in step; by default the one in which they diverge."""
     runs = _two(await _chosen(catalogue, run))
-    step = parse_step_reference(at) if at else ()
-    if not step:
+    if at:
+        step = StepRef.parse(at)
+    else:
         first = (await _difference(runs, cache, processes))["first_step"]
-        step = after_step(first) if first else (0, 0)
+        step = StepRef.parse(first).outcome if first else StepRef(0)
     names = [each.run_id for each in runs]
 
     def neighbour(by: int) -> str:
-        other = [*step[:-2], step[-2] + by, 0]
-        return link("/compare/replay", {"run": names, "at": step_reference(other)}) if other[-2] >= 0 else ""
+        other = replace(step, episode=step.episode + by, t=0)
+        return link("/compare/replay", {"run": names, "at": str(other)}) if other.episode >= 0 else ""
 
     def show() -> Response:
         view = _ReplaysView(
             _compared(runs, "/replay"),
-            sources=[f"/api/v1/runs/{name}/replay/{episode_path(step)}" for name in names],
+            sources=[f"/api/v1/runs/{name}/replay/{step.episode_path}" for name in names],
             scenes=[_scene(each) for each in runs],
-            episode=episode_in_words(step),
-            prefix=episode_reference(step),
-            t=step[-1],
+            episode=step.episode_name,
+            prefix=step.episode_text,
+            t=step.t,
             before=neighbour(-1),
             after=neighbour(1),
             base=link("/compare/replay", {"run": names}),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from http import HTTPStatus
 from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple
 
@@ -14,13 +14,12 @@ from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.evaluations import evaluations_of
-from runner.analysis.step_reference import episode_reference
+from runner.analysis.step_reference import StepRef
 from runner.drawing import svg
 from runner.errors import RunnerError
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service import fragments
-from runner.service.addresses import episode_path
 from runner.service.api.replay import part_of
 from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
 from runner.service.pages.frame import RunView, head_of
@@ -153,10 +152,11 @@ def _view(run: Run, which: tuple[int, ...], step: ShownStep | None, problem: str
         count = episodes
     else:
         count = next((each.trials for each in evaluations if each.after == which[0]), 0)
-    *_, number = which
+    number = which[-1]
+    at = StepRef(number) if len(which) == 1 else StepRef(number, after=which[0])
 
     def neighbour(other: int) -> str:
-        path = episode_path((*which[:-1], other, 0))
+        path = replace(at, episode=other).episode_path
         return f"/runs/{run.run_id}/replay/{path}" if 0 <= other < max(count, number) else ""
 
     return _ReplayView(
@@ -169,8 +169,8 @@ def _view(run: Run, which: tuple[int, ...], step: ShownStep | None, problem: str
         evaluations=evaluations,
         before=neighbour(number - 1),
         after=neighbour(number + 1),
-        source=f"/api/v1/runs/{run.run_id}/replay/{episode_path((*which, 0))}",
-        reference=episode_reference((*which, 0)),
+        source=f"/api/v1/runs/{run.run_id}/replay/{at.episode_path}",
+        reference=at.episode_text,
     )
 
 

@@ -12,17 +12,17 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, ClassVar, Final
 
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import FileResponse
 from filelock import FileLock
 
-from runner.analysis.step_reference import parse_step_reference
+from runner.analysis.step_reference import StepRef
 from runner.export.reports.rendering import View
 from runner.export.rerun import viewer as native_viewer
 from runner.service import fragments
-from runner.service.addresses import episode_in_words, link, replay_address
+from runner.service.addresses import link, replay_address
 from runner.service.api.replay import LONG
 from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
 from runner.service.guard import POLICY
@@ -67,8 +67,8 @@ class _FrameView(View):
 @router.get("/runs/{run}/rerun")
 def viewer(request: Request, run: RecordedRun, at: Annotated[str, Query(max_length=60)] = "") -> Response:
     """Show the Rerun viewer, opened at a step."""
-    step = parse_step_reference(at) if at else ()
-    content = f"{episode_in_words(step)}, step {step[-1]}." if step else OVERVIEW
+    step = StepRef.parse(at) if at else None
+    content = f"{step.episode_name}, step {step.t}." if step else OVERVIEW
     back = replay_address(run.run_id, step) if step else ""
     frame = link(f"/runs/{run.run_id}/rerun/frame", {"at": at})
     return page(request, _RerunView(head_of(run), "rerun", content, back, frame))
@@ -83,10 +83,12 @@ async def frame(
     at: Annotated[str, Query(max_length=60)] = "",
 ) -> Response:
     """Show the viewer alone, opened at a step."""
-    step = parse_step_reference(at) if at else ()
+    step = StepRef.parse(at) if at else None
     key = ("timeline step", recording_state(run), step)
     time = await cache.get_or_await(key, lambda: processes(fragments.timeline_step, run, step), LONG)
-    query: dict[str, Any] = {"episodes": step[0]} if len(step) == 2 else {"evaluations": list(step[:1])}
+    query: dict[str, int | None] = {}
+    if step:
+        query = {"episodes": step.episode} if step.after is None else {"evaluations": step.after}
     view = _FrameView(
         title=f"{run.name}, {run.run_id}",
         files=f"/static/rerun/{version()}",

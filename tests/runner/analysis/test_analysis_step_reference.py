@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import pytest
 
-from runner.analysis.step_reference import parse_step_reference, step_reference
+from runner.analysis.step_reference import StepRef
 from runner.errors import RunnerError
 
 
 @pytest.mark.parametrize(
     ("text", "step"),
     [
-        ("120", (120, 0)),
-        ("120:5", (120, 5)),
-        ("eval:3000", (3000, 0, 0)),
-        ("eval:3000:17", (3000, 17, 0)),
-        ("eval:3000:17:5", (3000, 17, 5)),
+        ("120", StepRef(120)),
+        ("120:5", StepRef(120, 5)),
+        ("eval:3000", StepRef(0, after=3000)),
+        ("eval:3000:17", StepRef(17, after=3000)),
+        ("eval:3000:17:5", StepRef(17, 5, 3000)),
     ],
 )
 def test_what_is_left_out_is_0(text, step):
-    assert parse_step_reference(text) == step
-    assert parse_step_reference(step_reference(step)) == step
+    assert StepRef.parse(text) == step
+    assert StepRef.parse(str(step)) == step
 
 
 @pytest.mark.parametrize(
@@ -28,4 +28,4 @@ def test_what_is_left_out_is_0(text, step):
 )
 def test_anything_else_is_refused_with_what_is_expected(text):
     with pytest.raises(RunnerError, match="expected EPISODE:T such as 120:5, or eval:N:TRIAL:T"):
-        parse_step_reference(text)
+        StepRef.parse(text)

@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from runner.analysis.diff import diff
+from runner.analysis.step_reference import StepRef
 from runner.cli import cli
 from runner.errors import MissingExtra, RecordingError
 from runner.export.rerun.selection import Request, episodes_of, locate, locate_divergence, select
@@ -69,16 +70,16 @@ class TestSelection:
 
     def test_the_step_to_view_is_exported(self, pictured):
         run = pictured("rivals")
-        location = locate(run, Request(), (7, 2))
+        location = locate(run, Request(), StepRef(7, 2))
         with open_recording(run.recording) as recording:
             step = recording.episode_steps("train", 7)[2]
             spans = select(recording, location.request).train
         assert location.time == step["log_time"] // schema.STEP_NANOSECONDS
         assert any(span.start <= step["step"] < span.stop for span in spans)
         with pytest.raises(RecordingError, match="no t = 999"):
-            locate(run, Request(), (7, 999))
+            locate(run, Request(), StepRef(7, 999))
         with pytest.raises(RecordingError, match="no trial 6 "):
-            locate(run, Request(), (20, 6, 0))
+            locate(run, Request(), StepRef(6, after=20))
 
 
 def test_an_environment_without_a_scene_is_reported(pictured):
@@ -180,7 +181,7 @@ class TestTwoRuns:
         with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
             divergence = diff(a, b).divergence
             record = next(a.blocks(schema.TRAIN_STEP, divergence.step, divergence.step + 1))[0]
-        assert step == (divergence.episode, divergence.t)
+        assert step == StepRef(divergence.episode, divergence.t)
         assert f"training step {divergence.step:,}" in message
         location = locate(runs[0], Request(), step)
         assert location.time == record["log_time"] // schema.STEP_NANOSECONDS

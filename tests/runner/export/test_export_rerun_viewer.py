@@ -18,6 +18,7 @@ import pytest
 from click.testing import CliRunner
 from rerun.chunk import RrdReader
 
+from runner.analysis.step_reference import StepRef
 from runner.cli import cli, progress
 from runner.errors import RunnerError, StorageError
 from runner.export.rerun import live as live_view
@@ -51,7 +52,7 @@ def drawn(path, step):
 
 def test_every_view_of_the_default_blueprint_is_drawn_without_an_error(pictured):
     run = pictured("rivals")
-    location = locate(run, Request(), (39, 3))
+    location = locate(run, Request(), StepRef(39, 3))
     path, _ = cached_export([run], location.request)
     views = drawn(path, location.time)
     maps = {f"taxi {i}: max Q, greedy moves" for i in (1, 2)}
