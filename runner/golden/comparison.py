@@ -1,12 +1,12 @@
-"""How a run is compared with a golden one: byte for byte, or by the scores of several seeds."""
+"""How a run is compared with a golden one: byte for byte, in its environment, or by scores of seeds."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -14,7 +14,10 @@ from runner.analysis.diff import RunDiff, diff
 from runner.analysis.diff.sections import sections
 from runner.errors import ConfigError
 from runner.export.reports.diff import render_diff
+from runner.loops.env import record
 from runner.recording.reader import open_recording
+from runner.replay.environment import redo
+from runner.runs.run import Run
 from runner.util.extras import require
 
 MIN_SCORES: Final = 6
@@ -58,6 +61,40 @@ def _in_words(difference: RunDiff) -> str:
     for change in (*difference.environment.description, *versions)[:_MAX_CHANGES]:
         lines.append(f"  {change.path}: {change.a} in A, {change.b} in B")
     return "\n".join(lines)
+
+
+def record_environment(make: Callable[[], Any], episodes: int, max_steps: int, recordings: Path) -> Run:
+    """Record episodes of random actions in an environment, each with its number as seed.
+
+    Args:
+        make: returns the environment.
+        episodes: number of episodes.
+        max_steps: the most steps of an episode.
+        recordings: the recordings folder.
+    """
+    with record(make(), recordings, name="golden", seed=0) as env:
+        env.action_space.seed(0)
+        for episode in range(episodes):
+            env.reset(seed=episode)
+            for _ in range(max_steps):
+                _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+                if terminated or truncated:
+                    break
+    return env.run
+
+
+def compare_environment(golden: Path, make: Callable[[], Any], tolerance: float) -> str:
+    """Return where an environment first differs from a golden run of it; empty if it does not.
+
+    Raises:
+        RecordingError: the golden run cannot be read.
+        CannotRedo: the actions cannot be taken in this environment.
+    """
+    with open_recording(golden) as recording:
+        for steps in redo(recording, make=make, tolerance=tolerance):
+            if steps.difference is not None:
+                return str(steps.difference)
+    return ""
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ pytest loads it wherever the project is installed, so heavy packages are importe
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -100,6 +100,47 @@ class Golden:
                     pytrace=False,
                 )
         export_mcap(run, file, anonymous=True, force=True)
+
+    def same_environment(
+        self,
+        make: Callable[[], Any],
+        episodes: int = 10,
+        max_steps: int = 1_000,
+        tolerance: float = 0.0,
+        name: str = "",
+    ) -> None:
+        """Fail unless the recorded actions give the recorded observations, rewards and ends.
+
+        The golden run has episodes of random actions, each with its number as seed.
+
+        Args:
+            make: returns the environment: a Gymnasium environment, wrapped or not.
+            episodes: number of episodes when it is recorded.
+            max_steps: the most steps of an episode when it is recorded.
+            tolerance: absolute and relative, for observations and rewards of floating-point numbers, where
+                machines differ; 0 compares bytes.
+            name: tells several golden runs of one test apart.
+        """
+        from runner.errors import RunnerError
+        from runner.export.mcap import export_mcap
+        from runner.golden.comparison import compare_environment, record_environment
+
+        file = self._file(name, ".mcap")
+        if not self._is_update:
+            self._require(file)
+        try:
+            text = compare_environment(file, make, tolerance) if file.exists() else "there is none"
+        except RunnerError as error:
+            text = str(error)
+        if text and self._is_update:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            run = record_environment(make, episodes, max_steps, self.recordings)
+            export_mcap(run, file, anonymous=True, force=True)
+        elif text:
+            pytest.fail(
+                f"the environment is not that of the golden run {file.name}.\n{text}\n{_UPDATE}",
+                pytrace=False,
+            )
 
     def no_worse(
         self, scores: Sequence[float], margin: float, error_rate: float = 0.05, name: str = ""

@@ -35,12 +35,19 @@ class Replay:
         tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
         report: called with the number of steps taken so far, after each block.
         render: whether the environments can draw.
+        make: returns the environment, instead of making it as the recording describes.
     """
 
     def __init__(
-        self, recording: Recording, trust: bool, tolerance: float, report: Report, render: bool
+        self,
+        recording: Recording,
+        trust: bool,
+        tolerance: float,
+        report: Report,
+        render: bool,
+        make: Callable[[], Any] | None = None,
     ) -> None:
-        self._recording, self._trust, self._tolerance = recording, trust, tolerance
+        self._recording, self._trust, self._tolerance, self._make = recording, trust, tolerance, make
         self._report, self.render = report, render
         self._steppers: dict[int, Stepper] = {}
         self.known: set[int] = set()
@@ -107,9 +114,12 @@ class Replay:
     def _stepper(self, environment: int) -> Stepper:
         if environment not in self._steppers:
             maker = self._recording.maker
-            assert maker is not None  # or `why_not_redone` gave a reason
-            env = make_environment(maker, self._trust, self.render)
-            kind = GameStepper if maker.kind == "pettingzoo" else EnvironmentStepper
+            if self._make is not None:
+                env = self._make()
+            else:
+                assert maker is not None  # or `why_not_redone` gave a reason
+                env = make_environment(maker, self._trust, self.render)
+            kind = GameStepper if maker and maker.kind == "pettingzoo" else EnvironmentStepper
             self._steppers[environment] = kind(env, self._recording)
         return self._steppers[environment]
 

@@ -13,11 +13,11 @@ limits on memory and time. Whether a recording can be done again is for `runner.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from runner.errors import CannotRedo
 from runner.recording.reader import Recording, open_recording
@@ -42,6 +42,7 @@ def redo(
     trust: bool = False,
     tolerance: float = 0.0,
     report: Report = lambda _: None,
+    make: Callable[[], Any] | None = None,
 ) -> Iterator[RedoneSteps]:
     """Do recorded episodes again; yield their steps in blocks of about 0.2 s, compared with the recording.
 
@@ -59,22 +60,23 @@ def redo(
         trust: whether what the recording names may be imported, see `runner.replay.makers`.
         tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
         report: called with the number of steps taken so far, also of those before an episode.
+        make: returns the environment, which is closed at the end, instead of making it as recorded.
 
     Raises:
         CannotRedo: the environment cannot be made again, or draws no pictures; the message is why.
         RecordingError: the recording is damaged, or has no such episode.
     """
-    if reason := why_not_redone(recording, trust):
+    if make is None and (reason := why_not_redone(recording, trust)):
         raise CannotRedo(reason)
-    make = partial(Replay, recording, trust, tolerance, report, render)
+    begin = partial(Replay, recording, trust, tolerance, report, render, make)
     if episodes is None:
-        with closing(make()) as replay:
+        with closing(begin()) as replay:
             for steps in replay.all():
                 if phase in (None, steps.phase) or steps.difference is not None:
                     yield steps
         return
     for episode in episodes:
-        for steps in redo_episode(recording, phase or "train", episode, make):
+        for steps in redo_episode(recording, phase or "train", episode, begin):
             yield steps
             if steps.difference is not None:
                 return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -39,9 +40,13 @@ CHANGED = TESTS.replace("0.5, 0.2, 0.0", "1.5, 0.3, 3.0")
 FILES = {"test_loop.mcap", "test_job.mcap", "test_scores.json"}
 
 
+PAGE = Path(__file__).parents[3] / "docs" / "golden-runs.md"
+
+
 def pytest_over(folder: Path, text: str, *options: str) -> tuple[int, str]:
-    """Return the exit code and output of pytest over a test file."""
-    (folder / "test_mine.py").write_text(text)
+    """Return the exit code and output of pytest over a folder, with this test file if it is not empty."""
+    if text:
+        (folder / "test_mine.py").write_text(text)
     (folder / "pytest.ini").touch()
     environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1", "COLUMNS": "200"}
     environment.pop("PYTEST_ADDOPTS", None)
@@ -102,3 +107,22 @@ def test_a_damaged_golden_run_is_reported_and_replaced_on_request(folder):
     assert pytest_over(folder, TESTS, "-k", "loop", "--golden-update")[0] == 0
     assert pytest_over(folder, TESTS, "-k", "loop")[0] == 0
     assert len(kept.read_bytes()) == pytest.approx(len(whole), abs=500)
+
+
+def test_the_examples_of_the_guide_pass_and_find_an_environment_that_changed(tmp_path):
+    examples = dict(re.findall(r"```python (test_\w+\.py)\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL))
+    assert len(examples) == 2
+    for name, text in examples.items():
+        (tmp_path / name).write_text(text)
+    assert "5 passed" in pytest_over(tmp_path, "", "--golden-update")[1]
+    for name, changed in (
+        ("test_cartpole.py", 'make("CartPole-v1", sutton_barto_reward=True)'),
+        ("test_taxi.py", 'make("Taxi-v4", is_rainy=True)'),
+    ):
+        before, _, after = examples[name].partition("golden.same_environment(lambda: gymnasium.")
+        text = before + "golden.same_environment(lambda: gymnasium." + changed + after[after.index(")") + 1 :]
+        (tmp_path / name).write_text(text)
+    output = pytest_over(tmp_path, "")[1]
+    assert "2 failed, 3 passed" in output
+    assert "train episode 0, t 0: reward: recorded 1.0, got 0.0" in output
+    assert "train episode 0, t 3: observation: recorded 214, got 314" in output
