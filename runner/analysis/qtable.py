@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NotRequired, TypedDict
+from typing import NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,19 @@ class ActionValue(TypedDict):
     changed_episode: int | None
 
 
+class TablesDescription(TypedDict):
+    """The Q-tables at a step; if a state was chosen, with its values."""
+
+    run: str
+    step: int
+    tables: list[TableSummary]
+    state: NotRequired[int]
+    state_in_words: NotRequired[str]
+    visits: NotRequired[int]
+    """Visits to the state up to the step."""
+    values: NotRequired[list[ActionValue]]
+
+
 def replay_at(recording: Recording, step: int | None = None, episode: int | None = None) -> TableReplay:
     """Return the tables after a number of training steps, or episodes; by default after the last.
 
@@ -54,18 +67,23 @@ def replay_at(recording: Recording, step: int | None = None, episode: int | None
     return TableReplay(recording, last_step(recording) if step is None else step)
 
 
-def describe_tables(recording: Recording, replay: TableReplay, state: int | None = None) -> dict[str, Any]:
-    """Return `run`, `step` and a summary of the `tables` at the step of a replay, as JSON can hold it.
+def describe_tables(recording: Recording, replay: TableReplay, state: int | None = None) -> TablesDescription:
+    """Return the tables at the step of a replay, as JSON can hold them.
 
-    With a state also `state`, `state_in_words`, its `visits`, and `values`, an `ActionValue` for each action.
+    Args:
+        recording: the run.
+        replay: of its tables.
+        state: whose values are added; None for none.
 
     Raises:
         RunnerError: there is no such state.
         RecordingError: the steps are not recorded, which a state's history needs.
     """
     tables = [summarize(agent, q) for agent, q in zip(replay.agents, replay.tables, strict=True)]
-    summary = {"run": recording.run_id, "step": replay.step, "tables": tables}
-    return summary if state is None else summary | _describe_state(recording, replay, state)
+    description: TablesDescription = {"run": recording.run_id, "step": replay.step, "tables": tables}
+    if state is not None:
+        _add_state(description, recording, replay, state)
+    return description
 
 
 def one_array(tables: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
@@ -95,7 +113,7 @@ def summarize(agent: str, q: NDArray[np.float64]) -> TableSummary:
     }
 
 
-def _describe_state(recording: Recording, replay: TableReplay, state: int) -> dict[str, Any]:
+def _add_state(description: TablesDescription, recording: Recording, replay: TableReplay, state: int) -> None:
     mdp = recording.mdp
     if state >= mdp.states:
         raise RunnerError(f"state: found {state}, expected one of 0 to {mdp.states - 1}.")
@@ -120,5 +138,7 @@ def _describe_state(recording: Recording, replay: TableReplay, state: int) -> di
             if "policy" in held:
                 value["policy"] = float(held["policy"][state, action])
             values.append(value)
-    words = str(states_in_words(mdp)[state])
-    return {"state": state, "state_in_words": words, "visits": int(history.visits[0].sum()), "values": values}
+    description["state"] = state
+    description["state_in_words"] = str(states_in_words(mdp)[state])
+    description["visits"] = int(history.visits[0].sum())
+    description["values"] = values

@@ -16,6 +16,9 @@ from runner.environments.scene import SceneDescription, scene_mistake
 from runner.errors import EnvironmentNotUsable
 from runner.util.values import is_text, is_whole
 
+Indices = NDArray[np.integer[Any]]
+"""Numbers of states or actions, as recorded in one integer type or another."""
+
 MAX_EVENTS = 31
 MAX_AGENTS = 31
 MAX_ARRAYS_BYTES = 128 << 20
@@ -91,9 +94,7 @@ class Mdp:
         """[S, J, K]: the reward of all agents together."""
         return np.asarray(self.rewards.sum(axis=-1))
 
-    def outcomes_to(
-        self, state: NDArray[Any], action: NDArray[Any], next_state: NDArray[Any]
-    ) -> NDArray[np.bool_]:
+    def outcomes_to(self, state: Indices, action: Indices, next_state: Indices) -> NDArray[np.bool_]:
         """Return which outcomes of steps, [N] each, lead to their next states: [N, K]; none if unknown."""
         known = (state >= 0) & (state < self.states) & (action >= 0) & (action < self.joint_actions)
         at = np.where(known, state, 0), np.where(known, action, 0)
@@ -132,9 +133,9 @@ class Mdp:
 def step_counts(
     mdp: Mdp,
     rewards: NDArray[np.float64],
-    state: NDArray[Any],
-    action: NDArray[Any],
-    next_state: NDArray[Any],
+    state: Indices,
+    action: Indices,
+    next_state: Indices,
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return events and penalties of steps, [N, events + 1], and which rewards the table excludes, [N].
 
@@ -228,7 +229,7 @@ def check_mdp(mdp: Mdp) -> None:
         raise EnvironmentNotUsable(f"environment {mdp.env_id!r}: {mistake}.")
 
 
-def _description_checks(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
+def _description_checks(mdp: Mdp) -> Iterator[tuple[str, bool, object]]:
     """Yield expectations of all fields but the arrays: their text, whether they hold, and the value found."""
     agents, counts, events = mdp.agents, mdp.action_counts, mdp.event_names
     yield "an id must be text", is_text(mdp.env_id), mdp.env_id
@@ -248,7 +249,7 @@ def _description_checks(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
     yield "the step limit must be a number from 0", is_whole(limit, 0, 2**31 - 1), limit
 
 
-def _array_checks(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
+def _array_checks(mdp: Mdp) -> Iterator[tuple[str, bool, object]]:
     """Yield expectations of the arrays: their text, whether they hold, and the value found."""
     for name, kind in _DTYPES.items():
         array = getattr(mdp, name)
@@ -285,7 +286,7 @@ def _array_checks(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
     yield f"each of the scene's arrays must have a row for each of the {shape[0]} states", fits, rows
 
 
-def _in_words(found: Any) -> str:
+def _in_words(found: object) -> str:
     """Return a value, or the result of a function, for a message: arrays by type and shape."""
     if callable(found):
         found = found()
@@ -307,7 +308,7 @@ def _sums(probability: NDArray[np.float64]) -> str:
     return f"values from {probability.min():g} on, sums {_range(probability.sum(axis=-1))}"
 
 
-def _distinct(names: tuple[Any, ...]) -> bool:
+def _distinct(names: tuple[object, ...]) -> bool:
     return all(map(is_text, names)) and len(set(names)) == len(names)
 
 

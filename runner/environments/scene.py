@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, NotRequired, TypedDict
+from typing import Any, Final, NotRequired, TypedDict, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +69,7 @@ _KEYS: Final = SceneDescription.__required_keys__
 
 
 def scene_mistake(
-    scene: Any, cells: NDArray[np.int16] | None, carriers: NDArray[np.int8] | None, states: int
+    scene: object, cells: NDArray[np.int16] | None, carriers: NDArray[np.int8] | None, states: int
 ) -> str | None:
     """Return the first mistake of a scene and its arrays; None if there is none.
 
@@ -91,10 +91,10 @@ def scene_mistake(
             f"found {rows!r:.40} rows and {columns!r:.40} columns"
         )
 
-    def is_cell(value: Any) -> bool:
+    def is_cell(value: object) -> bool:
         return _is_pair(value) and is_whole(value[0], 0, rows - 1) and is_whole(value[1], 0, columns - 1)
 
-    expected: dict[str, tuple[Callable[[Any], bool], str]] = {
+    expected: dict[str, tuple[Callable[[object], bool], str]] = {
         "walls": (lambda wall: _is_pair(wall) and all(map(is_cell, wall)), "two cells"),
         "landmarks": (lambda mark: _is_landmark(mark, is_cell), "a name, a cell and a colour"),
         "things": (_is_thing, "a name, a label and a kind"),
@@ -128,20 +128,24 @@ def _array_mistake(
     return None
 
 
-def _is_pair(value: Any) -> bool:
+def _is_pair(value: object) -> TypeGuard[Sequence[Any]]:
     return isinstance(value, list | tuple) and len(value) == 2
 
 
-def _has_texts(value: Any, *keys: str) -> bool:
+def _has_texts(value: object, *keys: str) -> TypeGuard[Mapping[str, Any]]:
     return isinstance(value, Mapping) and all(is_text(value.get(key)) for key in keys)
 
 
-def _is_landmark(value: Any, is_cell: Callable[[Any], bool]) -> bool:
-    named = _has_texts(value, "name", "colour") and is_cell(value.get("cell"))
-    return named and bool(_COLOUR.fullmatch(value["colour"])) and _is_optional(value, "label", "kind")
+def _is_landmark(value: object, is_cell: Callable[[object], bool]) -> bool:
+    return (
+        _has_texts(value, "name", "colour")
+        and is_cell(value.get("cell"))
+        and _COLOUR.fullmatch(value["colour"]) is not None
+        and _is_optional(value, "label", "kind")
+    )
 
 
-def _is_thing(value: Any) -> bool:
+def _is_thing(value: object) -> bool:
     return _has_texts(value, "name", "label", "kind") and _is_optional(value, "agent", "colour")
 
 
@@ -149,7 +153,7 @@ def _is_optional(value: Mapping[str, Any], *keys: str) -> bool:
     return all(value.get(key) is None or is_text(value[key]) for key in keys)
 
 
-def _is_action(value: Any) -> bool:
+def _is_action(value: object) -> bool:
     if not _has_texts(value, "name"):
         return False
     move = value.get("move")

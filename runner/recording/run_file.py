@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeGuard
 
 from runner.recording.metrics import METRICS
 from runner.util.values import MAX_JSON_DEPTH, is_too_deep
@@ -29,7 +29,7 @@ _QUOTED: Final = 60
 class Check(NamedTuple):
     """What a value must be."""
 
-    fits: Callable[[Any], bool]
+    fits: Callable[[object], bool]
     expected: str
 
 
@@ -217,7 +217,7 @@ def _archive(record: Mapping[str, Any], problems: list[str]) -> ArchiveReference
     return ArchiveReference(values.get("target", ""), values.get("digest") or "", done)
 
 
-def _quoted(value: Any) -> str:
+def _quoted(value: object) -> str:
     if isinstance(value, Mapping):
         return "an object"
     if isinstance(value, list):
@@ -232,34 +232,34 @@ def _in_utc(text: str) -> datetime:
     return datetime.fromisoformat(text).astimezone(UTC)
 
 
-def _is_moment(value: Any) -> bool:
+def _is_moment(value: object) -> bool:
     if isinstance(value, str):
         with contextlib.suppress(ValueError, OverflowError):  # the latter of a date at the end of time
             return bool(_in_utc(value))
     return False
 
 
-def _is_count(value: Any) -> bool:
+def _is_count(value: object) -> bool:
     return type(value) is int and 0 <= value < _LARGEST
 
 
-def _is_number(value: Any) -> bool:
-    if type(value) not in (int, float):
+def _is_number(value: object) -> TypeGuard[float]:
+    if not isinstance(value, int | float) or isinstance(value, bool):
         return False
     with contextlib.suppress(OverflowError):
         return math.isfinite(value)
     return False
 
 
-def _is_text(value: Any) -> bool:
+def _is_text(value: object) -> TypeGuard[str]:
     return isinstance(value, str)
 
 
-def _is_object(value: Any) -> bool:
+def _is_object(value: object) -> bool:
     return isinstance(value, Mapping)
 
 
-def _maps_to(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
+def _maps_to(fits: Callable[[object], bool]) -> Callable[[object], bool]:
     return lambda value: isinstance(value, Mapping) and all(map(fits, value.values()))
 
 

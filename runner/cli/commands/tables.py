@@ -27,7 +27,10 @@ from runner.export.places import require_new, write_new
 from runner.util.humanize import UNKNOWN, number
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
     from rich.table import Table
+
+    from runner.analysis.qtable import ActionValue, TablesDescription
 
 ROWS_AT_ONCE = 50_000
 
@@ -93,14 +96,16 @@ def qtable_command(
                 np.save(stream, array)
 
         write_new(output, force, write)
-        values["path"] = str(output.absolute())
+    written = None if output is None else str(output.absolute())
     if as_json:
-        print_json(values)
-    else:
-        _draw(values)
+        print_json({**values, **({"path": written} if written else {})})
+        return
+    _draw(values)
+    if written:
+        say(f"Written: {written}")
 
 
-def _draw(values: dict[str, Any]) -> None:
+def _draw(values: TablesDescription) -> None:
     head = {"run": values["run"], "step": f"after {values['step']:,} training steps"}
     for each in values["tables"]:
         head[each["agent"]] = (
@@ -110,16 +115,14 @@ def _draw(values: dict[str, Any]) -> None:
     if "state" in values:
         head["state"] = f"{values['state']}: {values['state_in_words']}"
         head["visits"] = f"{values['visits']:,}"
-    parts: list[Any] = [facts(head)]
+    parts: list[RenderableType] = [facts(head)]
     for each in values["tables"] if "state" in values else ():
         rows = [row for row in values["values"] if row["agent"] == each["agent"]]
         parts += [title(each["agent"]), _state_table(rows)]
     draw(*parts)
-    if "path" in values:
-        say(f"Written: {values['path']}")
 
 
-def _state_table(rows: list[dict[str, Any]]) -> Table:
+def _state_table(rows: list[ActionValue]) -> Table:
     """Return the table of a state's actions."""
     policy = ("policy",) if "policy" in rows[0] else ()
     headings = ("action", "", "value", *policy, "greedy", "visits", "changed\nby step", "in\nepisode")
@@ -130,7 +133,7 @@ def _state_table(rows: list[dict[str, Any]]) -> Table:
             str(row["action"]),
             row["action_in_words"],
             number(row["value"], 4),
-            *(number(row[name], 4) for name in policy),
+            *([number(row["policy"], 4)] if policy else []),
             "greedy" if row["greedy"] else "",
             f"{row['visits']:,}",
             *(UNKNOWN if change is None else f"{change:,}" for change in changes),

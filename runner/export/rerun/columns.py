@@ -47,7 +47,7 @@ class Batch:
         """The timelines of all rows."""
         return self.times_at(slice(None))
 
-    def times_at(self, rows: Any) -> list[rr.TimeColumn]:
+    def times_at(self, rows: slice | NDArray[np.int64]) -> list[rr.TimeColumn]:
         """Return the timelines of some rows."""
         return [
             rr.TimeColumn("step", sequence=self.time[rows]),
@@ -75,7 +75,7 @@ class Sender:
         """Send columns, a row for each time."""
         self._stream.send_columns(f"{self.path}/{part}", times, columns)
 
-    def send_static(self, part: str, *archetypes: Any) -> None:
+    def send_static(self, part: str, *archetypes: rr.AsComponents) -> None:
         """Send what never changes."""
         for archetype in archetypes:
             self._stream.log(f"{self.path}/{part}", archetype, static=True)
@@ -101,7 +101,7 @@ class Column(NamedTuple):
         return self.array
 
 
-def instances(archetype: Any, **parts: NDArray[Any]) -> list[Any]:
+def instances(archetype: Any, **parts: NDArray[Any]) -> list[Column]:
     """Return the columns of n rows with equally many instances each.
 
     Args:
@@ -114,18 +114,18 @@ def instances(archetype: Any, **parts: NDArray[Any]) -> list[Any]:
     ]
 
 
-def ragged(archetype: Any, lengths: NDArray[np.int64], **parts: NDArray[Any]) -> list[Any]:
+def ragged(archetype: Any, lengths: NDArray[np.int64], **parts: NDArray[Any]) -> list[Column]:
     """Return the columns of rows with different numbers of instances; each part is [all instances, ...]."""
     offsets = pa.array(np.concatenate(([0], np.cumsum(lengths))).astype(np.int32))
     return [_column(archetype, name, offsets, part) for name, part in parts.items()]
 
 
-def scalars(values: NDArray[np.float64]) -> list[Any]:
+def scalars(values: NDArray[np.float64]) -> list[Column]:
     """Return the column of series, [n, series]."""
     return instances(rr.Scalars, scalars=values)
 
 
-def strips(lines: NDArray[np.float32]) -> list[Any]:
+def strips(lines: NDArray[np.float32]) -> list[Column]:
     """Return the column of line strips, [n, strips, points, 2]."""
     n, count, points, _ = lines.shape
     flat = pa.FixedSizeListArray.from_arrays(pa.array(lines.reshape(-1)), type=_POINT)
@@ -171,7 +171,7 @@ def repeated_point(n: int, x: float, y: float) -> NDArray[np.float32]:
     return np.broadcast_to(np.array([[x, y]], np.float32), (n, 1, 2))
 
 
-def texts(rows: Sequence[str]) -> NDArray[Any]:
+def texts(rows: Sequence[str]) -> NDArray[np.object_]:
     """Return one text per row, [n, 1]."""
     return np.array(rows, dtype=object)[:, None]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 import rerun as rr
@@ -78,7 +78,7 @@ class RunView:
         if self.scene is not None:
             draw_scene(stream, self.root, self.scene)
 
-    def grid_view(self) -> Any:
+    def grid_view(self) -> rrb.View:
         """Return the view of the grid; without a scene that of state and action as lines."""
         if self.scene is None:
             entities = [f"{phase}/{name}" for phase in ("train", "eval") for name in ("state", "action")]
@@ -89,7 +89,7 @@ class RunView:
         entities = ["scene/**", "train/grid/**", "eval/grid/**", "notice/**"]
         return self._view(rrb.Spatial2DView, self.title, entities, visual_bounds=bounds)
 
-    def value_views(self) -> list[Any]:
+    def value_views(self) -> list[rrb.View]:
         """Return the views of Q-values: the table, and a map of each learner where there are any."""
         bottom = float(bar_rows(self.mdp)[-1][-1]) + 0.9
         bounds = rrb.VisualBounds2D(x_range=(-0.4, TABLE_WIDTH), y_range=(TABLE_TOP, bottom))
@@ -108,12 +108,12 @@ class RunView:
             views.append(self._view(rrb.Spatial2DView, name, entities, visual_bounds=bounds))
         return views
 
-    def event_view(self) -> Any:
+    def event_view(self) -> rrb.View:
         """Return the view of the log of events."""
         columns = rrb.TextLogColumns(timeline_columns=["step"], text_log_columns=["body"])
         return self._view(rrb.TextLogView, "Events", ["train/events", "eval/events"], columns=columns)
 
-    def _view(self, kind: Any, name: str, entities: Sequence[str], **options: Any) -> Any:
+    def _view(self, kind: type[rrb.View], name: str, entities: Sequence[str], **options: Any) -> rrb.View:
         contents = [f"{self.root}/{entity}" for entity in entities]
         return kind(origin=f"{self.root}/", contents=contents, name=name, **options)
 
@@ -126,9 +126,9 @@ def blueprint(runs: Sequence[RunView], entities: set[str] | None) -> rrb.Bluepri
         entities: the entities of recorded metrics; None if not known yet.
     """
     plots = _plots(runs, entities)
-    body: Any
+    body: rrb.Container
     if len(runs) == 1:
-        columns: list[Any] = [rrb.Grid(*plots, grid_columns=2)]
+        columns: list[rrb.View | rrb.Container] = [rrb.Grid(*plots, grid_columns=2)]
         shares = [1]
         if runs[0].has_steps:
             columns.insert(0, rrb.Vertical(runs[0].grid_view(), runs[0].event_view(), row_shares=[3, 1]))
@@ -155,12 +155,12 @@ def blueprint(runs: Sequence[RunView], entities: set[str] | None) -> rrb.Bluepri
     return _with_panels(body, "following")
 
 
-def loop_blueprint(views: Sequence[Any]) -> rrb.Blueprint:
+def loop_blueprint(views: Sequence[rrb.View]) -> rrb.Blueprint:
     """Return the blueprint of loops, given the view of each."""
     return _with_panels(views[0] if len(views) == 1 else rrb.Vertical(*views), "paused")
 
 
-def _with_panels(body: Any, play_state: Any) -> rrb.Blueprint:
+def _with_panels(body: rrb.View | rrb.Container, play_state: Literal["following", "paused"]) -> rrb.Blueprint:
     return rrb.Blueprint(
         body,
         rrb.TimePanel(state="collapsed", timeline="step", fps=FRAMES_PER_SECOND, play_state=play_state),
@@ -176,9 +176,9 @@ def whole_axis(last: int) -> rrb.TimeAxis:
     return rrb.TimeAxis(view_range=rr.TimeRange(start=rr.TimeRangeBoundary.absolute(seq=0), end=end))
 
 
-def _plots(runs: Sequence[RunView], entities: set[str] | None) -> list[Any]:
+def _plots(runs: Sequence[RunView], entities: set[str] | None) -> list[rrb.View]:
     axis = whole_axis(max(run.last for run in runs))
-    views = []
+    views: list[rrb.View] = []
     for name, paths in PLOTS:
         contents = [f"{run.root}/{path}" for run in runs for path in paths]
         if shown := [entity for entity in contents if entities is None or entity in entities]:
