@@ -26,6 +26,7 @@ from runner.service.fragments import load_sweep_libraries
 from runner.service.guard import Guard
 from runner.service.jobs.queue import JobQueue
 from runner.service.logs import LOG, AccessLog
+from runner.service.pictures import PictureStreams
 from runner.service.problems import add_error_handlers, error_docs
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ResponseCache
@@ -130,6 +131,8 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.state.writers = anyio.CapacityLimiter(uploads.WRITERS)
         app.state.uploads = Uploads(settings.recordings[0], limits, log_upload)
         stack.callback(app.state.uploads.close)
+        app.state.pictures = PictureStreams()
+        stack.callback(app.state.pictures.close)
         app.state.processes = stack.enter_context(
             ProcessPool(PROCESSES, limits.work_seconds, limits.work_bytes)
         )

@@ -13,6 +13,7 @@ from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.catalogue import Catalogue
 from runner.service.jobs.queue import JobQueue
+from runner.service.pictures import PictureStreams
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ALWAYS, ResponseCache
 from runner.service.settings import Settings
@@ -32,6 +33,7 @@ SettingsOf = Annotated[Settings, _state("settings")]
 CatalogueOf = Annotated[Catalogue, _state("catalogue")]
 ProcessesOf = Annotated[ProcessPool, _state("processes")]
 SweepProcesses = Annotated[ProcessPool, _state("sweep_processes")]
+PicturesOf = Annotated[PictureStreams, _state("pictures")]
 CacheOf = Annotated[ResponseCache, _state("cache")]
 JobsOf = Annotated[JobQueue, _state("jobs")]
 UploadsOf = Annotated[Uploads, _state("uploads")]

@@ -22,6 +22,7 @@ from runner.analysis.step_reference import StepRef
 from runner.analysis.summary import random_policy_sentence
 from runner.drawing import svg
 from runner.errors import RecordingError, RunnerError
+from runner.export.encoded import why_no_pictures
 from runner.export.plots.curves import footnote, panel_plots
 from runner.export.reports.diff import ShownDivergence, difference_view
 from runner.export.reports.episode import last_episode, last_whole_evaluation, trial, typical_trial
@@ -57,7 +58,8 @@ def episode_part(path: Path, which: tuple[int, ...], start: int, steps: int) -> 
     with open_recording(path) as recording:
         episode = playback_of(recording, which, steps, max(0, start - _STEPS_BEFORE))
         scene = recording.environment["scene"] if episode.grid else None
-        data = {"episode": asdict(episode), "scene": scene}
+        reason = "" if episode.grid else why_no_pictures(recording)
+        data = {"episode": asdict(episode), "scene": scene, "why_no_pictures": reason}
         return json.dumps(data, separators=(",", ":"), ensure_ascii=False).encode(errors="replace")
 
 

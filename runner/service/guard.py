@@ -36,7 +36,7 @@ UPLOADS: Final = "/api/v1/uploads"
 MIN_RATE: Final = 1000
 """Bytes a second of a body, on average; slower clients are cut off."""
 POLICY: Final = (
-    "default-src 'self'; img-src 'self' data:; object-src 'none'; base-uri 'none'; form-action 'self'; "
+    "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; form-action 'self'; "
     "frame-ancestors 'self'"
 )
 _HEADERS: Final = {

@@ -25,12 +25,14 @@ Args = ParamSpec("Args")
 Result = TypeVar("Result")
 
 PRELOADED: Final = (
+    "gymnasium",
     "runner.analysis.diff",
     "runner.analysis.qtable",
     "runner.analysis.series",
     "runner.environments.loading",
     "runner.execution.estimate",
     "runner.execution.initial_tables",
+    "runner.replay.environment",
     "runner.runs.importing",
     "runner.service.computed",
     "runner.service.fragments",

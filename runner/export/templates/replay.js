@@ -15,6 +15,7 @@ class Replay {
     this.slider.addEventListener("input", () => { this.pause(); this.show(Number(this.slider.value)); });
     this.slider.addEventListener("keydown", (event) => this.key(event));
     this.button.addEventListener("click", () => this.play());
+    this.image?.addEventListener("load", () => this.image.classList.toggle("coarse", this.image.naturalWidth < 300));
   }
 
   find(selector) { return this.root.querySelector(selector); }
@@ -269,7 +270,7 @@ class Replay {
     });
     if (this.k === this.length) parts.push(Replay.make("p", "The last step shown."));
     else if (!episode.values.length) {
-      const next = episode.actions.map((words) => `${words.agent.replaceAll("_", " ")} ${words.values[words.at[i]]}`.trim());
+      const next = episode.actions.map((words) => `${words.agent ? `${words.agent.replaceAll("_", " ")}: ` : ""}${words.values[words.at[i]]}`);
       parts.push(Replay.make("p", `Next action: ${next.join(", ")}`));
     }
     this.find(".choice").replaceChildren(...parts);

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from functools import partial
 from http import HTTPStatus
+from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from fastapi import APIRouter, Path, Query, Response
+from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
+from starlette.concurrency import run_in_threadpool
 
+from runner.export.encoded import encoded_pictures
+from runner.export.reports.episode import EpisodePlace, place_of
 from runner.export.reports.player_data import Playback
+from runner.recording.reader import open_recording
 from runner.service import fragments
-from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
-from runner.service.problems import error_docs
+from runner.service.dependencies import CacheOf, PicturesOf, ProcessesOf, RecordedRun, recording_state
+from runner.service.pictures import PictureStreams
+from runner.service.problems import error_docs, media_docs
 
 if TYPE_CHECKING:
     from runner.runs.run import Run
@@ -34,6 +42,10 @@ MAX_STEPS: Final = 2000
 LONG: Final = 3600.0
 """Seconds that a part is cached, unless the recording changes."""
 
+OCTETS: Final = "application/octet-stream"
+PICTURES: Final = 64
+"""Pictures in a response by default."""
+
 Number = Annotated[int, Path(ge=0, lt=2**62, description="Counted from 0.")]
 After = Annotated[
     int, Path(ge=0, lt=2**62, description="The evaluation after this number of training episodes.")
@@ -42,11 +54,16 @@ Start = Annotated[int, Query(ge=0, lt=2**62, description="The first step, from 0
 Steps = Annotated[int, Query(ge=1, le=MAX_STEPS, description="Maximum number of steps.")]
 
 
+Pictures = Annotated[int, Query(ge=1, le=1000, description="Maximum number of pictures.")]
+
+
 class Part(BaseModel):
     """A part of an episode, and the scene of its environment if it has one."""
 
     episode: Playback
     scene: dict[str, Any] | None
+    why_no_pictures: str
+    """Why no pictures of it can be had; empty if the scene is drawn or `/pictures` has them."""
 
 
 @router.get("/train/{episode}", response_model=Part, summary="A part of a training episode, to be replayed.")
@@ -74,6 +91,58 @@ async def trial(
 ) -> Response:
     """Return steps of a trial of an evaluation, in the same form."""
     return _json(await part_of(run, cache, processes, (after, trial), start, steps))
+
+
+@router.get(
+    "/train/{episode}/pictures",
+    response_class=Response,
+    responses=media_docs(OCTETS),
+    summary="The pictures of a training episode.",
+)
+async def training_pictures(
+    run: RecordedRun, streams: PicturesOf, episode: Number, start: Start = 0, steps: Pictures = PICTURES
+) -> Response:
+    """Return the pictures from a step on: frames that were recorded, or drawn by the environment made again.
+
+    Each is preceded by its length in bytes, 32 bits, big-endian; length 0 stands for the same as before. The
+    length 2^32 - 1 is followed by the reason, as text, why there are no further pictures.
+    """
+    return await _pictures(run, streams, (episode,), start, steps)
+
+
+@router.get(
+    "/eval/{after}/{trial}/pictures",
+    response_class=Response,
+    responses=media_docs(OCTETS),
+    summary="The pictures of a trial.",
+)
+async def trial_pictures(
+    run: RecordedRun,
+    streams: PicturesOf,
+    after: After,
+    trial: Number,
+    start: Start = 0,
+    steps: Pictures = PICTURES,
+) -> Response:
+    """Return the pictures of a trial of an evaluation, in the same form."""
+    return await _pictures(run, streams, (after, trial), start, steps)
+
+
+async def _pictures(
+    run: Run, streams: PictureStreams, which: tuple[int, ...], start: int, steps: int
+) -> Response:
+    place, length = await run_in_threadpool(_place, run.recording, which)
+    stop = min(start + steps, length + 1)
+    key = (await run_in_threadpool(recording_state, run), place.phase, place.number)
+    stream = streams.open(key, partial(encoded_pictures, run.recording, place.phase, place.number), start)
+    return StreamingResponse(streams.send(stream, start, stop), media_type=OCTETS)
+
+
+def _place(path: FilePath, which: tuple[int, ...]) -> tuple[EpisodePlace, int]:
+    """Return where an episode stands, and its number of steps."""
+    with open_recording(path) as recording:
+        place = place_of(recording, which)
+        return place, len(recording.episode_span(place.phase, place.number))
 
 
 async def part_of(

@@ -195,6 +195,8 @@ def _step(part: Mapping[str, Any], t: int) -> ShownStep:
         key=key,
         broad=broad,
         facts=_facts(episode, i),
+        note=f"There is no picture: {part['why_no_pictures']}" if part["why_no_pictures"] else "",
+        has_pictures=not (picture or part["why_no_pictures"]),
     )
 
 
