@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import platform
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,42 +26,9 @@ from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
 from runner.runs import run as runs
-from tests.runner.altering import altered, without_chunk
+from tests.runner.altering import altered, without_digest
+from tests.runner.analysis.conftest import BASE
 from tests.runner.recording.making import stopping_after
-
-BASE = {
-    "name": "base",
-    "mode": "competitive",
-    "exploration": "shared",
-    "episodes": 120,
-    "discount": 0.8,
-    "epsilon": 0.6,
-    "evaluation": {"every": 60, "trials": 10},
-    "snapshots": {"every": 60},
-    "quirks": {"second_table_uses_first_action": True},
-    "recording": {"chunk_steps": 1024},
-}
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("recordings")
-
-
-@pytest.fixture(scope="module")
-def record(folder):
-    """Record the base run with some other values, once for each."""
-    known: dict[str, Path] = {}
-
-    def recorded(*overrides: str) -> Path:
-        key = " ".join(overrides)
-        if key not in known:
-            config = from_mapping(BASE, overrides)
-            run = runs.create_run(folder, config, config.seeds[0])
-            known[key] = run_job(Job(config, config.seeds[0]), run).recording
-        return known[key]
-
-    return recorded
 
 
 @pytest.fixture(scope="module")
@@ -269,11 +235,6 @@ def test_the_diff_of_an_altered_copy_names_step_and_field(small, tmp_path, data)
     copy.unlink()
 
 
-def without_digest(entries):
-    """Return a result with another digest; otherwise the two would be equal by it."""
-    return {"json": json.dumps(json.loads(entries["json"]) | {"content_digest": "altered"})}
-
-
 def test_equal_streams_have_no_difference_however_they_are_cut(record):
     with open_recording(record()) as recording:
         blocks = list(recording.blocks(schema.TRAIN_STEP))
@@ -373,59 +334,3 @@ class TestIndependentExploration:
             difference = diff(a, b)
         assert difference.cause.kind == "greedy_action"
         assert difference.cause.update is not None
-
-
-@pytest.fixture
-def lossy(record, tmp_path):
-    """The base run with the metrics of its second evaluation lost, and the base run itself."""
-    path = tmp_path / "lossy.mcap"
-    path.write_bytes(record().read_bytes())
-    assert without_chunk(path, schema.EVAL_METRICS_TOPIC, 1) == 1
-    with open_recording(path) as damaged, open_recording(record()) as whole:
-        yield damaged, whole
-
-
-def test_lost_metrics_of_an_evaluation_shift_no_others(lossy):
-    for pair in (lossy, lossy[::-1]):
-        difference = diff(*pair)
-        assert difference.divergence is None
-        assert difference.evaluation_divergence is None
-        assert any("lost parts of evaluations" in note for note in difference.notes)
-
-
-def test_an_evaluation_after_a_lost_one_is_compared_with_its_own_tables(lossy, record, tmp_path):
-    def change(records):
-        records["action"][records["episode"] == 24] ^= 1  # trial 4 of the third evaluation
-        return records
-
-    damaged, _ = lossy
-    forged = altered(record(), tmp_path / "forged.mcap", schema.EVAL_STEP, change, result=without_digest)
-    with open_recording(forged) as other:
-        difference = diff(damaged, other)
-    divergence, cause = difference.evaluation_divergence, difference.evaluation_cause
-    assert (divergence.evaluation, divergence.after, divergence.episode, divergence.t) == (2, 120, 4, 0)
-    trained = damaged.metrics("eval")[-1]["step"]
-    state = int(divergence.a_step["state"])
-    assert cause.rows[0].a == tables_at(damaged, trained)[0][state].tolist()
-
-
-def test_evaluations_of_other_numbers_are_compared_by_trial(record):
-    with open_recording(record()) as a, open_recording(record("evaluation.every=40")) as b:
-        divergence = diff(a, b).evaluation_divergence
-    assert divergence is not None
-    assert divergence.after == 120
-    assert divergence.field not in ("episode", "step")
-
-
-def test_lost_trials_leave_out_their_evaluation_alone(record, tmp_path):
-    def change(records):
-        records["action"][records["episode"] == 24] ^= 1
-        return records
-
-    forged = altered(record(), tmp_path / "forged.mcap", schema.EVAL_STEP, change, result=without_digest)
-    path = tmp_path / "lossy.mcap"
-    path.write_bytes(record().read_bytes())
-    without_chunk(path, schema.EVAL_STEP, 0)
-    with open_recording(path) as damaged, open_recording(forged) as other:
-        divergence = diff(damaged, other).evaluation_divergence
-    assert (divergence.after, divergence.episode) == (120, 4)
