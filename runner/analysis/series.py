@@ -148,9 +148,7 @@ def parse_target(text: str) -> tuple[str, float]:
     try:
         return metric, float(level)
     except ValueError:
-        raise RunnerError(
-            f"target: found {text!r}, expected METRIC=LEVEL such as success_percent=80."
-        ) from None
+        raise RunnerError(f"found {text!r}, expected METRIC=LEVEL such as success_percent=80.") from None
 
 
 # --- reading ------------------------------------------------------------------------------------------

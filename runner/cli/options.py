@@ -182,6 +182,12 @@ def _step(text: str) -> StepRef:
     return StepRef.parse(text)
 
 
+def _target(text: str) -> tuple[str, float]:
+    from runner.analysis.series import parse_target  # loads NumPy
+
+    return parse_target(text)
+
+
 SHIPPED: Final = Completed("name", _shipped)
 SETTING: Final = Completed("setting", _settings)
 FILTER_WORD: Final = Completed("filter", _filter_words)
@@ -190,6 +196,7 @@ RANGES: Final = Parsed("ranges", "START:STOP or N, such as 0:20,49980:50000", _r
 NUMBERS: Final = Parsed("numbers", "numbers such as 1000,49000", _numbers)
 PICTURE_SIZE: Final = Parsed("WxH", "WIDTHxHEIGHT up to 8192x8192, such as 1600x900", _picture_size)
 GRID: Final = Parsed("RxC", "ROWSxCOLUMNS up to 8x8, such as 3x3", _grid)
+TARGET: Final = Parsed("METRIC=LEVEL", "METRIC=LEVEL such as success_percent=80", _target)
 STEP: Final = Parsed("step", "EPISODE:T, or eval:N:TRIAL:T", _step)
 DIRECTORY: Final = click.Path(file_okay=False, path_type=Path)
 FILE: Final = click.Path(dir_okay=False, path_type=Path)
@@ -277,6 +284,17 @@ def output_option(default: Path | str, metavar: str = "FILE") -> Decorator:
     )
 
 
+def writing_options(default: Path | str, metavar: str = "FILE") -> Decorator:
+    """Return the options of a command that writes files made from runs; arguments as for `output_option`."""
+
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        for option in (json_option, recordings_option, force_option, output_option(default, metavar)):
+            command = option(command)
+        return command
+
+    return add
+
+
 def limit_option(default: int | str) -> Decorator:
     """Return the option --limit, with a default number of rows, or a text that describes the default."""
     return click.option(
@@ -306,6 +324,7 @@ def target_option(multiple: bool) -> Decorator:
         "targets" if multiple else "target",
         multiple=multiple,
         metavar="METRIC=LEVEL",
+        type=TARGET,
         help="Compare when this level is first reached, such as success_percent=80"
         + ("; may be repeated." if multiple else "."),
     )

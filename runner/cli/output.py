@@ -46,6 +46,27 @@ def json_list(name: str, rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
     yield "\n ]\n}\n" if separator else "]\n}\n"
 
 
+def print_written(text: str, as_json: bool, *paths: Path, **more: object) -> None:
+    """Print what a command wrote, as text or as JSON.
+
+    Args:
+        text: a line with path, size and counts.
+        as_json: print an object with the list `files`, of each its path and bytes, instead.
+        paths: the files; of a folder all of its files.
+        more: further keys of the object.
+    """
+    if as_json:
+        print_json({"files": files_written(*paths)} | more)
+    else:
+        click.echo(text)
+
+
+def files_written(*paths: Path) -> list[dict[str, Any]]:
+    """Return path and bytes of each file; of a folder those of all its files."""
+    files = [file for path in paths for file in (sorted(path.rglob("*")) if path.is_dir() else [path])]
+    return [{"path": str(file.absolute()), "bytes": file.stat().st_size} for file in files if file.is_file()]
+
+
 def say(text: str) -> None:
     """Print a notice on stderr."""
     click.echo(text, err=True)

@@ -205,7 +205,7 @@ def difference(a: Run, b: Run, ignore: Sequence[str], first: bool, targets: Sequ
 
 
 def comparison(
-    paths: Sequence[Path], by: str | None, metrics: Sequence[str], at: str, target: str | None
+    paths: Sequence[Path], by: str | None, metrics: Sequence[str], moment: str, target: str | None
 ) -> bytes:
     """Return a comparison of groups of runs, as `dualtaxi compare --json` prints it.
 
@@ -214,10 +214,10 @@ def comparison(
         RunnerError: there is nothing to compare.
     """
     require_scipy()
-    moment, names = moment_of(at, target, metrics)
+    chosen, names = moment_of(moment, parse_target(target) if target else None, metrics)
     groups, notes = grouped(_series(paths), by)
     require_two(groups, by)
-    return as_json(dataclasses.asdict(compare(groups, metrics_of(groups, names), moment, notes)))
+    return as_json(dataclasses.asdict(compare(groups, metrics_of(groups, names), chosen, notes)))
 
 
 def replay(runs: Sequence[Run], request: Request) -> bytes:

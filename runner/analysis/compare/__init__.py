@@ -161,7 +161,7 @@ def _no_values(
     after = sorted(n for n in episodes if n > moment.number)[:1]
     nearest = " and ".join(f"{episode:,}" for episode in before + after)
     hint = f"; the nearest are those after {nearest}" if nearest else ""
-    return f"at: found no values after {moment.number:,} training episodes{hint}."
+    return f"moment: found no values after {moment.number:,} training episodes{hint}."
 
 
 def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]]) -> Iterator[str]:
@@ -176,7 +176,7 @@ def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]]) -> Itera
         where = ", ".join(f"{env_id} in {label}" for label, env_id in environments.items())
         yield f"the environments differ ({where}): their figures do not measure the same"
     if all(metric.startswith("training.") for metric, _ in metrics):
-        yield "training is compared, as last reported; --at area takes the mean over all of it"
+        yield "training is compared, as last reported; --moment area takes the mean over all of it"
     digests = {
         group.label: sorted((run.seed or 0, run.content_digest) for run in group.runs)
         for group in groups
@@ -272,7 +272,7 @@ def _uneven_ends(groups: Sequence[Group], metric: str, line: str) -> list[str]:
     ends = ", ".join(f"after {end:,} episodes in {label}" for label, end in last.items())
     what = "report of training" if metric.startswith("training.") else "evaluation"
     shared = set.intersection(*(set(points) for _, points in curves))
-    hint = f"; --at {max(shared)} compares after as many" if shared else ""
+    hint = f"; --moment {max(shared)} compares after as many" if shared else ""
     return [f"the last {what} is {ends}{hint}"]
 
 

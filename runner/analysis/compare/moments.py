@@ -9,7 +9,7 @@ from typing import Final, Literal
 
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.groups import Group
-from runner.analysis.series import RunSeries, first_crossing, mean_height, parse_target, points_of
+from runner.analysis.series import RunSeries, first_crossing, mean_height, points_of
 from runner.errors import RunnerError
 from runner.recording.metrics import METRIC_OF
 
@@ -54,28 +54,32 @@ class Moment:
                 return f"training episodes until it is first at {self.level:g}"
 
 
-def moment_of(at: str, target: str | None, chosen: Sequence[str]) -> tuple[Moment, Sequence[str]]:
+def moment_of(
+    moment: str, target: tuple[str, float] | None, chosen: Sequence[str]
+) -> tuple[Moment, Sequence[str]]:
     """Return the moment that options stand for, and the metrics: a target names its own.
 
     Args:
-        at: `last`, `best`, `area`, or a number of training episodes.
-        target: METRIC=LEVEL, instead; or None.
+        moment: `last`, `best`, `area`, or a number of training episodes.
+        target: a metric and its level, instead; or None.
         chosen: metrics.
 
     Raises:
         RunnerError: it is none of these, or both are given.
     """
     if target is not None:
-        if at != "last" or chosen:
-            raise RunnerError("target: found at or a metric as well, expected it alone.")
-        metric, level = parse_target(target)
+        if moment != "last" or chosen:
+            raise RunnerError("target: found a moment or a metric as well, expected it alone.")
+        metric, level = target
         return Moment("crossing", level=level), (metric,)
-    if at.isascii() and at.isdecimal():
-        return Moment("episode", number=int(at)), chosen
+    if moment.isascii() and moment.isdecimal():
+        return Moment("episode", number=int(moment)), chosen
     for kind in _OF_WHOLE_RUNS:
-        if at == kind:
+        if moment == kind:
             return Moment(kind), chosen
-    raise RunnerError(f"at: found {at!r}, expected last, best, area, or a number of training episodes.")
+    raise RunnerError(
+        f"moment: found {moment!r}, expected last, best, area, or a number of training episodes."
+    )
 
 
 def value_of(
@@ -89,7 +93,7 @@ def value_of(
     if moment.kind == "episode":
         return points.get(moment.number), f"has none after {moment.number:,} episodes"
     if not run.finished:
-        return None, "not finished; --at EPISODE takes it as far as it got"
+        return None, "not finished; --moment EPISODE takes it as far as it got"
     if moment.kind == "area":
         return _area(points, _shared_episodes(metric, line, groups))
     if moment.level is not None:

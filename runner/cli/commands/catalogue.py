@@ -23,6 +23,8 @@ from runner.cli.options import (
 from runner.cli.output import draw, facts, print_json, say, table, title
 from runner.cli.runs import find
 from runner.errors import ExitCode, RunnerError
+from runner.runs.catalogue.columns import with_same_as
+from runner.runs.run import label
 from runner.util.humanize import UNKNOWN, duration, size
 
 if TYPE_CHECKING:
@@ -60,8 +62,6 @@ def label_command(
       dualtaxi label k3v9m2xq --note - < observations.txt
       dualtaxi ls --quiet name:quick | xargs -I{} dualtaxi label {} --tag first-try
     """
-    from runner.runs.run import label
-
     run = find(run_name, recordings)
     missing = sorted(set(untags) - set(run.tags))
     labels = run.labels
@@ -235,7 +235,6 @@ def rebuild(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> 
 
 
 def _contents(index: Index) -> _Contents:
-    from runner.runs.catalogue.columns import with_same_as
     from runner.runs.catalogue.filters import Filter
 
     rows = index.rows(Filter(None), columns=("root", "entry", "status", "digest"))

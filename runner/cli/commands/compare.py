@@ -38,11 +38,11 @@ from runner.util.humanize import size
     help="A metric; may be repeated.  [default: those of evaluations]",
 )
 @click.option(
-    "--at",
+    "--moment",
     default="last",
     show_default=True,
     metavar="last|best|area|EPISODE",
-    help="The point in training: the last evaluation, each run's best, the mean over all, or after EPISODE.",
+    help="Compare at the last evaluation, at each run's best, the mean over all, or after EPISODE.",
 )
 @target_option(multiple=False)
 @json_option
@@ -54,8 +54,8 @@ def compare_command(
     run_names: tuple[str, ...],
     by: str | None,
     metrics: tuple[str, ...],
-    at: str,
-    target: str | None,
+    moment: str,
+    target: tuple[str, float] | None,
     as_json: bool,
     as_markdown: bool,
     html: Path | None,
@@ -73,7 +73,7 @@ def compare_command(
 
     Examples:
       dualtaxi compare cooperative competitive
-      dualtaxi compare first second third --metric mean_length --at 10000
+      dualtaxi compare first second third --metric mean_length --moment 10000
       dualtaxi compare sweep --by discount --target success_percent=80
       dualtaxi compare cooperative competitive --html comparison.html
     """
@@ -89,7 +89,7 @@ def compare_command(
     require_scipy()
     if html is not None:
         require_page(html, force)
-    moment, chosen = moment_of(at, target, metrics)
+    read_at, chosen = moment_of(moment, target, metrics)
     runs = find_all_recorded(run_names, recordings)
     series = []
     with stage_line("reading runs") as stage:
@@ -99,7 +99,7 @@ def compare_command(
         groups, notes = grouped(series, by)
         require_two(groups, by)
         stage("computing intervals")
-        comparison = compare(groups, metrics_of(groups, chosen), moment, notes)
+        comparison = compare(groups, metrics_of(groups, chosen), read_at, notes)
         if html is not None:
             from runner.export.reports.compare import render_comparison
 
@@ -152,7 +152,7 @@ def diff_command(
     ignore: tuple[str, ...],
     everything: bool,
     first: bool,
-    targets: tuple[str, ...],
+    targets: tuple[tuple[str, float], ...],
 ) -> None:
     """Show what differs between the runs A and B, down to the first step at which they diverge, and why.
 
@@ -165,17 +165,15 @@ def diff_command(
     """
     from runner.analysis import diff as differences
     from runner.analysis.diff.sections import sections
-    from runner.analysis.series import parse_target
     from runner.recording.reader import open_recording
 
     require_one_form(as_json, as_markdown)
-    levels = dict(parse_target(target) for target in targets)
     if html is not None:
         require_page(html, force)
     left, right = find_recorded(a, recordings), find_recorded(b, recordings)
     with open_recording(left.recording) as recording_a, open_recording(right.recording) as recording_b:
         with stage_line("comparing") as stage:
-            difference = differences.diff(recording_a, recording_b, levels, first)
+            difference = differences.diff(recording_a, recording_b, dict(targets), first)
             difference = difference if first else differences.with_seconds(difference, left, right)
             difference = differences.without_ignored(difference, ignore, everything)
             if html is not None:

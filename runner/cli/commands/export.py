@@ -13,14 +13,11 @@ from runner.cli.commands import export_film, export_tables, export_tools
 from runner.cli.options import (
     EXPORTS,
     Ranges,
-    force_option,
-    json_option,
-    output_option,
-    recordings_option,
     run_argument,
     selection_options,
+    writing_options,
 )
-from runner.cli.output import draw, facts, print_json, say
+from runner.cli.output import print_written, say
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_recorded
 from runner.export.places import require_new
@@ -42,10 +39,8 @@ def export_command() -> None:
 
 @export_command.command("rerun", short_help="For the Rerun viewer: every view of selected episodes.")
 @run_argument
-@output_option("exports/NAME-RUN.rrd", "FILE.rrd")
 @selection_options
-@force_option
-@recordings_option
+@writing_options("exports/NAME-RUN.rrd", "FILE.rrd")
 def rerun(
     run_name: str,
     output: Path | None,
@@ -55,6 +50,7 @@ def rerun(
     everything: bool,
     force: bool,
     recordings: Path | None,
+    as_json: bool,
 ) -> None:
     """Export RUN for the Rerun viewer, arranged and ready to look at.
 
@@ -83,7 +79,8 @@ def rerun(
         (selection,) = export([source], request, path)
     print_selection(selection)
     took = duration(time.monotonic() - started)
-    click.echo(f"{path}  {size(path.stat().st_size)}, {selection.steps:,} steps, in {took}")
+    text = f"{path}  {size(path.stat().st_size)}, {selection.steps:,} steps, in {took}"
+    print_written(text, as_json, path, steps=selection.steps, left_out=selection.left_out)
 
 
 def print_selection(selection: Selection) -> None:
@@ -98,11 +95,8 @@ def print_selection(selection: Selection) -> None:
 
 @export_command.command("mcap", short_help="One file with everything, for `dualtaxi import`.")
 @run_argument
-@output_option("NAME-RUN.mcap")
 @click.option("--anonymous", is_flag=True, help="Leave out host, user, command line and folder.")
-@force_option
-@recordings_option
-@json_option
+@writing_options("NAME-RUN.mcap")
 def mcap(
     run_name: str, output: Path | None, anonymous: bool, force: bool, recordings: Path | None, as_json: bool
 ) -> None:
@@ -123,10 +117,8 @@ def mcap(
         exported = export_mcap(run, path, anonymous, force)
     for warning in exported.warnings:
         say(warning)
-    if as_json:
-        print_json({"path": str(path.absolute()), "bytes": path.stat().st_size, "anonymous": anonymous})
-        return
-    draw(facts({"file": f"{path}  {size(path.stat().st_size)}", "next": f"dualtaxi import {path}"}))
+    text = f"{path}  {size(path.stat().st_size)}; `dualtaxi import {path}` takes it in"
+    print_written(text, as_json, path, anonymous=anonymous)
 
 
 for _command in (

@@ -12,13 +12,11 @@ from runner.cli.options import (
     EXPORTS,
     GRID,
     episode_option,
-    force_option,
-    output_option,
-    recordings_option,
     run_argument,
     trial_option,
+    writing_options,
 )
-from runner.cli.output import say
+from runner.cli.output import print_written, say
 from runner.cli.progress import count_line
 from runner.cli.runs import opened_run
 from runner.util.humanize import size
@@ -44,7 +42,6 @@ _FPS = 30.0
     metavar="RxC",
     help="Several episodes side by side, evenly from the best to the worst, such as 3x3.",
 )
-@output_option("exports/NAME-RUN.mp4", "FILE")
 @click.option(
     "--fps",
     type=click.FloatRange(0.1, 240),
@@ -57,8 +54,7 @@ _FPS = 30.0
     metavar="PIXELS",
     help="Width of the film.  [default: about that of the pictures]",
 )
-@force_option
-@recordings_option
+@writing_options("exports/NAME-RUN.mp4")
 def command(
     run_name: str,
     episode: int | None,
@@ -71,6 +67,7 @@ def command(
     width: int | None,
     force: bool,
     recordings: Path | None,
+    as_json: bool,
 ) -> None:
     """Make a film of a recorded episode of RUN; the ending of the file chooses the format.
 
@@ -128,7 +125,13 @@ def command(
         say(note)
     what = shown[0].title if len(shown) == 1 else f"{len(shown)} episodes"
     facts = f"{made[0].frames:,} frames of {made[0].width}x{made[0].height}, {size(path.stat().st_size)}"
-    click.echo(f"{path}: {what}, {facts}")
+    print_written(
+        f"{path}: {what}, {facts}",
+        as_json,
+        path,
+        episodes=[one.title for one in shown],
+        frames=made[0].frames,
+    )
 
 
 def _ranked(recording: Recording, grid: tuple[int, int] | None, best: bool) -> list[EpisodeChoice]:

@@ -11,12 +11,10 @@ from runner.cli.options import (
     EXPORTS,
     Ranges,
     episodes_option,
-    force_option,
-    output_option,
-    recordings_option,
     run_argument,
+    writing_options,
 )
-from runner.cli.output import say
+from runner.cli.output import print_written, say
 from runner.cli.progress import count_line
 from runner.cli.runs import opened_run
 from runner.export.places import new_folder
@@ -34,6 +32,7 @@ def _command(form: str, text: str) -> click.Command:
         episodes: Ranges | None,
         force: bool,
         recordings: Path | None,
+        as_json: bool,
         gz: bool = False,
     ) -> None:
         require("pyarrow", extra="archive", purpose=f"export {form}")
@@ -46,8 +45,10 @@ def _command(form: str, text: str) -> click.Command:
                 rows = write_tables(recording, folder, form, phase, episodes or (), gz, report)
             if form == "csv" and (large := left_out(recording)):
                 say(f"Left out, as CSV cannot hold bytes: {', '.join(large)}; `export parquet` has them.")
-        for name, count in rows.items():
-            click.echo(f"{path / name}  {size((path / name).stat().st_size)}, {count:,} rows")
+        lines = [
+            f"{path / name}  {size((path / name).stat().st_size)}, {n:,} rows" for name, n in rows.items()
+        ]
+        print_written("\n".join(lines), as_json, *(path / name for name in rows), rows=rows)
 
     run.__doc__ = text
     phase_option = click.option(
@@ -57,12 +58,10 @@ def _command(form: str, text: str) -> click.Command:
     )
     gz_option = click.option("--gz", is_flag=True, help="Compress each file with gzip.")
     for option in (
-        recordings_option,
-        force_option,
+        writing_options(f"exports/NAME-RUN-{form}", "FOLDER"),
         *([gz_option] if form == "csv" else []),
         episodes_option,
         phase_option,
-        output_option(f"exports/NAME-RUN-{form}", "FOLDER"),
         run_argument,
     ):
         run = option(run)

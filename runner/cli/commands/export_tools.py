@@ -12,11 +12,12 @@ from runner.cli.options import (
     Ranges,
     episodes_option,
     force_option,
-    output_option,
+    json_option,
     recordings_option,
     run_argument,
+    writing_options,
 )
-from runner.cli.output import say
+from runner.cli.output import print_written, say
 from runner.cli.progress import count_line, stage_line
 from runner.cli.runs import opened_run
 from runner.export.places import new_folder
@@ -24,7 +25,6 @@ from runner.export.places import new_folder
 
 @click.command("minari", cls=Command, short_help="A Minari dataset, for offline learning.")
 @run_argument
-@output_option(EXPORTS / "minari", "FOLDER")
 @click.option(
     "--phase",
     type=click.Choice(["train", "eval"]),
@@ -33,8 +33,7 @@ from runner.export.places import new_folder
     help="The phase of the episodes.",
 )
 @episodes_option
-@force_option
-@recordings_option
+@writing_options(EXPORTS / "minari", "FOLDER")
 def minari(
     run_name: str,
     output: Path,
@@ -42,6 +41,7 @@ def minari(
     episodes: Ranges | None,
     force: bool,
     recordings: Path | None,
+    as_json: bool,
 ) -> None:
     """Export the episodes of RUN as a Minari dataset: observations, actions, rewards, how each ended.
 
@@ -63,18 +63,20 @@ def minari(
             written = write_dataset(recording, folder, phase, episodes or (), report)
     for note in written.notes:
         say(note)
-    click.echo(
+    text = (
         f"{path}  {written.episodes:,} episodes, {written.steps:,} steps; read it by: "
         f"MINARI_DATASETS_PATH={output} and minari.load_dataset('{path.name}')"
     )
+    counts = {"episodes": written.episodes, "steps": written.steps}
+    print_written(text, as_json, path, dataset=path.name, **counts)
 
 
 @click.command("tensorboard", cls=Command, short_help="An event file for TensorBoard.")
 @run_argument
-@output_option("exports/tensorboard/NAME-RUN", "FOLDER")
-@force_option
-@recordings_option
-def tensorboard(run_name: str, output: Path | None, force: bool, recordings: Path | None) -> None:
+@writing_options("exports/tensorboard/NAME-RUN", "FOLDER")
+def tensorboard(
+    run_name: str, output: Path | None, force: bool, recordings: Path | None, as_json: bool
+) -> None:
     """Export RUN for TensorBoard: every metric, and length and return of each training episode.
 
     Each number is at its training step. TensorBoard itself keeps numbers as 32-bit floats, and shows a
@@ -91,10 +93,11 @@ def tensorboard(run_name: str, output: Path | None, force: bool, recordings: Pat
         path = output or EXPORTS / "tensorboard" / run.file_stem
         with new_folder(path, force, PATTERNS) as folder, stage_line("writing events"):
             count = write_events(recording, folder)
-    click.echo(
+    text = (
         f"{path}  {count:,} numbers; view them by: "
         f"tensorboard --logdir {path.parent} --samples_per_plugin scalars=100000"
     )
+    print_written(text, as_json, path, numbers=count)
 
 
 @click.command("mlflow", cls=Command, short_help="A run in an MLflow store.")
@@ -114,8 +117,15 @@ def tensorboard(run_name: str, output: Path | None, force: bool, recordings: Pat
 @click.option("--with-recording", is_flag=True, help="Also store the recording as an artifact.")
 @force_option
 @recordings_option
+@json_option
 def mlflow(
-    run_name: str, tracking: str, experiment: str, with_recording: bool, force: bool, recordings: Path | None
+    run_name: str,
+    tracking: str,
+    experiment: str,
+    with_recording: bool,
+    force: bool,
+    recordings: Path | None,
+    as_json: bool,
 ) -> None:
     """Export RUN into MLflow: parameters, metrics over training steps, tags, and run.json as an artifact.
 
@@ -134,6 +144,6 @@ def mlflow(
         say(note)
     if result.exists:
         say("The run is in the store already, with this content; nothing was written. --force replaces it.")
-    click.echo(
-        f"{tracking}  experiment {experiment}, run {result.mlflow_run}, {result.metrics:,} metrics written"
-    )
+    text = f"{tracking}  experiment {experiment}, run {result.mlflow_run}, {result.metrics:,} metrics written"
+    place = {"tracking_uri": tracking, "experiment": experiment, "mlflow_run": result.mlflow_run}
+    print_written(text, as_json, already=result.exists, metrics=result.metrics, **place)

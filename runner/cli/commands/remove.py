@@ -39,7 +39,10 @@ _LEFT: Final = ("id", "name", "status")
 
 _yes_option = click.option("--yes", "-y", is_flag=True, help="Do not ask for confirmation.")
 _foreign_option = click.option(
-    "--force", is_flag=True, help="Also remove files and folders in a run's folder that no run writes."
+    "--foreign-files",
+    "foreign",
+    is_flag=True,
+    help="Also remove files and folders in a run's folder that no run writes.",
 )
 _dry_run_option = click.option(
     "--dry-run", is_flag=True, help="Show what would be removed and how much is freed, and remove nothing."
@@ -54,7 +57,12 @@ _dry_run_option = click.option(
 @_foreign_option
 @json_option
 def rm_command(
-    run_names: tuple[str, ...], recordings: Path | None, yes: bool, dry_run: bool, force: bool, as_json: bool
+    run_names: tuple[str, ...],
+    recordings: Path | None,
+    yes: bool,
+    dry_run: bool,
+    foreign: bool,
+    as_json: bool,
 ) -> None:
     """Remove runs and their recordings, after confirmation.
 
@@ -70,11 +78,11 @@ def rm_command(
 
     root = recordings_folder(recordings)
     runs = {run.folder.resolve(): run for run in (find(name, recordings) for name in run_names)}
-    removals = [plan(run, root, force) for run in runs.values()]
+    removals = [plan(run, root, foreign) for run in runs.values()]
     refused = [f"run {each.run_id} stays: {each.refusal}." for each in removals if each.refusal]
     if refused:
         raise RunnerError("\n".join([*refused, "Nothing was removed."]))
-    _carry_out(removals, {}, force, yes, dry_run, as_json)
+    _carry_out(removals, {}, foreign, yes, dry_run, as_json)
 
 
 @click.command("prune", cls=Command)
@@ -101,7 +109,7 @@ def prune_command(
     statuses: tuple[str, ...],
     dry_run: bool,
     yes: bool,
-    force: bool,
+    foreign: bool,
     as_json: bool,
 ) -> None:
     """Remove the runs that match FILTER (as in `dualtaxi ls`) and all options, after confirmation.
@@ -129,10 +137,10 @@ def prune_command(
         raise click.UsageError("expected a FILTER, --older-than, --keep-last or --status: which runs?")
     rows, protected = look(recordings, lambda index: unwanted(index, criteria, time.time()), say)
     if dry_run:
-        removals = [plan_row(row, force) for row in rows]
+        removals = [plan_row(row, foreign) for row in rows]
     else:
         places = [(Path(row["root"]), row["entry"]) for row in rows]
-        removals = [plan(run, root, force) for root, entry in places if (run := run_in(root / entry))]
+        removals = [plan(run, root, foreign) for root, entry in places if (run := run_in(root / entry))]
     kept = {each.run_id: each.refusal for each in removals if each.refusal}
     for run_id, reason in kept.items():
         say(f"Run {run_id} stays: {reason}.")
@@ -143,18 +151,18 @@ def prune_command(
     if not removals and not as_json:
         say("There is nothing to remove.")
         return
-    _carry_out(removals, kept, force, yes, dry_run, as_json)
+    _carry_out(removals, kept, foreign, yes, dry_run, as_json)
 
 
 def _carry_out(
-    removals: Sequence[Removal], kept: dict[str, str], force: bool, yes: bool, dry_run: bool, as_json: bool
+    removals: Sequence[Removal], kept: dict[str, str], foreign: bool, yes: bool, dry_run: bool, as_json: bool
 ) -> None:
     """Show the removals, ask, carry them out and print what was freed.
 
     Args:
         removals: the removals, none of them refused.
         kept: run id to reason, of the runs that stay; for programs.
-        force: also remove strange files.
+        foreign: also remove foreign files.
         yes: do not ask.
         dry_run: remove nothing.
         as_json: print JSON.
@@ -176,7 +184,7 @@ def _carry_out(
         if not yes:
             click.confirm(f"Remove {runs} for good, and free {size(freed)}?", abort=True, err=True)
         for removal in removals:
-            remove(removal, force)
+            remove(removal, foreign)
         for root in {removal.root for removal in removals}:
             clean(root)
     if as_json:

@@ -11,12 +11,10 @@ from runner.cli.options import (
     EXPORTS,
     INDEX,
     TRIAL,
-    force_option,
-    output_option,
-    recordings_option,
     runs_argument,
+    writing_options,
 )
-from runner.cli.output import say
+from runner.cli.output import print_written, say
 from runner.cli.progress import count_line, stage_line
 from runner.cli.runs import find_all_recorded
 from runner.export.places import write_new, write_text_new
@@ -27,10 +25,10 @@ from runner.util.humanize import size
 
 @click.command("plot", cls=Command)
 @runs_argument
-@output_option(EXPORTS / "plot.png", "FILE.png|svg|pdf")
-@force_option
-@recordings_option
-def plot_command(run_names: tuple[str, ...], output: Path, force: bool, recordings: Path | None) -> None:
+@writing_options(EXPORTS / "plot.png", "FILE.png|svg|pdf")
+def plot_command(
+    run_names: tuple[str, ...], output: Path, force: bool, recordings: Path | None, as_json: bool
+) -> None:
     """Draw every metric of one or several runs over episodes, in one figure; or a sweep.
 
     Runs that differ in nothing but the seed are drawn as one line, their median, with a band from the lowest
@@ -56,7 +54,7 @@ def plot_command(run_names: tuple[str, ...], output: Path, force: bool, recordin
     check_suffix(output)
     folder = recordings_folder(recordings)
     if is_sweep(run_names, folder):
-        _plot_sweep(run_names[0], folder, output, force)
+        _plot_sweep(run_names[0], folder, output, force, as_json)
         return
     series = []
     runs = find_all_recorded(run_names, folder)
@@ -76,10 +74,11 @@ def plot_command(run_names: tuple[str, ...], output: Path, force: bool, recordin
     with stage_line("drawing"):
         write_new(output, force, lambda path: save(curves_sheet(groups, panels), path))
     count = sum(len(group.runs) for group in groups)
-    click.echo(f"{output}: {len(panels)} metrics of {_runs(count)}")
+    text = f"{output}: {len(panels)} metrics of {_runs(count)}"
+    print_written(text, as_json, output, metrics=len(panels), runs=count)
 
 
-def _plot_sweep(name: str, recordings: Path, output: Path, force: bool) -> None:
+def _plot_sweep(name: str, recordings: Path, output: Path, force: bool, as_json: bool) -> None:
     from runner.export.plots.image import save
     from runner.sweep.charts import learning, panel_of, picture_of, sweep_sheet
     from runner.sweep.results import results_of
@@ -92,12 +91,12 @@ def _plot_sweep(name: str, recordings: Path, output: Path, force: bool) -> None:
     with stage_line("drawing"):
         sheet = sweep_sheet(f"Sweep {name}", picture, groups, panel)
         write_new(output, force, lambda path: save(sheet, path))
-    click.echo(f"{output}: the sweep {name}, {len(picture.trials)} trials")
+    count = len(picture.trials)
+    print_written(f"{output}: the sweep {name}, {count} trials", as_json, output, sweep=name, trials=count)
 
 
 @click.command("report", cls=Command)
 @runs_argument
-@output_option(EXPORTS / "report.html")
 @click.option(
     "--episode",
     "episodes",
@@ -114,8 +113,7 @@ def _plot_sweep(name: str, recordings: Path, output: Path, force: bool) -> None:
     metavar="N:TRIAL",
     help="Also show this trial of the evaluation after N training episodes; may be repeated.",
 )
-@force_option
-@recordings_option
+@writing_options(EXPORTS / "report.html", "FILE.html")
 def report_command(
     run_names: tuple[str, ...],
     output: Path,
@@ -123,6 +121,7 @@ def report_command(
     trials: tuple[tuple[int, int], ...],
     force: bool,
     recordings: Path | None,
+    as_json: bool,
 ) -> None:
     """Write one self-contained page about one or several runs, or about a sweep.
 
@@ -146,7 +145,7 @@ def report_command(
     if is_sweep(run_names, folder):
         if episodes or trials:
             raise click.UsageError("the page of a sweep shows no episode: leave out --episode and --eval.")
-        _report_sweep(run_names[0], folder, output, force)
+        _report_sweep(run_names[0], folder, output, force, as_json)
         return
     replays = [*(("train", number, 0) for number in episodes), *(("eval", *trial) for trial in trials)]
     paths = [run.recording for run in find_all_recorded(run_names, folder)]
@@ -155,10 +154,11 @@ def report_command(
         write_new(output, force, lambda path: notes.extend(write_report(path, paths, replays, progress)))
     for note in notes:
         say(note)
-    click.echo(f"{output}: {size(output.stat().st_size)}, {_runs(len(paths))}")
+    text = f"{output}: {size(output.stat().st_size)}, {_runs(len(paths))}"
+    print_written(text, as_json, output, runs=len(paths))
 
 
-def _report_sweep(name: str, recordings: Path, output: Path, force: bool) -> None:
+def _report_sweep(name: str, recordings: Path, output: Path, force: bool, as_json: bool) -> None:
     from runner.sweep.page import render_sweep
     from runner.sweep.results import results_of
     from runner.sweep.state import read_sweep
@@ -166,7 +166,8 @@ def _report_sweep(name: str, recordings: Path, output: Path, force: bool) -> Non
     results = results_of(read_sweep(name, recordings), recordings)
     with stage_line("drawing"):
         write_text_new(output, force, render_sweep(results, recordings))
-    click.echo(f"{output}: {size(output.stat().st_size)}, the sweep {name}")
+    text = f"{output}: {size(output.stat().st_size)}, the sweep {name}"
+    print_written(text, as_json, output, sweep=name)
 
 
 def _runs(count: int) -> str:

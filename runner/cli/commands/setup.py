@@ -8,7 +8,7 @@ import click
 
 from runner.cli import Command, Group
 from runner.cli.options import DIRECTORY, SHIPPED, config_argument, json_option, output_option, set_option
-from runner.cli.output import draw, print_json, say, table
+from runner.cli.output import draw, print_json, print_written, say, table
 
 
 @click.command("init", cls=Command)
@@ -91,10 +91,8 @@ def copy(name: str, output: Path | None, as_json: bool) -> None:
     experiment = find_shipped(name)
     target = output or Path(f"{name}.yaml")
     copy_shipped(experiment, target)
-    if as_json:
-        print_json({"name": name, "path": str(target.absolute())})
-    else:
-        click.echo(target)
+    print_written(str(target), as_json, target, name=name)
+    if not as_json:
         say(f"Next: {experiment.command.rpartition(' ')[0]} {target}")
 
 

@@ -20,7 +20,7 @@ from runner.cli.options import (
     run_argument,
     set_option,
 )
-from runner.cli.output import draw, facts, print_json, say, table, title
+from runner.cli.output import draw, facts, files_written, print_json, say, table, title
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_recorded
 from runner.export.places import require_new, write_new
@@ -96,13 +96,12 @@ def qtable_command(
                 np.save(stream, array)
 
         write_new(output, force, write)
-    written = None if output is None else str(output.absolute())
     if as_json:
-        print_json({**values, **({"path": written} if written else {})})
+        print_json(values if output is None else {**values, "files": files_written(output)})
         return
     _draw(values)
-    if written:
-        say(f"Written: {written}")
+    if output is not None:
+        say(f"Written: {output.absolute()}")
 
 
 def _draw(values: TablesDescription) -> None:

@@ -11,7 +11,7 @@ import click
 
 from runner.cli import Command
 from runner.cli.commands.export import print_selection
-from runner.cli.options import PICTURE_SIZE, STEP, RunName, recordings_option, selection_options
+from runner.cli.options import PICTURE_SIZE, STEP, RunName, force_option, recordings_option, selection_options
 from runner.cli.output import say
 from runner.cli.runs import find_recorded
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     "step",
     type=STEP,
     metavar="EPISODE:T",
-    help="The point in training: EPISODE:T to show a step, or eval:N:TRIAL:T of an evaluation. "
+    help="The step to show: EPISODE:T of training, or eval:N:TRIAL:T of an evaluation. "
     "T and TRIAL default to 0.",
 )
 @click.option("--web", is_flag=True, help="Serve the web viewer on 127.0.0.1 instead of opening a window.")
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     metavar="WxH",
     help="Size of the screenshot in pixels.",
 )
-@click.option("--force", is_flag=True, help="Replace the screenshot if it exists.")
+@force_option
 @selection_options
 @recordings_option
 def view_command(

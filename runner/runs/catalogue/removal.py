@@ -68,42 +68,42 @@ class Removal:
         return listed_run(self.folder, self.run_id)
 
 
-def plan(run: Run, root: Path, force: bool = False) -> Removal:
+def plan(run: Run, root: Path, foreign: bool = False) -> Removal:
     """Return the removal of a run.
 
     Args:
         run: the run to remove.
         root: the recordings folder it must be in.
-        force: also remove strange files in its folder.
+        foreign: also remove foreign files in its folder.
     """
     row = row_of(run, None) | {"root": root, "entry": run.folder.name}
-    return _removal(row, run.folder, _why_not_in(run, root) or _protected(run), force)
+    return _removal(row, run.folder, _why_not_in(run, root) or _protected(run), foreign)
 
 
-def plan_row(row: dict[str, Any], force: bool = False) -> Removal:
+def plan_row(row: dict[str, Any], foreign: bool = False) -> Removal:
     """Return the removal of a run by its row in the index, which is quicker for very many runs.
 
     This is for showing only: before runs are removed, `plan` reads their own files.
 
     Args:
         row: a row that `unwanted` returned.
-        force: also remove strange files in its folder.
+        foreign: also remove foreign files in its folder.
     """
     folder = Path(row["root"], row["entry"])
-    return _removal(row, folder, _linked(folder) or _unreadable(folder), force)
+    return _removal(row, folder, _linked(folder) or _unreadable(folder), foreign)
 
 
-def _removal(row: dict[str, Any], folder: Path, refusal: str, force: bool) -> Removal:
+def _removal(row: dict[str, Any], folder: Path, refusal: str, foreign: bool) -> Removal:
     contents = Contents()
     if not refusal:
         try:
             contents = contents_of(folder)
         except OSError as error:
             refusal = f"its folder cannot be read ({error.strerror})"
-    if contents.strange and not force:
+    if contents.foreign and not foreign:
         refusal = (
-            f"its folder also has {listed(contents.strange)}, which no run writes; "
-            "move that away, or remove it as well with --force"
+            f"its folder also has {listed(contents.foreign)}, which no run writes; "
+            "move that away, or remove it as well with --foreign-files"
         )
     return Removal(
         run_id=row["id"],
@@ -120,12 +120,12 @@ def _removal(row: dict[str, Any], folder: Path, refusal: str, force: bool) -> Re
     )
 
 
-def remove(removal: Removal, force: bool = False) -> None:
+def remove(removal: Removal, foreign: bool = False) -> None:
     """Remove a run.
 
     Args:
         removal: from `plan`.
-        force: also remove strange files in its folder.
+        foreign: also remove foreign files in its folder.
 
     Raises:
         RunnerError: it must not be removed, or another process is using it; it is unchanged.
@@ -147,7 +147,7 @@ def remove(removal: Removal, force: bool = False) -> None:
         except RunnerError:
             hidden.rename(run.folder)
             raise
-        _delete(hidden, force)
+        _delete(hidden, foreign)
     except OSError as error:
         raise StorageError(f"{error.filename or hidden}: cannot be removed ({error.strerror}).") from error
 
@@ -157,7 +157,7 @@ def clean(root: Path) -> None:
     for stray in strays(root):
         with contextlib.suppress(OSError):
             if time.time() - stray.stat().st_mtime > _STRAY_SECONDS:
-                _delete(stray, force=False)
+                _delete(stray, foreign=False)
 
 
 @dataclass(frozen=True)
@@ -240,14 +240,14 @@ def _unreadable(folder: Path) -> str:
     return ""
 
 
-def _delete(folder: Path, force: bool) -> None:
-    """Delete the run's files in a folder, strange ones first if `force`, and the folder."""
+def _delete(folder: Path, foreign: bool) -> None:
+    """Delete the run's files in a folder, foreign ones first if `foreign`, and the folder."""
     with os.scandir(folder) as entries:
         found = sorted(entries, key=lambda entry: belongs(entry.name))
     for entry in found:
         if entry.is_dir(follow_symlinks=False):
-            if force:
+            if foreign:
                 shutil.rmtree(entry.path)
-        elif force or belongs(entry.name):
+        elif foreign or belongs(entry.name):
             Path(entry.path).unlink(missing_ok=True)
     folder.rmdir()

@@ -43,12 +43,12 @@ class Contents:
 
     recording: int = 0
     other: int = 0
-    """All other files, including strange ones."""
+    """All other files, including foreign ones."""
     left_over: int = 0
     """Of these: files left by a repair or an interrupted command."""
     freed: int = 0
     """Freed by removing the run's own files; those with other links free nothing."""
-    strange: list[str] = field(default_factory=list)
+    foreign: list[str] = field(default_factory=list)
     """Names that no run has: the user's own files, folders, links."""
 
 
@@ -75,8 +75,8 @@ def contents_of(folder: Path) -> Contents:
                 found.freed += size if facts.st_nlink == 1 else 0
                 found.left_over += size if _LEFT_OVER.fullmatch(entry.name) else 0
             else:
-                found.strange.append(entry.name)
-    found.strange.sort()
+                found.foreign.append(entry.name)
+    found.foreign.sort()
     return found
 
 
@@ -216,7 +216,7 @@ def usage_of(
             contents = contents_of(Path(row["root"], row["entry"]))
         except OSError:
             contents = Contents()  # removed just now
-        if row["stable"] and row["status"] != "running" and not contents.strange:
+        if row["stable"] and row["status"] != "running" and not contents.foreign:
             measured.append((row, contents))
         every.append(usage(row, contents))
         sums.add(every[-1])

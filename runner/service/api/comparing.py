@@ -67,13 +67,15 @@ async def compare(
     ],
     by: Annotated[str | None, Query(max_length=200, description="Group by this setting.")] = None,
     metric: Annotated[list[str] | None, Query(max_length=100)] = None,
-    at: Annotated[str, Query(max_length=20, description="`last`, `best`, `area`, or episodes.")] = "last",
-    target: Annotated[str | None, Query(max_length=200, description="METRIC=LEVEL, instead of `at`.")] = None,
+    moment: Annotated[str, Query(max_length=20, description="`last`, `best`, `area`, or episodes.")] = "last",
+    target: Annotated[
+        str | None, Query(max_length=200, description="METRIC=LEVEL, instead of `moment`.")
+    ] = None,
 ) -> dict[str, Any]:
     """Return what `dualtaxi compare --json` prints; a run's name stands for all runs of that name."""
     runs = await found_runs(catalogue, run, several=True)
     key = ("compare", *map(recording_state, runs), request.url.query)
-    options = ([found.recording for found in runs], by, metric or [], at, target)
+    options = ([found.recording for found in runs], by, metric or [], moment, target)
     body = await cache.get_or_await(key, lambda: processes(computed.comparison, *options), ALWAYS)
     return Response(body, media_type="application/json")  # type: ignore[return-value]
 

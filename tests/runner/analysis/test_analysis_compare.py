@@ -247,7 +247,7 @@ def test_interrupted_runs_are_left_out_and_taken_at_an_episode_that_they_have():
 
 def test_groups_of_other_lengths_and_modes_are_compared_as_far_as_they_can_be():
     series = [run(0, [0, 10]), run(0, [0, 10, 20], name="b")]
-    assert "--at 100 compares" in result(series).metrics[0].notes[0]
+    assert "--moment 100 compares" in result(series).metrics[0].notes[0]
     series = [run(0, [0, 1], metric="mean_return", line=line, mode=line) for line in ("agency", "taxi_1")]
     groups, _ = grouped(series)
     metrics = metrics_of(groups)
@@ -303,7 +303,7 @@ def test_the_command_prints_text_json_and_markdown(command):
     assert [metric["line"] for metric in as_json["metrics"]] == ["taxi_1", "taxi_2"]
     assert as_json["metrics"][0]["groups"][0]["seeds"] == [0, 1, 2]
     assert command("near", "far", "--markdown").stdout.startswith("## Groups")
-    by_value = command("near", "far", "--by", "discount", "--at", "10")
+    by_value = command("near", "far", "--by", "discount", "--moment", "10")
     assert "discount = 0.95" in by_value.stdout
 
 
@@ -312,10 +312,10 @@ def test_the_command_prints_text_json_and_markdown(command):
     [
         (["near"], "found 3 runs of one configuration"),
         (["near@latest"], "found one run"),
-        (["near", "far", "--at", "middle"], "expected last, best, area"),
+        (["near", "far", "--moment", "middle"], "expected last, best, area"),
         (["near", "far", "--target", "success_percent"], "expected METRIC=LEVEL"),
         (["near", "far", "--target", "finish=80"], "expected one of"),
-        (["near", "far", "--at", "14"], "the nearest are those after 10 and 20"),
+        (["near", "far", "--moment", "14"], "the nearest are those after 10 and 20"),
         (["near", "far", "--by", "tables"], "expected two values"),
         (["near", "nobody"], "nobody"),
     ],

@@ -6,6 +6,8 @@ import contextlib
 import json
 import re
 import shutil
+from collections import defaultdict
+from pathlib import Path
 from types import SimpleNamespace
 
 import click
@@ -45,6 +47,22 @@ LISTS = {
     "remote jobs": "jobs",
 }
 """Commands whose result is a list, and the name of the list."""
+WRITING = {
+    "plot": "{run} -o {folder}/plot.svg",
+    "report": "{run} -o {folder}/report.html",
+    "config copy": "quick -o {folder}/mine.yaml",
+    "export rerun": "{run} -o {folder}/a.rrd",
+    "export mcap": "{run} -o {folder}/a.mcap",
+    "export film": "{run} -o {folder}/a.gif",
+    "export csv": "{run} -o {folder}/csv",
+    "export parquet": "{run} -o {folder}/parquet",
+    "export minari": "{run} --phase eval -o {folder}/minari",
+    "export tensorboard": "{run} -o {folder}/tensorboard",
+    "qtable": "{run} --state 0 -o {folder}/table.npy",
+}
+"""Commands whose JSON lists the files that they wrote, and what is typed after them."""
+WITHOUT_JSON = ("view", "completion", "serve")
+"""Commands that print an address, a script or nothing."""
 LINES = ("run", "play", "table", "archive")
 """Commands that print one object per line."""
 WORDS = {
@@ -59,18 +77,16 @@ WORDS = {
     "diff": "@latest @latest",
     "compare": "@latest other@latest",
     "verify": "@latest",
-    "qtable": "@latest --state 0",
     "table": "--env FrozenLake-v1",
     "label": "@latest --tag good",
     "rm": "@latest --dry-run",
     "prune": "--keep-last 0 --dry-run",
     "repair": "@latest",
     "init": "{folder}/start",
-    "config copy": "quick -o {folder}/mine.yaml",
     "config check": "{tiny}",
     "archive": "@latest --to {folder}/archive",
     "restore": "other",
-    "export mcap": "@latest -o {folder}/a.mcap",
+    "export mlflow": "@latest --tracking-uri sqlite:///{folder}/mlflow.db",
     "import": "{recording} --as-new",
     "remote push": "@latest",
     "remote pull": "@latest",
@@ -106,6 +122,7 @@ def place(tmp_path_factory, recorded_run, command_in):
         tiny=tiny,
         sweep=sweep,
         recording=recorded_run.recording,
+        run=recorded_run.run_id,
     )
 
 
@@ -129,13 +146,14 @@ def server(monkeypatch, tmp_path, recorded_run):
 
 
 def test_every_command_with_json_is_tested():
-    assert {*WORDS, *LISTS} <= {" ".join(path) for path in WITH_JSON}
+    assert {*WORDS, *LISTS, *WRITING} <= {" ".join(path) for path in WITH_JSON}
+    assert {" ".join(path) for path in EVERY.keys() - WITH_JSON.keys()} == {*WITHOUT_JSON}
 
 
 @pytest.mark.parametrize("path", WITH_JSON, ids=" ".join)
 def test_json_is_an_object_or_one_per_line(place, path):
     name = " ".join(path)
-    words = WORDS.get(name, "").format(**vars(place)).split()
+    words = (WORDS | WRITING).get(name, "").format(**vars(place)).split()
     if name == "token revoke":
         place.command("token", "create", "laptop")
     done = place.command(*path, *words, "--json")
@@ -149,6 +167,11 @@ def test_json_is_an_object_or_one_per_line(place, path):
     assert all(isinstance(each, dict) for each in objects)
     if name in LISTS:
         assert isinstance(objects[0][LISTS[name]], list)
+    if name in WRITING:
+        assert objects[0]["files"]
+        for file in objects[0]["files"]:
+            assert Path(file["path"]).is_absolute()
+            assert Path(file["path"]).stat().st_size == file["bytes"]
 
 
 @pytest.mark.parametrize("path", EVERY, ids=" ".join)
@@ -184,15 +207,40 @@ def test_exit_codes_are_explained_by_help():
         assert [str(int(code)), *code.explanation.split()] in lines
 
 
-@pytest.mark.parametrize(
-    "name", ["all", "at", "limit", "workers", "target", "set", "json", "markdown", "recordings"]
+OF_THE_COMMAND = (
+    "accept-changes",
+    "dry-run",
+    "episode",
+    "eval",
+    "name",
+    "output",
+    "phase",
+    "port",
+    "ray",
+    "seed",
 )
+"""Options that mean the same thing, in words that fit the command."""
+
+
+def meanings():
+    """Return the meanings of each option by name, as help states them up to the first stop."""
+    found = defaultdict(set)
+    for command in EVERY.values():
+        for option in command.params:
+            if isinstance(option, click.Option):
+                text = re.split(r"[:;.]|  \[", option.help or "")[0].replace("A folder", "The folder")
+                for name in option.opts:
+                    found[name].add((text, option.type.name))
+    return found
+
+
+@pytest.mark.parametrize("name", meanings())
 def test_an_option_has_one_meaning(name):
-    texts = {
-        option.help
-        for command in EVERY.values()
-        for option in command.params
-        if isinstance(option, click.Option) and f"--{name}" in option.opts
-    }
-    meanings = {re.split(r"[:;.]|  \[", text)[0].replace("A folder", "The folder") for text in texts}
-    assert len(meanings) == 1, texts
+    assert len(meanings()[name]) == 1 or name in ("-o", *(f"--{each}" for each in OF_THE_COMMAND))
+
+
+def test_a_wrong_target_is_named_as_it_is_typed(place):
+    for command in ("diff", "compare"):
+        done = place.command(command, "@latest", "@latest", "--target", "far")
+        assert done.exit_code == ExitCode.USAGE
+        assert "'--target': found 'far', expected METRIC=LEVEL" in done.stderr

@@ -299,7 +299,8 @@ def test_qtable_replaces_a_file_only_with_force(recorded, tmp_path):
     assert result.exit_code == 2
     assert "--force" in result.stderr
     assert out.read_text() == "mine"
-    assert recorded.json("qtable", "@latest", "-o", out, "--force")["path"] == str(out)
+    (file,) = recorded.json("qtable", "@latest", "-o", out, "--force")["files"]
+    assert file["path"] == str(out)
     assert np.load(out).dtype == np.float64
     assert list(tmp_path.iterdir()) == [out]
 

@@ -241,7 +241,7 @@ def test_rm_leaves_strange_files_unless_forced(command, make):
     assert result.exit_code == 2
     assert "figures, thesis.tex" in result.stderr
     assert (run.folder / "thesis.tex").exists()
-    assert command("rm", run.run_id, "--yes", "--force").exit_code == 0
+    assert command("rm", run.run_id, "--yes", "--foreign-files").exit_code == 0
     assert not run.folder.exists()
 
 
@@ -251,10 +251,10 @@ def test_rm_follows_no_link_and_stays_in_its_folder(command, make, tmp_path, rec
     (outside / "precious").write_text("mine")
     linked, moved, inside = make(), make(), make()
     (linked.folder / "link").symlink_to(outside, target_is_directory=True)
-    assert command("rm", linked.run_id, "--yes", "--force").exit_code == 0
+    assert command("rm", linked.run_id, "--yes", "--foreign-files").exit_code == 0
     moved.recording.unlink()
     moved.recording.symlink_to(outside / "precious")
-    assert command("rm", moved.run_id, "--yes", "--force").exit_code == 0
+    assert command("rm", moved.run_id, "--yes", "--foreign-files").exit_code == 0
     assert (outside / "precious").read_text() == "mine"
     elsewhere = tmp_path / "elsewhere"
     inside.folder.rename(elsewhere)
