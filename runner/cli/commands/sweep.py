@@ -145,7 +145,8 @@ def run(
 @click.argument("name")
 @all_option
 @click.option(
-    "--best",
+    "--write-best",
+    "best",
     type=click.Path(path_type=Path),
     metavar="FILE",
     help="Write the best configuration, with fresh seeds.",
@@ -171,7 +172,7 @@ def show(
 
     Examples:
       dualtaxi sweep show hyperparameters
-      dualtaxi sweep show hyperparameters --best best.yaml
+      dualtaxi sweep show hyperparameters --write-best best.yaml
     """
     from runner.sweep.results import DEFAULT_SHOWN, results_of, sections
     from runner.sweep.state import read_sweep
@@ -198,7 +199,9 @@ def show(
         print_sections(sections(results, None if everything else DEFAULT_SHOWN), as_markdown)
         if best is None and results.best is not None:
             number = results.best.number
-            say(f"--best FILE writes the configuration of trial {number}, with fresh seeds to confirm it.")
+            say(
+                f"--write-best FILE writes the configuration of trial {number}, with fresh seeds to confirm it."
+            )
     if best is not None:
         if results.best_yaml is None:
             raise RunnerError(f"the sweep {name!r} has no finished trial yet, so there is no best one.")

@@ -43,7 +43,7 @@ def test_a_sweep_runs_and_its_best_configuration_loads(type_in, file, tmp_path):
     assert len(shown["ranking"]) == 6
     assert "median" in type_in("show", "small").stdout
     best = tmp_path / "best.yaml"
-    type_in("show", "small", "--best", str(best))
+    type_in("show", "small", "--write-best", str(best))
     assert load(best).step_size == reply["best"]["values"]["step_size"]
     assert load(best).seeds == tuple(range(2, 12))  # the search saw 0 and 1
     assert json.loads(type_in("ls", "--json").stdout) == {"sweeps": ["small"]}
@@ -83,7 +83,7 @@ def test_a_level_that_is_never_reached_is_printed_as_never(type_in, file, tmp_pa
     assert "never in trial 0" in type_in("run", path, "--workers", "1").stdout
     assert json.loads(type_in("run", path, "--resume", "--json").stdout)["best"]["value"] is None
     best = tmp_path / "best.yaml"
-    type_in("show", "small", "--best", str(best))
+    type_in("show", "small", "--write-best", str(best))
     assert ": never, the median" in best.read_text()
     plotted = CliRunner().invoke(cli, ["plot", "small", "--recordings", str(tmp_path / "runs")])
     assert "none of its 1 finished trials reached success_percent, first at 101" in plotted.output
