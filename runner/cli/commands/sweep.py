@@ -199,9 +199,7 @@ def show(
         print_sections(sections(results, None if everything else DEFAULT_SHOWN), as_markdown)
         if best is None and results.best is not None:
             number = results.best.number
-            say(
-                f"--write-best FILE writes the configuration of trial {number}, with fresh seeds to confirm it."
-            )
+            say(f"--write-best FILE writes the configuration of trial {number}, with seeds not searched.")
     if best is not None:
         if results.best_yaml is None:
             raise RunnerError(f"the sweep {name!r} has no finished trial yet, so there is no best one.")
