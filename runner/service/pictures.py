@@ -8,6 +8,7 @@ closed, and with it the process of the environment.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import struct
 import threading
 import time
@@ -143,13 +144,13 @@ class PictureStreams:
                 stream.idle_since = None
                 return stream
             self._close(stream)  # it would have to go back
-        kept = [stream for stream in self._streams if stream.can_continue]
-        closing_too = len(self._streams)
-        if sum(not stream.is_closed for stream in self._streams) >= MAX_STREAMS:
+        alive = [stream for stream in self._streams if stream.is_alive]
+        if len([stream for stream in alive if not stream.is_closed]) >= MAX_STREAMS:
+            kept = [stream for stream in alive if stream.can_continue]
             if not kept:
                 raise Busy(_BUSY)
             self._close(min(kept, key=lambda stream: stream.idle_since or 0.0))
-        if closing_too >= 2 * MAX_STREAMS:  # environments that hang
+        if len(alive) >= 2 * MAX_STREAMS:  # environments that hang
             raise Busy(_BUSY)
         stream = PictureStream(key, make, start)
         self._streams.append(stream)
@@ -161,8 +162,16 @@ class PictureStreams:
             async for record in stream.records(start, stop):
                 yield record
         finally:
-            stream.idle_since = time.monotonic()
-            asyncio.get_running_loop().call_later(IDLE_SECONDS, self._close_idle)
+            self._keep(stream)
+
+    def prepare(self, key: Hashable, make: Make, start: int) -> None:
+        """Begin a stream that will be requested soon, if that is possible."""
+        with contextlib.suppress(Busy):
+            self._keep(self.open(key, make, start))
+
+    def _keep(self, stream: PictureStream) -> None:
+        stream.idle_since = time.monotonic()
+        asyncio.get_running_loop().call_later(IDLE_SECONDS, self._close_idle)
 
     def _close_idle(self) -> None:
         for stream in list(self._streams):

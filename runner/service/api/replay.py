@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Hashable
 from functools import partial
 from http import HTTPStatus
-from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 from fastapi import APIRouter, Path, Query, Response
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
+from runner.errors import RunnerError
 from runner.export.encoded import encoded_pictures
-from runner.export.reports.episode import EpisodePlace, place_of
+from runner.export.reports.episode import place_of
 from runner.export.reports.player_data import Playback
 from runner.recording.reader import open_recording
 from runner.service import fragments
 from runner.service.dependencies import CacheOf, PicturesOf, ProcessesOf, RecordedRun, recording_state
-from runner.service.pictures import PictureStreams
+from runner.service.pictures import Make, PictureStreams
 from runner.service.problems import error_docs, media_docs
 
 if TYPE_CHECKING:
@@ -131,18 +133,33 @@ async def trial_pictures(
 async def _pictures(
     run: Run, streams: PictureStreams, which: tuple[int, ...], start: int, steps: int
 ) -> Response:
-    place, length = await run_in_threadpool(_place, run.recording, which)
-    stop = min(start + steps, length + 1)
-    key = (await run_in_threadpool(recording_state, run), place.phase, place.number)
-    stream = streams.open(key, partial(encoded_pictures, run.recording, place.phase, place.number), start)
+    episode = await run_in_threadpool(_pictured_episode, run, which)
+    stop = min(start + steps, episode.length + 1)
+    stream = streams.open(episode.key, episode.make, start)
     return StreamingResponse(streams.send(stream, start, stop), media_type=OCTETS)
 
 
-def _place(path: FilePath, which: tuple[int, ...]) -> tuple[EpisodePlace, int]:
-    """Return where an episode stands, and its number of steps."""
-    with open_recording(path) as recording:
+async def prepare_pictures(run: Run, streams: PictureStreams, which: tuple[int, ...], start: int) -> None:
+    """Begin to make the pictures of an episode, whose page will request them soon."""
+    with contextlib.suppress(RunnerError, OSError):  # its page shows the reason
+        episode = await run_in_threadpool(_pictured_episode, run, which)
+        if start <= episode.length:
+            streams.prepare(episode.key, episode.make, start)
+
+
+class _PicturedEpisode(NamedTuple):
+    key: Hashable
+    make: Make
+    length: int
+    """Steps of the episode."""
+
+
+def _pictured_episode(run: Run, which: tuple[int, ...]) -> _PicturedEpisode:
+    with open_recording(run.recording) as recording:
         place = place_of(recording, which)
-        return place, len(recording.episode_span(place.phase, place.number))
+        length = len(recording.episode_span(place.phase, place.number))
+    make = partial(encoded_pictures, run.recording, place.phase, place.number)
+    return _PicturedEpisode((recording_state(run), place.phase, place.number), make, length)
 
 
 async def part_of(

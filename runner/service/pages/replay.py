@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -20,8 +21,8 @@ from runner.errors import RunnerError
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service import fragments
-from runner.service.api.replay import part_of
-from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
+from runner.service.api.replay import part_of, prepare_pictures
+from runner.service.dependencies import CacheOf, PicturesOf, ProcessesOf, RecordedRun, recording_state
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import message_of, page
 
@@ -106,10 +107,16 @@ async def chosen_replay(
 
 @router.get("/train/{episode}")
 async def training_replay(
-    request: Request, run: RecordedRun, cache: CacheOf, processes: ProcessesOf, episode: Number, t: T = 0
+    request: Request,
+    run: RecordedRun,
+    cache: CacheOf,
+    processes: ProcessesOf,
+    streams: PicturesOf,
+    episode: Number,
+    t: T = 0,
 ) -> Response:
     """Show a step of a training episode."""
-    return await _replay(request, run, cache, processes, (episode,), t)
+    return await _replay(request, run, cache, processes, streams, (episode,), t)
 
 
 @router.get("/eval/{after}/{trial}")
@@ -118,22 +125,31 @@ async def trial_replay(
     run: RecordedRun,
     cache: CacheOf,
     processes: ProcessesOf,
+    streams: PicturesOf,
     after: Number,
     trial: Number,
     t: T = 0,
 ) -> Response:
     """Show a step of a trial of an evaluation."""
-    return await _replay(request, run, cache, processes, (after, trial), t)
+    return await _replay(request, run, cache, processes, streams, (after, trial), t)
 
 
 async def _replay(
-    request: Request, run: Run, cache: CacheOf, processes: ProcessesOf, which: tuple[int, ...], t: int
+    request: Request,
+    run: Run,
+    cache: CacheOf,
+    processes: ProcessesOf,
+    streams: PicturesOf,
+    which: tuple[int, ...],
+    t: int,
 ) -> Response:
     part: bytes | RunnerError
+    preparing = asyncio.create_task(prepare_pictures(run, streams, which, t))
     try:
         part = await part_of(run, cache, processes, which, max(0, t - BEFORE))
     except RunnerError as error:
         part = error
+    await preparing
 
     def show() -> Response:  # in a thread, as it reads the recording
         if isinstance(part, RunnerError):
