@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final
 
 from fastapi import APIRouter, Query, Request, Response
@@ -13,6 +14,7 @@ from runner.analysis.groups import flat_config
 from runner.analysis.step_reference import StepRef
 from runner.drawing import svg
 from runner.errors import RunnerError
+from runner.export.encoded import why_no_pictures
 from runner.export.reports.rendering import View
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
@@ -23,6 +25,7 @@ from runner.service.api.comparing import found_runs
 from runner.service.api.replay import LONG
 from runner.service.dependencies import CacheOf, CatalogueOf, ProcessesOf, timed_recording_state
 from runner.service.pages.frame import RunHead, head_of, is_loop, last_evaluation
+from runner.service.pages.panels import Panel
 from runner.service.pages.rendering import page
 from runner.util import humanize
 
@@ -46,6 +49,7 @@ class ComparedRun:
     """A run in a comparison."""
 
     head: RunHead
+    recording: Path
     letter: str
     label: str
     number: int
@@ -100,8 +104,7 @@ class _TablesView(CompareView):
 @dataclass(frozen=True)
 class _ReplaysView(CompareView):
     TEMPLATE: ClassVar = "compare_replay.html"
-    sources: list[str]
-    scenes: list[str]
+    shown: list[Panel]
     episode: str
     prefix: str
     """The reference of the episode, without its step."""
@@ -179,10 +182,10 @@ async def replay(
         return link("/compare/replay", {"run": names, "at": str(other)}) if other.episode >= 0 else ""
 
     def show() -> Response:
+        head = _compared(runs, "/replay")
         view = _ReplaysView(
-            _compared(runs, "/replay"),
-            sources=[f"/api/v1/runs/{name}/replay/{step.episode_path}" for name in names],
-            scenes=[_scene(each) for each in runs],
+            head,
+            shown=[_panel(compared, step) for compared in head.runs],
             episode=step.episode_name,
             prefix=step.episode_text,
             t=step.t,
@@ -228,9 +231,11 @@ def _compared(runs: list[Run], here: str) -> Compared:
     tabs = [(tab, title, link(f"/compare{tab}", {"run": names})) for tab, title in TABS]
     letters = [chr(ord("A") + i) for i in range(len(runs))]
     compared = [
-        ComparedRun(head_of(each), letter, f"{letter}: {each.name}", i % 7)
+        ComparedRun(head_of(each), each.recording, letter, f"{letter}: {each.name}", i % 7)
         for i, (each, letter) in enumerate(zip(runs, letters, strict=True))
     ]
+    if all(map(is_loop, runs)):
+        tabs = [tab for tab in tabs if tab[0] != "/tables"]
     return Compared(compared, tabs if len(runs) == 2 else [], here)
 
 
@@ -258,8 +263,11 @@ def _results(runs: list[Run]) -> Rows:
     ]
 
 
-def _scene(run: Run) -> str:
-    """Return the picture of a run's grid, whose things the script moves to their places."""
-    with open_recording(run.recording) as recording:
-        scene = recording.environment.get("scene")
-    return "" if scene is None else svg.Drawing(scene).frame(None, f"The grid of {run.name}", style="")
+def _panel(compared: ComparedRun, step: StepRef) -> Panel:
+    """Return the replay of an episode of a run."""
+    source = f"/api/v1/runs/{compared.head.id}/replay/{step.episode_path}"
+    with open_recording(compared.recording) as recording:
+        drawing = svg.drawing_of(recording.mdp) if recording.tabular else None
+        why = "" if drawing else why_no_pictures(recording)
+    scene = "" if drawing is None else drawing.frame(None, f"The grid of {compared.head.name}", style="")
+    return Panel(compared.label, compared.number, source, f"{source}/pictures", scene, why)

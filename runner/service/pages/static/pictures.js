@@ -9,7 +9,7 @@ export function picturesOf(root, at = 0) {
   const source = root.dataset.pictures;
   if (!source) return null;
   const image = root.querySelector(".frame"), kept = new Map(), messages = new Map();
-  let wanted = at, show = () => {}, reading = null, waiting = null, last = Infinity;
+  let wanted = at, show = () => {}, reading = null, waiting = null, retry = null, last = Infinity;
 
   const known = (k) => kept.has(k) || messages.has(k) || k > last;
 
@@ -40,6 +40,7 @@ export function picturesOf(root, at = 0) {
     };
     try {
       const response = await fetch(`${source}?start=${start}&steps=${PIECE}`, { signal: own.control.signal });
+      if (response.status === 503) retry = setTimeout(() => { messages.clear(); more(); }, 2500);  // others are looking
       if (!response.ok) throw new Error((await response.json().catch(() => null))?.error.message ?? `The service responded with status ${response.status}.`);
       const failed = await records(response.body.getReader(), (bytes, number) => take(start + number, bytes));
       if (failed !== null) throw new Error(failed);
@@ -70,7 +71,7 @@ export function picturesOf(root, at = 0) {
   }
 
   if (image?.getAttribute("src")) keep(at, image.getAttribute("src"));
-  addEventListener("pagehide", () => reading?.control.abort());
+  addEventListener("pagehide", () => { reading?.control.abort(); clearTimeout(retry); });
   more();
   return (k, display) => {
     wanted = k;

@@ -1,4 +1,4 @@
-// Two replays in step: one slider moves both; a replay that has ended stays at its last step.
+// Replays in step: one slider moves all; a replay that has ended stays at its last step.
 import { onKeys, partAt } from "./parts.js";
 import { picturesOf } from "./pictures.js";
 
@@ -7,10 +7,10 @@ const [slider, button, count] = [".both", ".both-play", ".both-count"].map((name
 let timer = null, writing = null;
 
 async function start(root) {
-  const { source } = root.dataset;
-  const { episode } = await partAt(source, 0);
-  const replay = new Replay(root, { load: async (k) => (await partAt(source, k)).episode, pictures: picturesOf(root) });
-  replay.begin(episode);
+  const { source } = root.dataset, { episode } = await partAt(source, 0);
+  const k = Math.min(Number(bar.dataset.at), episode.length);
+  const replay = new Replay(root, { load: async (k) => (await partAt(source, k)).episode, pictures: picturesOf(root, k) });
+  await replay.begin(episode, k);
   return replay;
 }
 
@@ -36,15 +36,16 @@ function pause() {
   clearInterval(timer);
   timer = null;
   button.textContent = "\u25b6";
-  button.setAttribute("aria-label", "Play both");
+  button.setAttribute("aria-label", "Play all");
 }
 
 function play() {
   if (timer) return pause();
   if (Number(slider.value) === length) show(0);
   button.textContent = "\u23f8";
-  button.setAttribute("aria-label", "Pause both");
-  timer = setInterval(() => Number(slider.value) < length ? show(Number(slider.value) + 1) : pause(), 350);
+  button.setAttribute("aria-label", "Pause all");
+  const pace = Math.max(...replays.map((replay) => replay.pace));
+  timer = setInterval(() => Number(slider.value) < length ? show(Number(slider.value) + 1) : pause(), pace);
 }
 
 slider.max = length;
