@@ -48,7 +48,7 @@ def test_a_job_on_ray_gives_the_same_runs_and_can_be_cancelled(cluster, tmp_path
         with open_recording(far[0].recording) as recording:
             assert "ray" in recording.provenance["command"]
         endless = submit(jobs, ENDLESS).number
-        until(lambda progress: progress and progress.episode > 0, lambda: jobs.progress(endless))
+        until(lambda progress: progress and progress.episode > 0, lambda: jobs.pool.progress(endless))
         jobs.cancel(endless)
         until(lambda job: job.state == "cancelled", lambda: jobs.store.job(endless))
     (run,) = [run for run in list_runs(tmp_path / "far") if run.name == "endless"]
