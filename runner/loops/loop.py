@@ -187,7 +187,7 @@ class Loop(Generic[R]):
     def add_maker(self, phase: str, maker: EnvironmentMaker) -> None:
         """Note how the environment of a phase was made, if it is another one than the first."""
         with self.lock:
-            if maker != self._maker and not self.closed:
+            if not self.closed:
                 self._own_makers[phase] = maker
 
     def activate(self, rows: R) -> None:

@@ -189,6 +189,10 @@ class RunDescription(ABC):
         """
         return self._maker(f"{MAKER_RECORD}/{phase}") or self.maker
 
+    def has_own_maker(self, phase: str) -> bool:
+        """Return whether a phase has its own environment, which was recorded into the run of another."""
+        return f"{MAKER_RECORD}/{phase}" in self.metadata_names
+
     def _maker(self, name: str) -> EnvironmentMaker | None:
         if name not in self.metadata_names:
             return None

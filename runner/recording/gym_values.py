@@ -17,6 +17,8 @@ SCALARS: Final = (np.bool_, *(np.dtype(code).type for code in "bBhHiIlLqQefd"))
 
 OnRounded = Callable[[str], None]
 """Called with a warning: values are recorded rounded."""
+Put = Callable[[int, Any], None]
+"""Puts a value into a row of a column."""
 
 
 class Leaf:
@@ -92,9 +94,7 @@ def leaves_of(space: Space, what: str, where: str = "", on_rounded: OnRounded = 
     return [Leaf(part, what, on_rounded) for part in parts_of(space, where or f"the {what} space")]
 
 
-def filler(
-    leaves: Sequence[Leaf], column: NDArray[Any], batch: tuple[int, ...] = ()
-) -> Callable[[int, Any], None]:
+def filler(leaves: Sequence[Leaf], column: NDArray[Any], batch: tuple[int, ...] = ()) -> Put:
     """Return a function that puts a value of a space into a row of a column.
 
     Args:
@@ -122,7 +122,7 @@ def filler(
     return put
 
 
-def _leaf_filler(leaf: Leaf, column: NDArray[Any], batch: tuple[int, ...]) -> Callable[[int, Any], None]:
+def _leaf_filler(leaf: Leaf, column: NDArray[Any], batch: tuple[int, ...]) -> Put:
     base, shape, array = leaf.base, batch + leaf.shape, np.ndarray
     scalars = frozenset() if batch else leaf.exact_scalars
 

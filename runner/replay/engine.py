@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.errors import CannotRedo
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.comparing import Difference, differing_rows, differing_value
-from runner.replay.makers import make_environment
+from runner.replay.makers import is_whole_vector, make_environment, make_vector
 from runner.replay.recorded import Piece, RecordedReset, pieces
 from runner.replay.redone import RedoneStart, RedoneSteps, Values
 from runner.replay.stepping import EnvironmentStepper, GameStepper, Results, Stepper
+from runner.replay.stepping_vector import VectorStepper
 
 BLOCK_SECONDS: Final = 0.2
 """Blocks of steps take about this long, so that progress and a hanging environment can be seen."""
@@ -23,7 +25,20 @@ _MAX_ROWS: Final = 16_384
 _MAX_PICTURES: Final = 32
 """The most steps in a block with pictures."""
 
+ALL: Final = -1
+"""The number that stands for all environments of a vector."""
 Report = Callable[[int], None]
+_Key = tuple[str, int]
+
+
+class _Part(NamedTuple):
+    """Steps of one environment, or of all, and what came of them."""
+
+    environment: int
+    rows: NDArray[np.void]
+    resets: Sequence[tuple[int, RecordedReset]]
+    """Row and reset, in order; each comes before its row."""
+    results: Results
 
 
 class Replay:
@@ -49,9 +64,17 @@ class Replay:
     ) -> None:
         self._recording, self._trust, self._tolerance, self._make = recording, trust, tolerance, make
         self._report, self.render = report, render
-        self._steppers: dict[int, Stepper] = {}
-        self.known: set[int] = set()
+        self._steppers: dict[_Key, Stepper] = {}
+        self._known: set[_Key] = set()
         """The environments whose random generators are in the recorded state."""
+        makers = {phase: recording.maker_of(phase) for phase in schema.PHASES}
+        self._is_separate = any(map(recording.has_own_maker, schema.PHASES))
+        """Whether training and evaluation have environments of their own."""
+        self.environments: Sequence[int] = range(recording.environments)
+        """The environments that can be stepped alone; `ALL` where the vector must be stepped as a whole."""
+        self._makers = {phase: maker for phase, maker in makers.items() if maker is not None}
+        if any(map(is_whole_vector, self._makers.values())):
+            self.environments = [ALL]
         self._max_rows = 1 if render else 256
         self.taken = 0
         """Steps taken so far."""
@@ -66,43 +89,57 @@ class Replay:
     def all(self) -> Iterator[RedoneSteps]:
         """Yield all steps of both phases in the order of time, up to the first difference."""
         for piece in pieces(self._recording, schema.PHASES):
-            for environment in range(self._recording.environments):
+            for environment in self.environments:
                 for steps in self.steps(piece, environment, draws=self.render):
                     yield steps
                     if steps.difference is not None:
                         return
 
     def steps(self, piece: Piece, environment: int, draws: bool) -> Iterator[RedoneSteps]:
-        """Yield the steps of one environment in a piece, in blocks, up to the first difference."""
+        """Yield the steps of one environment in a piece, in blocks, up to the first difference.
+
+        Args:
+            piece: of the recording.
+            environment: the number of one in `environments`; `ALL` yields the steps of each in turn.
+            draws: whether to draw pictures.
+        """
+        phase, width = piece.phase, self._recording.environments if environment == ALL else 1
         rows, resets = _own(piece, environment, self._recording.environments)
         begin = 0
-        if environment not in self.known:
+        if not self.is_known(phase, environment):
             known = next((k for k, (_, reset) in enumerate(resets) if reset.is_known), None)
             if known is None:
                 self.skipped += len(rows)
                 return
-            self.known.add(environment)
+            self._known.add(self._key(phase, environment))
             begin, resets = resets[known][0], resets[known:]
-            self.skipped += begin
-        stepper = self._stepper(environment)
+            self.skipped += begin * width
+        stepper = self._stepper(phase, environment)
         stepper.draws = draws
-        if (other := stepper.other_space()) is not None:
-            yield self._at_reset(piece, rows[:0], resets[0][1], *other)
-            return
-        end = begin
-        while end < len(rows) or resets:
-            begin, end = end, min(end + self._max_rows, len(rows))
-            here = [(row - begin, reset) for row, reset in resets if row < end or end == len(rows)]
-            resets = resets[len(here) :]
+        end, stop = begin, len(rows) // width
+        while end < stop or resets:
+            begin, end = end, min(end + max(self._max_rows // width, 1), stop)
+            here = [(row - begin, reset) for row, reset in resets if row < end or end == stop]
+            resets, block = resets[len(here) :], rows[begin * width : end * width]
             started = time.monotonic()
-            results = stepper.run(rows[begin:end], here)
+            results = stepper.run(block, here)
             self._adapt(time.monotonic() - started, draws)
             self.taken += results.done
             self._report(self.taken)
-            steps = self._compared(piece.phase, environment, rows[begin:end], here, results)
-            yield steps
-            if steps.difference is not None:
-                return
+            parts = [_Part(environment, block, here, results)]
+            for part in _parts(parts[0], width) if environment == ALL else parts:
+                steps = self._compared(phase, part)
+                yield steps
+                if steps.difference is not None:
+                    return
+
+    def is_known(self, phase: str, environment: int) -> bool:
+        """Return whether an environment's random generators are in the recorded state."""
+        return self._key(phase, environment) in self._known
+
+    def _key(self, phase: str, environment: int) -> _Key:
+        """Return the same for both phases if they are of one environment."""
+        return (phase if self._is_separate else "", environment)
 
     def _adapt(self, seconds: float, draws: bool) -> None:
         """Adapt the size of blocks to the time that one takes."""
@@ -111,29 +148,44 @@ class Replay:
         elif seconds > 2 * BLOCK_SECONDS:
             self._max_rows = max(self._max_rows // 2, 1)
 
-    def _stepper(self, environment: int) -> Stepper:
-        if environment not in self._steppers:
-            maker = self._recording.maker
+    def _stepper(self, phase: str, environment: int) -> Stepper:
+        """Return an environment, made when it is first needed.
+
+        Raises:
+            CannotRedo: it cannot be made, or has other spaces.
+        """
+        key, maker = self._key(phase, environment), self._makers.get(phase)
+        if key not in self._steppers:
+            stepper: Stepper
+            if environment == ALL and self.render:
+                raise CannotRedo(
+                    "The environments of this vector cannot be made one by one, to draw themselves."
+                )
             if self._make is not None:
                 env = self._make()
             else:
                 assert maker is not None  # or `why_not_redone` gave a reason
-                env = make_environment(maker, self._trust, self.render)
-            kind = GameStepper if maker and maker.kind == "pettingzoo" else EnvironmentStepper
-            self._steppers[environment] = kind(env, self._recording)
-        return self._steppers[environment]
+                if environment == ALL:
+                    env = make_vector(maker, self._trust)
+                else:
+                    env = make_environment(maker, self._trust, self.render)
+            if environment == ALL:
+                assert maker is not None
+                assert maker.vector is not None
+                stepper = VectorStepper(env, self._recording, maker.vector.autoreset)
+            elif maker is not None and maker.kind == "pettingzoo":
+                stepper = GameStepper(env, self._recording)
+            else:
+                stepper = EnvironmentStepper(env, self._recording)
+            self._steppers[key] = stepper
+            stepper.check_spaces()
+        return self._steppers[key]
 
     # --- comparing ------------------------------------------------------------------------------------
 
-    def _compared(
-        self,
-        phase: str,
-        environment: int,
-        rows: NDArray[np.void],
-        resets: Sequence[tuple[int, RecordedReset]],
-        results: Results,
-    ) -> RedoneSteps:
+    def _compared(self, phase: str, part: _Part) -> RedoneSteps:
         """Return steps that were done again, up to the first difference."""
+        environment, rows, resets, results = part
         recorded = _recorded_values(rows)
         done, resets_done = results.done, results.resets_done
         place = self._first_row(rows, recorded, results)
@@ -261,27 +313,6 @@ class Replay:
             number = _ended_episode(self._recording, phase, environment, step)
         return Difference(phase, number, t, step, environment, field, recorded, got)
 
-    def _at_reset(
-        self,
-        piece: Piece,
-        no_rows: NDArray[np.void],
-        reset: RecordedReset,
-        field: str,
-        recorded: Any,
-        got: Any,
-    ) -> RedoneSteps:
-        """Return no steps, with a difference at a reset."""
-        phase, environment = piece.phase, reset.environment
-        nothing = _recorded_values(no_rows) if no_rows.dtype.names else _NOTHING
-        difference = self._difference(phase, environment, reset.episode, 0, reset.step, field, recorded, got)
-        none = np.empty(0, np.int64)
-        return RedoneSteps(
-            phase, environment, none, none, none, none, nothing, nothing, difference=difference
-        )
-
-
-_NOTHING: Final = Values(np.empty(0), np.empty((0, 1)), np.empty(0, np.bool_), np.empty(0, np.bool_))
-
 
 def _own(
     piece: Piece, environment: int, environments: int
@@ -290,17 +321,29 @@ def _own(
 
     Steps at which a vector only reset the environment are left out: the reset stands for them.
     """
-    rows = piece.rows[environment::environments]
-    own = [reset for reset in piece.resets if reset.environment == environment]
+    is_all = environment == ALL
+    rows = piece.rows if is_all else piece.rows[environment::environments]
+    own = [reset for reset in piece.resets if is_all or reset.environment == environment]
     if not len(rows):
         return rows, [(0, reset) for reset in own]
     at = [(reset.step - piece.first) // environments for reset in own]
-    if environments > 1:
+    if environments > 1 and not is_all:
         taken = rows["t"] != schema.RESET_ONLY
         if not taken.all():
             before = np.concatenate([[0], np.cumsum(taken)])
             at, rows = before[at].tolist(), rows[taken]
     return rows, list(zip(at, own, strict=True))
+
+
+def _parts(whole: _Part, n: int) -> Iterator[_Part]:
+    """Yield the steps of each of the n environments of a vector."""
+    for environment in range(n):
+        rows = whole.rows[environment::n]
+        taken = rows["t"] != schema.RESET_ONLY
+        before = np.concatenate([[0], np.cumsum(taken)])
+        here = [k for k, (_, reset) in enumerate(whole.resets) if reset.environment == environment]
+        resets = [(int(before[whole.resets[k][0]]), whole.resets[k][1]) for k in here]
+        yield _Part(environment, rows[taken], resets, whole.results.part(environment, n, taken, here))
 
 
 def _recorded_values(rows: NDArray[np.void]) -> Values:

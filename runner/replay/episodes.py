@@ -13,7 +13,7 @@ import numpy as np
 from runner.errors import CannotRedo, RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.replay.engine import Replay
+from runner.replay.engine import ALL, Replay
 from runner.replay.recorded import Piece, RecordedReset, pieces, resets_of
 from runner.replay.redone import RedoneSteps
 
@@ -53,7 +53,9 @@ def redo_episode(
         CannotRedo, RecordingError: see `runner.replay.environment.redo`.
     """
     target = _target(recording, phase, number)
-    for start in _starts(recording, target):
+    with closing(make()) as replay:
+        starts = [None] if ALL in replay.environments else _starts(recording, target)
+    for start in starts:
         try:
             with closing(make()) as replay:
                 yield from _held(_episode(recording, replay, target, start), is_last=start is None)
@@ -131,7 +133,7 @@ def _episode(
             elif steps.difference is not None:
                 yield steps.without_rows()
                 return
-        if is_target and target.environment not in replay.known:
+        if is_target and not replay.is_known(target.phase, target.environment):
             raise CannotRedo(
                 f"{target.phase} episode {target.number} began with a reset without a seed, and the state of "
                 "the random generators before it was not recorded."

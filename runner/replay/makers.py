@@ -22,7 +22,7 @@ from functools import cache
 from typing import Any, Final
 
 from runner.errors import CannotRedo
-from runner.recording.maker import EnvironmentMaker
+from runner.recording.maker import EnvironmentMaker, VectorMaker
 from runner.util.values import is_whole
 
 PACKAGES: Final = (
@@ -37,6 +37,10 @@ _PARALLEL: Final = "parallel_env"
 """The name of the function that makes a PettingZoo environment, in every package of them."""
 _ONLY_PICTURES: Final = frozenset({"HumanRendering", "RecordVideo", "RenderCollection"})
 """Wrappers of Gymnasium that show or write pictures and change no step: they are left out."""
+_ONLY_INFOS: Final = frozenset({"DictInfoToList", "RecordEpisodeStatistics"})
+"""Wrappers of vectors that change nothing but infos: left out too."""
+_Wrapper = tuple[str, str, dict[str, Any]]
+"""Name, entry point and keyword arguments of a wrapper."""
 _TRUST: Final = "It is imported only if you trust the recording (--trust)."
 
 
@@ -49,8 +53,8 @@ class _Spec:
     kwargs: dict[str, Any]
     max_episode_steps: int | None
     order_enforce: bool
-    wrappers: tuple[tuple[str, str, dict[str, Any]], ...]
-    """Name, entry point and keyword arguments of each, from the innermost out."""
+    wrappers: tuple[_Wrapper, ...]
+    """From the innermost out."""
 
 
 def why_not_made(maker: EnvironmentMaker | None, trust: bool) -> str:
@@ -103,28 +107,53 @@ def make_environment(maker: EnvironmentMaker, trust: bool, render: bool = False)
         ) from error
 
 
+def is_whole_vector(maker: EnvironmentMaker) -> bool:
+    """Return whether a vector cannot be taken apart: its environments are not independent of one another."""
+    vector = maker.vector
+    if vector is None:
+        return False
+    return vector.mode == "custom" or bool(maker.make) or bool(_vector_wrappers(vector))
+
+
 def make_vector(maker: EnvironmentMaker, trust: bool) -> Any:
-    """Return the vector environment of a class of its own, such as `gymnasium.make_vec` makes.
+    """Return a vector environment as a loop had it, an asynchronous one as a `SyncVectorEnv`.
 
     Raises:
         CannotRedo: it cannot be made; the message is why.
     """
-    import gymnasium
-
     if reason := why_not_made(maker, trust):
         raise CannotRedo(reason)
-    spec, registered = _registered(maker, trust)
-    number = maker.vector.number if maker.vector else 1
-    settings = {key: value for key, value in spec.kwargs.items() if key != "vectorization_mode"}
-    settings |= {"num_envs": number, "vectorization_mode": "vector_entry_point"}
     try:
-        return gymnasium.make_vec(dataclasses.replace(registered, kwargs=settings))
-    except MemoryError:
+        return _made_by_function(maker.make, False) if maker.make and trust else _made_vector(maker, trust)
+    except (CannotRedo, MemoryError):
         raise
-    except Exception as error:
+    except Exception as error:  # foreign code raises anything
         raise CannotRedo(
             f"The vector environment cannot be made here: {type(error).__name__}: {_short(error)}"
         ) from error
+
+
+def _made_vector(maker: EnvironmentMaker, trust: bool) -> Any:
+    import gymnasium
+
+    assert maker.vector is not None
+    if maker.vector.mode == "custom":
+        spec, registered = _registered(maker, trust)
+        settings = {key: value for key, value in spec.kwargs.items() if key != "vectorization_mode"}
+        settings |= {"num_envs": maker.vector.number, "vectorization_mode": "vector_entry_point"}
+        envs = gymnasium.make_vec(
+            dataclasses.replace(registered, kwargs=settings, max_episode_steps=spec.max_episode_steps)
+        )
+    else:
+        envs = gymnasium.vector.SyncVectorEnv(
+            [lambda: make_environment(maker, trust)] * maker.vector.number,
+            autoreset_mode=gymnasium.vector.AutoresetMode(maker.vector.autoreset),
+        )
+    for name, entry_point, kwargs in _vector_wrappers(maker.vector):
+        if not trust:
+            _check_plain(f"argument of the wrapper {name}", kwargs, {})
+        envs = _wrapper(entry_point, gymnasium.vector.VectorWrapper)(envs, **kwargs)
+    return envs
 
 
 def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
@@ -150,7 +179,7 @@ def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
         if name not in _ONLY_PICTURES
     )
     for wrapper in wrappers:
-        _check_wrapper(wrapper.entry_point)
+        _wrapper(wrapper.entry_point, gymnasium.Wrapper)
     made: Any = gymnasium.make(
         dataclasses.replace(
             registered,
@@ -233,7 +262,8 @@ def _modules(maker: EnvironmentMaker) -> list[str]:
     if maker.kind == "pettingzoo":
         return [_game_of(maker.spec)[0]]
     spec = _spec_of(maker.spec)
-    names = [maker.registered_by, spec.entry_point, *(entry_point for _, entry_point, _ in spec.wrappers)]
+    wrappers = [*spec.wrappers, *(_vector_wrappers(maker.vector) if maker.vector else ())]
+    names = [maker.registered_by, spec.entry_point, *(entry_point for _, entry_point, _ in wrappers)]
     return [name.partition(":")[0] for name in dict.fromkeys(names) if name]
 
 
@@ -251,17 +281,24 @@ def _spec_of(text: str) -> _Spec:
         raise CannotRedo("The specification of the recorded environment has no id or entry point.")
     if not isinstance(kwargs, dict) or not (limit is None or is_whole(limit, 1, _MAX_STEPS)):
         raise CannotRedo(f"The specification of {name} has arguments or a step limit that are not possible.")
-    parsed = []
-    for wrapper in wrappers if isinstance(wrappers, list) else [None]:
-        own = wrapper if isinstance(wrapper, Mapping) else {}
-        parts = own.get("name"), own.get("entry_point"), own.get("kwargs")
-        if not isinstance(parts[0], str) or not isinstance(parts[1], str):
-            raise CannotRedo(f"The specification of {name} has a wrapper that is none.")
-        if not isinstance(parts[2], dict):
-            raise CannotRedo(f"The wrapper {parts[0]} of {name} does not state its arguments.")
-        parsed.append((parts[0], parts[1], parts[2]))
     order = values.get("order_enforce") is not False
-    return _Spec(name, entry_point or "", kwargs, limit, order, tuple(parsed))
+    return _Spec(name, entry_point or "", kwargs, limit, order, _wrappers_of(wrappers, name))
+
+
+def _wrappers_of(values: Any, owner: str) -> tuple[_Wrapper, ...]:
+    """Return the wrappers in the JSON of `WrapperSpec`s.
+
+    Raises:
+        CannotRedo: one lacks its name, entry point or arguments.
+    """
+    found = []
+    for value in values if isinstance(values, list) else [None]:
+        own = value if isinstance(value, Mapping) else {}
+        name, entry_point, kwargs = own.get("name"), own.get("entry_point"), own.get("kwargs")
+        if not isinstance(name, str) or not isinstance(entry_point, str) or not isinstance(kwargs, dict):
+            raise CannotRedo(f"A wrapper of {owner} does not state its class and arguments.")
+        found.append((name, entry_point, kwargs))
+    return tuple(found)
 
 
 def _game_of(text: str) -> tuple[str, str, dict[str, Any]]:
@@ -312,13 +349,25 @@ def _texts(value: Any) -> Iterator[str]:
             yield from _texts(part)
 
 
-def _check_wrapper(entry_point: str) -> None:
-    """Refuse an entry point that is not a wrapper."""
-    import gymnasium
+def _wrapper(entry_point: str, base: type) -> Any:
+    """Return a wrapper.
 
+    Raises:
+        CannotRedo: it is something else.
+    """
     wrapper = _attribute(entry_point)
-    if not (isinstance(wrapper, type) and issubclass(wrapper, gymnasium.Wrapper)):
+    if not (isinstance(wrapper, type) and issubclass(wrapper, base)):
         raise CannotRedo(f"{entry_point} is not a wrapper of Gymnasium.")
+    return wrapper
+
+
+def _vector_wrappers(vector: VectorMaker) -> list[_Wrapper]:
+    """Return the wrappers around a vector that change what it returns, from the innermost out."""
+    return [
+        wrapper
+        for wrapper in _wrappers_of(json.loads(vector.wrapper_specs or "[]"), "the vector")
+        if wrapper[0] not in {*_ONLY_PICTURES, *_ONLY_INFOS}
+    ]
 
 
 def _why_not_imported(module: str, trust: bool) -> str:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import struct
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from runner.errors import CannotRedo
 from runner.recording.gym_spaces import Space, describe_space
-from runner.recording.gym_values import filler, filler_by_agent, leaves_by_agent, leaves_of, value_bytes
+from runner.recording.gym_values import Put, filler, filler_by_agent, leaves_by_agent, leaves_of, value_bytes
 from runner.recording.reader import Recording
 from runner.recording.reset_states import ResetState
 from runner.recording.spaces import decode
@@ -21,8 +22,7 @@ from runner.recording.spaces import leaves_of as recorded_leaves
 from runner.replay.recorded import RecordedReset
 from runner.replay.redone import Frame, Values
 
-Put = Callable[[int, Any], None]
-
+_MAX_TEXT: Final = 300
 _ENDING: Final = struct.Struct("<d??")
 _ENDING_DTYPE: Final = np.dtype([("reward", "<f8"), ("terminated", "?"), ("truncated", "?")])
 
@@ -61,6 +61,25 @@ class Results:
         """The values of all rows."""
         return Values(self.observations, self.rewards, self.terminated, self.truncated)
 
+    def part(self, first: int, stride: int, rows: NDArray[np.bool_], resets: Sequence[int]) -> Results:
+        """Return the results of one environment of a vector.
+
+        Args:
+            first: its number.
+            stride: the number of environments.
+            rows: which of its own rows to return.
+            resets: the numbers of its resets.
+        """
+        part = Results.__new__(Results)
+        for name in ("observations", "rewards", "terminated", "truncated"):
+            setattr(part, name, getattr(self, name)[first::stride][rows])
+        part.agents_terminated, part.agents_truncated = self.agents_terminated, self.agents_truncated
+        part.first_observations = self.first_observations[list(resets)]
+        part.frames, part.first_frames, part.error = [], [], self.error
+        part.done = int(np.count_nonzero(rows[: self.done // stride]))
+        part.resets_done = sum(number < self.resets_done for number in resets)
+        return part
+
 
 class Stepper(ABC):
     """An environment that is stepped through a recording of one like it.
@@ -95,35 +114,39 @@ class Stepper(ABC):
         """Return the spaces of observation and action."""
 
     @abstractmethod
-    def _filler(self, column: NDArray[Any], is_first: bool = False) -> Put:
-        """Return a function that puts an observation into a row of a column; `is_first`: that of a reset."""
+    def run(self, rows: NDArray[np.void], resets: Sequence[tuple[int, RecordedReset]]) -> Results:
+        """Do recorded steps again, until the environment raises an error.
 
-    @abstractmethod
-    def actions(self, rows: NDArray[np.void]) -> Sequence[Any]:
-        """Return the actions of recorded steps as the environment takes them."""
+        Args:
+            rows: the recorded steps.
+            resets: row and reset, in order; each comes before its row.
+        """
 
-    @abstractmethod
-    def take(self, actions: Sequence[Any], first: int, stop: int, results: Results, put: Put) -> None:
-        """Take the steps of these rows, and fill them in; `results.error` is what the environment raised."""
+    def check_spaces(self) -> None:
+        """Check that the environment's spaces hold the recorded values.
 
-    def other_space(self) -> tuple[str, Any, Any] | None:
-        """Return name, recorded and found description of a space that holds other values than recorded."""
-        found = {"observation": self.observation_space, "action": self.action_space}
-        for name, space in found.items():
-            recorded, described = self._recording.spaces[name], describe_space(space)
+        Raises:
+            CannotRedo: one has other parts, shapes or numbers of values.
+        """
+        for name, space in (("observation", self.observation_space), ("action", self.action_space)):
+            recorded, found = self._recording.spaces[name], describe_space(space)
             shapes = [
                 [(leaf.path, leaf.dtype and leaf.dtype.shape) for leaf in recorded_leaves(each, name)]
-                for each in (recorded, described)
+                for each in (recorded, found)
             ]
-            if shapes[0] != shapes[1] or any(
-                recorded.get(key) != described.get(key) for key in ("type", "n")
-            ):
-                return f"{name} space", recorded, described
-        return None
+            if shapes[0] != shapes[1] or recorded.get("n") != found.get("n"):
+                raise CannotRedo(
+                    f"The environment has another {name} space than recorded: found {_text(found)}, expected "
+                    f"{_text(recorded)}. It is another environment, or another version."
+                )
 
-    def _restore(self, state: ResetState) -> int | None:
-        """Bring random generators to a recorded state; return the seed that `reset` needs instead, if any."""
-        base = self.env.unwrapped
+    def _restore(self, state: ResetState, base: Any) -> int | None:
+        """Bring random generators to a recorded state; return the seed that `reset` needs instead, if any.
+
+        Args:
+            state: the recorded state.
+            base: the environment inside of all wrappers.
+        """
         if state.bit_generator is None and not state.ale_state:
             return state.np_random_seed
         if state.bit_generator is not None:
@@ -156,13 +179,29 @@ class Stepper(ABC):
             )
         return picture.copy()
 
-    def run(self, rows: NDArray[np.void], resets: Sequence[tuple[int, RecordedReset]]) -> Results:
-        """Do recorded steps again, until the environment raises an error.
 
-        Args:
-            rows: the recorded steps.
-            resets: row and reset, in order; each comes before its row.
-        """
+def _text(description: Mapping[str, Any]) -> str:
+    text = json.dumps(description)
+    return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}…"
+
+
+class RowStepper(Stepper):
+    """An environment that takes one step after the other."""
+
+    @abstractmethod
+    def _filler(self, column: NDArray[Any], is_first: bool = False) -> Put:
+        """Return a function that puts an observation into a row of a column; `is_first`: that of a reset."""
+
+    @abstractmethod
+    def actions(self, rows: NDArray[np.void]) -> Sequence[Any]:
+        """Return the actions of recorded steps as the environment takes them."""
+
+    @abstractmethod
+    def take(self, actions: Sequence[Any], first: int, stop: int, results: Results, put: Put) -> None:
+        """Take the steps of these rows, and fill them in; `results.error` is what the environment raised."""
+
+    def run(self, rows: NDArray[np.void], resets: Sequence[tuple[int, RecordedReset]]) -> Results:
+        """Do recorded steps again, until the environment raises an error."""
         n = len(rows)
         results = Results(n, len(resets), self.dtypes, self._learners)
         put, actions, first = self._filler(results.observations), self.actions(rows), 0
@@ -189,12 +228,12 @@ class Stepper(ABC):
         """Reset the environment as it was; return its observation."""
         seed = reset.seed
         if seed is None and reset.state is not None:
-            seed = self._restore(reset.state)
+            seed = self._restore(reset.state, self.env.unwrapped)
         arguments = {"seed": seed, "options": reset.options}
         return self.env.reset(**{name: value for name, value in arguments.items() if value is not None})[0]
 
 
-class EnvironmentStepper(Stepper):
+class EnvironmentStepper(RowStepper):
     """A Gymnasium environment."""
 
     def _spaces(self) -> tuple[Space, Space]:
@@ -260,7 +299,7 @@ class EnvironmentStepper(Stepper):
         results.truncated[first:row] = filled["truncated"]
 
 
-class GameStepper(Stepper):
+class GameStepper(RowStepper):
     """A PettingZoo parallel environment."""
 
     def _spaces(self) -> tuple[Space, Space]:

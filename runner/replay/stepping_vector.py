@@ -1,0 +1,166 @@
+"""A vector environment that is stepped as a whole: of its own class, or with wrappers around the vector."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import CannotRedo
+from runner.recording import schema
+from runner.recording.gym_spaces import Space
+from runner.recording.gym_values import filler, leaves_of, put_chosen
+from runner.recording.reader import Recording
+from runner.replay.recorded import RecordedReset
+from runner.replay.stepping import Results, Stepper
+
+_Numbered = tuple[int, RecordedReset]
+"""The place of a reset among those of a block, and the reset."""
+
+
+class VectorStepper(Stepper):
+    """All environments of a vector; rows are those of all of them, in the order of the recording.
+
+    Args:
+        env: the vector environment.
+        recording: of a loop over such a vector.
+        autoreset: `NextStep`, `SameStep` or `Disabled`.
+    """
+
+    def __init__(self, env: Any, recording: Recording, autoreset: str) -> None:
+        super().__init__(env, recording)
+        self._autoreset, self._n = autoreset, recording.environments
+        if env.num_envs != self._n:
+            raise CannotRedo(f"The vector has {env.num_envs} environments, and the recording {self._n}.")
+        self._leaves = leaves_of(self.observation_space, "observation")
+        self._over = np.zeros(self._n, np.bool_)
+        """Whose episode ended with the last step."""
+        self._last = np.zeros(self._n, self.dtypes.reset)
+        """What the vector returned last."""
+        self._put = filler(self._leaves, self._last[np.newaxis], (self._n,))
+
+    def _spaces(self) -> tuple[Space, Space]:
+        return self.env.single_observation_space, self.env.single_action_space
+
+    def run(self, rows: NDArray[np.void], resets: Sequence[tuple[int, RecordedReset]]) -> Results:
+        """Do recorded steps again, until the environment raises an error.
+
+        Args:
+            rows: the recorded steps, as many of each environment.
+            resets: step of each environment, and reset, in order; each comes before its step.
+        """
+        n, times = self._n, len(rows) // self._n
+        results = Results(len(rows), len(resets), self.dtypes, 1)
+        by_time: dict[int, list[_Numbered]] = {}
+        for number, (time, reset) in enumerate(resets):
+            by_time.setdefault(time, []).append((number, reset))
+        actions = _batches(self.action_space, self._raw_actions(rows), n)
+        only_reset = (rows["t"] == schema.RESET_ONLY).reshape(times, n)
+        try:
+            for time in range(times):
+                here = by_time.get(time, [])
+                automatic = only_reset[time]
+                self._reset_before(here, automatic, results)
+                self._step(time, actions[time], results)
+                for number, reset in here:
+                    if automatic[reset.environment]:
+                        results.first_observations[number] = self._last[reset.environment]
+                results.done += n
+                results.resets_done += len(here)
+            self._reset_before(by_time.get(times, []), np.zeros(n, np.bool_), results)
+            results.resets_done = len(resets)
+        except (MemoryError, CannotRedo):
+            raise
+        except Exception as error:  # foreign code raises anything
+            results.error = error
+        return results
+
+    def _raw_actions(self, rows: NDArray[np.void]) -> NDArray[Any]:
+        if self._recording.kind != "step":
+            return np.array(rows["action"])
+        start = int(self.action_space.start)  # type: ignore[attr-defined]
+        return np.asarray(rows["action"].astype(np.int64) + start)
+
+    def _reset_before(
+        self, resets: Sequence[_Numbered], automatic: NDArray[np.bool_], results: Results
+    ) -> None:
+        """Do the resets before a step, but those that the step itself does."""
+        explicit = []
+        for number, reset in resets:
+            own = reset.environment
+            if automatic[own]:
+                continue
+            if self._autoreset == "SameStep" and self._over[own]:
+                self._over[own] = False  # the step before did it
+                results.first_observations[number] = self._last[own]
+            else:
+                explicit.append((number, reset))
+        for call in _calls(explicit):
+            which = np.zeros(self._n, np.bool_)
+            which[[reset.environment for _, reset in call]] = True
+            options = dict(call[0][1].options or {}) | ({} if which.all() else {"reset_mask": which})
+            seeds = [self._seed(reset) for _, reset in call]
+            arguments: dict[str, Any] = {"options": options} if options else {}
+            if seeds == list(range(seeds[0] or 0, (seeds[0] or 0) + self._n)):
+                arguments["seed"] = seeds[0]  # not every vector takes a list
+            elif any(seed is not None for seed in seeds):
+                own_seeds: list[int | None] = [None] * self._n
+                for (_, reset), seed in zip(call, seeds, strict=True):
+                    own_seeds[reset.environment] = seed
+                arguments["seed"] = own_seeds if hasattr(self.env.unwrapped, "envs") else seeds[0]
+            self._put(0, self.env.reset(**arguments)[0])
+            for number, reset in call:
+                results.first_observations[number] = self._last[reset.environment]
+
+    def _step(self, time: int, action: Any, results: Results) -> None:
+        """Take a step of all environments, and fill in its row."""
+        observations, rewards, terminated, truncated, infos = self.env.step(action)
+        self._put(0, observations)
+        rows = slice(time * self._n, (time + 1) * self._n)
+        after = self._last.copy()
+        self._over = np.asarray(terminated) | np.asarray(truncated)
+        final = infos.get("final_obs") if isinstance(infos, Mapping) else None
+        if self._autoreset == "SameStep" and final is not None and self._over.any():
+            put_chosen(self._leaves, final, after, np.flatnonzero(self._over))
+        if self._recording.kind == "step":
+            after = after - int(self.observation_space.start)  # type: ignore[attr-defined]
+        results.observations[rows] = after
+        results.rewards[rows, 0] = rewards
+        results.terminated[rows] = terminated
+        results.truncated[rows] = truncated
+
+    def _seed(self, reset: RecordedReset) -> int | None:
+        """Return the seed of a reset, after restoring the state that it depends on."""
+        if reset.seed is not None or reset.state is None:
+            return reset.seed
+        base = self.env.unwrapped
+        if hasattr(base, "envs"):
+            base = base.envs[reset.environment].unwrapped
+        return self._restore(reset.state, base)
+
+
+def _calls(resets: Sequence[_Numbered]) -> Iterator[list[_Numbered]]:
+    """Yield the resets of each call; within a call, the environments are in order."""
+    call: list[_Numbered] = []
+    for numbered in resets:
+        if call and numbered[1].environment <= call[-1][1].environment:
+            yield call
+            call = []
+        call.append(numbered)
+    if call:
+        yield call
+
+
+def _batches(space: Space, column: NDArray[Any], n: int) -> Sequence[Any]:
+    """Return a column of actions as batches of n, as a vector takes them."""
+    from gymnasium import spaces
+
+    if isinstance(space, spaces.Dict):
+        parts = {key: _batches(part, column[str(key)], n) for key, part in space.spaces.items()}
+        return [{key: part[time] for key, part in parts.items()} for time in range(len(column) // n)]
+    if isinstance(space, spaces.Tuple):
+        columns = [_batches(part, column[str(i)], n) for i, part in enumerate(space.spaces)]
+        return list(zip(*columns, strict=True))
+    return list(np.array(column).reshape(len(column) // n, n, *column.shape[1:]))
