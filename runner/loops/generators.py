@@ -92,6 +92,8 @@ class VectorWatch:
         base = envs.unwrapped
         self._watches: list[GeneratorWatch] = []
         self._async: Any = None
+        self._seeded: set[int] = set()
+        """The environments of an `AsyncVectorEnv` whose generators come from the seed of a reset."""
         self._resets_itself = isinstance(base, SyncVectorEnv) and autoreset == AutoresetMode.NEXT_STEP
         if isinstance(base, SyncVectorEnv):
             self._watches = [GeneratorWatch(env) for env in base.envs]
@@ -140,10 +142,12 @@ class VectorWatch:
     def after_reset(self, states: States, which: NDArray[np.bool_], seeds: Sequence[int | None]) -> States:
         """Return what a reset depended on; arguments as for `before_reset`, and what that returned."""
         chosen = {i: seeds[i] if seeds else None for i in np.flatnonzero(which).tolist()}
+        if self._async is not None:
+            self._seeded.update(i for i, seed in chosen.items() if seed is not None)
         if self._async is not None and None in chosen.values():
             generators = self._async.get_attr("_np_random")
             self._async = None
-            drawn = {i: seed_of(generators[i]) for i, seed in chosen.items() if seed is None}
+            drawn = {i: seed_of(generators[i]) for i in chosen if i not in self._seeded}
             return {i: ResetState(environment=i, np_random_seed=s) for i, s in drawn.items() if s is not None}
         found = {
             i: self._watches[i].after(states.get(i), seed)

@@ -54,8 +54,10 @@ def redo_episode(
     """
     target = _target(recording, phase, number)
     with closing(make()) as replay:
-        starts = [None] if ALL in replay.environments else _starts(recording, target)
-    for start in starts:
+        if ALL in replay.environments:
+            yield from _episode_of_whole(recording, replay, target)
+            return
+    for start in _starts(recording, target):
         try:
             with closing(make()) as replay:
                 yield from _held(_episode(recording, replay, target, start), is_last=start is None)
@@ -138,6 +140,19 @@ def _episode(
                 f"{target.phase} episode {target.number} began with a reset without a seed, and the state of "
                 "the random generators before it was not recorded."
             )
+
+
+def _episode_of_whole(recording: Recording, replay: Replay, target: _Target) -> Iterator[RedoneSteps]:
+    """Yield the steps of one episode of a vector that is stepped as a whole, from its beginning."""
+    for piece in pieces(recording, schema.PHASES, stop_time=target.stop_time):
+        for steps in replay.steps(piece, ALL, draws=False):
+            own = steps.without_rows()
+            if piece.phase == target.phase and steps.environment == target.environment:
+                own = steps.since(target.reset.step)
+            if len(own) or own.difference is not None:
+                yield replace(own, episode=np.full(len(own), target.number))
+            if own.difference is not None:
+                return
 
 
 def _approach(

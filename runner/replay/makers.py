@@ -141,9 +141,8 @@ def _made_vector(maker: EnvironmentMaker, trust: bool) -> Any:
         spec, registered = _registered(maker, trust)
         settings = {key: value for key, value in spec.kwargs.items() if key != "vectorization_mode"}
         settings |= {"num_envs": maker.vector.number, "vectorization_mode": "vector_entry_point"}
-        envs = gymnasium.make_vec(
-            dataclasses.replace(registered, kwargs=settings, max_episode_steps=spec.max_episode_steps)
-        )
+        limit = spec.kwargs.get("max_episode_steps", spec.max_episode_steps)
+        envs = gymnasium.make_vec(dataclasses.replace(registered, kwargs=settings, max_episode_steps=limit))
     else:
         envs = gymnasium.vector.SyncVectorEnv(
             [lambda: make_environment(maker, trust)] * maker.vector.number,

@@ -79,7 +79,7 @@ def pieces(
         recording: of a loop.
         phases: `train`, `eval` or both.
         start_time: the earliest `log_time` of resets; steps come after it.
-        stop_time: the last `log_time` of steps and resets; by default all that is recorded.
+        stop_time: the last `log_time` of steps; resets after that step are left out. By default all.
 
     Raises:
         RecordingError: the recording is damaged.
@@ -91,7 +91,7 @@ def pieces(
 def resets_of(
     recording: Recording, phase: str, start_time: int = 0, stop_time: int | None = None
 ) -> Iterator[RecordedReset]:
-    """Yield the resets of a phase in order; arguments as for `pieces`."""
+    """Yield the resets of a phase in order, from `start_time` up to and with `stop_time`."""
     topic = recording.topic(f"/{phase}/reset")
     stop = _FOREVER if stop_time is None else stop_time + 1
     extras = _Extras(recording, phase, range(start_time, stop))
@@ -164,7 +164,7 @@ def _reset_part(text: str) -> dict[str, Any]:
 def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int | None) -> Iterator[Piece]:
     """Yield the pieces of one phase; one ends where steps of the other phase come between its own."""
     n = recording.environments
-    resets = resets_of(recording, phase, start_time, stop_time)
+    resets = resets_of(recording, phase, start_time, None if stop_time is None else stop_time - 1)
     waiting = next(resets, None)
     rows = _cut_off(recording, phase, _aligned(_blocks(recording, phase, start_time, stop_time), n), n)
     nothing = np.empty(0, _row_dtype(recording, recording.topic(f"/{phase}/step")))

@@ -29,6 +29,12 @@ class Values:
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
 
+    def since(self, row: int) -> Values:
+        """Return the values from a row on."""
+        return Values(
+            self.observations[row:], self.rewards[row:], self.terminated[row:], self.truncated[row:]
+        )
+
     def first(self, rows: int) -> Values:
         """Return the values of the first rows."""
         return Values(
@@ -78,6 +84,13 @@ class RedoneSteps:
 
     def __len__(self) -> int:
         return len(self.step)
+
+    def since(self, step: int) -> RedoneSteps:
+        """Return what came from a step of the phase on."""
+        at = int(np.searchsorted(self.step, step))
+        kept = {name: getattr(self, name)[at:] for name in ("step", "episode", "t", "actions", "frames")}
+        starts = tuple(replace(start, row=start.row - at) for start in self.starts if start.row >= at)
+        return replace(self, **kept, recorded=self.recorded.since(at), got=self.got.since(at), starts=starts)
 
     def without_rows(self) -> RedoneSteps:
         """Return the difference alone: it is in another episode than the one that was asked for."""
