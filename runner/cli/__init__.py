@@ -40,6 +40,8 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "diff": ("compare", "Show what differs between two runs, and where they diverge."),
         "compare": ("compare", "Compare groups of runs, with statistics over seeds."),
         "verify": ("verify", "Check every step of a run by training it again."),
+        "checkpoints": ("checkpoints", "List the checkpoints that a loop recorded."),
+        "checkpoint": ("checkpoints", "Write a checkpoint of a run into a file."),
         "qtable": ("tables", "Show the exact Q-table of a run at any step."),
         "table": ("tables", "Print an environment's transition table with names."),
     },

@@ -37,6 +37,7 @@ from runner.recording.loop_blocks import Inconsistent
 from runner.recording.reader import Recording, open_recording
 from runner.recording.records import Report as BytesReport
 from runner.recording.reference import Reference
+from runner.runs.checkpoints import read_checkpoints
 from runner.runs.provenance import Differences, differing_provenance
 from runner.util.files import open_regular
 
@@ -285,6 +286,7 @@ def _verify_loop(recording: Recording) -> Verification:
         for phase in phases:
             check_extras(recording, phase, finished, content.add)
         content.add_other_topics()
+        notes += _check_checkpoints(recording)
         if content.off_table:
             strange = f"{content.off_table:,} steps"
             notes.append(f"{strange} are no outcome of the environment's table: it has other rules too")
@@ -341,6 +343,26 @@ class _Content:
                 if topic.digested:
                     self.digest.update(topic, message_record(topic, time, payload))
                 self.counts[topic.name] += 1
+
+
+def _check_checkpoints(recording: Recording) -> list[str]:
+    """Compare the contents of a run's checkpoints with their digests; return a note if some are not here.
+
+    Raises:
+        Inconsistent: one was changed, or the recording has an invalid one.
+    """
+    missing = []
+    try:
+        for checkpoint in read_checkpoints(recording, recording.path.absolute().parent.parent):
+            if checkpoint.path.exists():
+                checkpoint.check()
+            else:
+                missing.append(checkpoint.reference)
+    except RecordingError as error:
+        raise Inconsistent(str(error)) from error
+    if not missing:
+        return []
+    return [f"the contents of {len(missing):,} checkpoints are not here, the first {missing[0]}"]
 
 
 def _unusual(recording: Recording, phase: str, findings: Findings) -> Iterator[str]:

@@ -70,6 +70,27 @@ class Recorded(Generic[R]):
         """
         self._messages.snapshot(self._phase, name, array)
 
+    def checkpoint(self, name: str, value: Any, *, pickle: bool = False) -> str:
+        """Keep the agent's parameters as they are now: `rec.checkpoint("policy", model.state_dict())`.
+
+        The content goes into a store next to the runs, once for equal contents; the recording has its digest,
+        with the step.
+
+        Args:
+            name: its name, without `@`.
+            value: bytes, the path of a file, or a mapping of arrays or tensors, which becomes safetensors.
+            pickle: record any object by pickling it; it can be loaded only by those who trust it.
+
+        Returns:
+            The digest of the content, in hexadecimal.
+
+        Raises:
+            ConfigError: the name or the value cannot be recorded.
+            MissingExtra: a mapping needs safetensors, which is not installed.
+            StorageError: the file cannot be read, or the store cannot be written.
+        """
+        return self._messages.checkpoint(self._phase, name, value, pickle)
+
     def note_step(self, values: Mapping[str, Any] | None = None, /, **more: Any) -> None:
         """Record values with the last step, as `step(action, extras={...})` does.
 

@@ -120,7 +120,12 @@ class Loop(Generic[R]):
         )
         self.extras = Extras(self._recorder, batch)
         self.messages = Messages(
-            self, self._recorder, self._outcomes, options, {topic.name: topic for topic in topics}
+            self,
+            self._recorder,
+            self._outcomes,
+            options,
+            {topic.name: topic for topic in topics},
+            self.run.folder,
         )
         if self._is_settled:
             try:

@@ -6,12 +6,14 @@ import io
 import json
 import threading
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import ConfigError
+from runner.loops.checkpointing import content_of
 from runner.loops.options import ALL_INFO, Options, pillow
 from runner.loops.outcomes import Outcomes
 from runner.loops.rows import MAX_SEED, PhaseRows
@@ -21,6 +23,7 @@ from runner.recording.messages import encode, encode_image, encode_log, scalar_e
 from runner.recording.recorder import Recorder
 from runner.recording.reset_states import ResetState
 from runner.recording.schema import STEP_NANOSECONDS, Topic
+from runner.runs.store import Store
 from runner.util.jsonable import as_json
 from runner.util.values import is_utf8
 
@@ -71,7 +74,9 @@ class Messages:
         outcomes: Outcomes,
         options: Options,
         topics: Mapping[str, Topic],
+        run_folder: Path,
     ) -> None:
+        self._run_folder = run_folder
         self._loop, self._recorder, self._outcomes = loop, recorder, outcomes
         self._options, self._topics = options, topics
         self.has_logged = False
@@ -150,6 +155,28 @@ class Messages:
                 fields |= {"shape": list(values.shape), "dtype": values.dtype.str, "data": values.tobytes()}
                 self._recorder.append(schema.ARRAY_TOPIC, encode(schema.ARRAY, fields), position)
                 self.has_logged = True
+
+    def checkpoint(self, phase: str, name: str, value: Any, pickle: bool) -> str:
+        """Store a checkpoint, and record it at this moment; return its digest.
+
+        Raises:
+            ConfigError: the name or the value cannot be recorded.
+            MissingExtra: safetensors is not installed.
+            StorageError: the file cannot be read, or the store cannot be written.
+        """
+        with self._loop.lock:
+            if not self._loop.records():
+                return ""
+            step, episode = self._loop.rows(phase).place
+        content, kind = content_of(name, value, pickle)
+        digest, size = Store(self._run_folder.parent).put(self._run_folder.name, content)
+        fields = {"name": name, "phase": phase, "step": step, "episode": episode}
+        fields |= {"digest": digest, "size": size, "format": kind}
+        with self._loop.lock:
+            position = self._loop.position  # other threads may have taken steps while it was stored
+            self._recorder.append(schema.CHECKPOINT_TOPIC, encode(schema.CHECKPOINT, fields), position)
+            self.has_logged = True
+        return digest
 
     def info(self, phase: str, info: Mapping[str, Any], reset: Mapping[str, Any] | None = None) -> None:
         """Record the chosen fields of an info, of the step or reset that was just put down.

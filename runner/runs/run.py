@@ -31,6 +31,7 @@ from runner.util.values import as_utf8, checked_run_name, is_utf8
 
 if TYPE_CHECKING:  # listing runs must be quick
     from runner.config import ExperimentConfig
+    from runner.runs.checkpoints import Checkpoint
 
 RUN_FILE: Final = "run.json"
 RECORDING_FILE: Final = "recording.mcap"
@@ -174,6 +175,18 @@ class Run:
     def archive(self) -> ArchiveReference:
         """The archive of its recording; false if it has none."""
         return self.file.archive
+
+    def checkpoints(self) -> list[Checkpoint]:
+        """Return the checkpoints that a loop recorded, in order; each has `load`.
+
+        Raises:
+            RecordingError: the recording cannot be read.
+        """
+        from runner.recording.reader import open_recording
+        from runner.runs.checkpoints import read_checkpoints
+
+        with open_recording(self.recording) as recording:
+            return read_checkpoints(recording, self.folder.parent)
 
     def beat(self) -> None:
         """Record that the owner is alive."""

@@ -1,0 +1,97 @@
+"""What `rec.checkpoint` accepts, as bytes: files, bytes, mappings of arrays, and on request pickles."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from runner.errors import ConfigError
+from runner.loops.values import as_array
+from runner.util.extras import require
+from runner.util.values import is_utf8
+
+MAX_NAME_LENGTH: Final = 200
+_MAX_KEYS: Final = 1 << 20
+_MAX_NUMBER: Final = 8
+"""Bytes of the widest number that safetensors have."""
+
+
+def content_of(name: str, value: Any, pickle: bool) -> tuple[bytes | memoryview | Path, str]:
+    """Return the content of a checkpoint, and its format.
+
+    Args:
+        name: of the checkpoint.
+        value: bytes, the path of a file, or a mapping of arrays or tensors.
+        pickle: whether to pickle it.
+
+    Raises:
+        ConfigError: name or value cannot be recorded.
+        MissingExtra: safetensors is not installed.
+    """
+    is_valid = isinstance(name, str) and 0 < len(name) <= MAX_NAME_LENGTH and is_utf8(name)
+    if not is_valid or "@" in name or not name.isprintable():
+        raise ConfigError(
+            f"checkpoint: found the name {str(name)[:80]!r}, expected printable text of 1 to "
+            f"{MAX_NAME_LENGTH} letters without @"
+        )
+    if pickle:
+        import pickle as pickling
+
+        try:
+            return pickling.dumps(value), "pickle"
+        except Exception as error:  # whatever the object raises
+            raise ConfigError(f"checkpoint: {name!r} cannot be pickled ({error})") from error
+    if isinstance(value, bytes | bytearray | memoryview):
+        return memoryview(value).cast("B"), "bytes"
+    if isinstance(value, str | os.PathLike):
+        path = Path(os.fspath(value))
+        if not path.is_file():
+            raise ConfigError(
+                f"checkpoint: found the path {str(path)!r} for {name!r}, expected that of a file"
+            )
+        return path, "safetensors" if path.suffix == ".safetensors" else "file"
+    if isinstance(value, Mapping):
+        return _safetensors(name, dict(_leaves(value, ""))), "safetensors"
+    raise ConfigError(
+        f"checkpoint: found {type(value).__name__} for {name!r}, expected bytes, a path, or a mapping of "
+        "arrays or tensors, such as model.state_dict(); pickle=True records any other object"
+    )
+
+
+def _leaves(values: Mapping[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested mappings, named `outer/inner`."""
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{key}/")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _safetensors(name: str, values: dict[str, Any]) -> bytes:
+    if not 0 < len(values) <= _MAX_KEYS:
+        raise ConfigError(f"checkpoint: found {len(values):,} arrays for {name!r}, expected at least one")
+    torch = sys.modules.get("torch")
+    is_torch = torch is not None and all(isinstance(value, torch.Tensor) for value in values.values())
+    module = "safetensors.torch" if is_torch else "safetensors.numpy"
+    save = require(module, extra="safetensors", purpose="a checkpoint of arrays or tensors").save
+    if is_torch:  # a copy of each: tensors that share memory are refused
+        return bytes(save({key: value.detach().cpu().contiguous().clone() for key, value in values.items()}))
+    arrays = {}
+    for key, value in values.items():
+        try:
+            arrays[key] = np.array(as_array(value), order="C")
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ConfigError(
+                f"checkpoint: found no array of numbers at {key!r} of {name!r} ({error})"
+            ) from error
+        if arrays[key].dtype.kind not in "biuf" or arrays[key].dtype.itemsize > _MAX_NUMBER:
+            raise ConfigError(
+                f"checkpoint: found {type(value).__name__} at {key!r} of {name!r}, expected an array of "
+                "numbers; pickle=True records any object"
+            )
+    return bytes(save(arrays))
