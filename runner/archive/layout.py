@@ -13,7 +13,9 @@
     <run id>/frames.parquet          the pictures,
     <run id>/extra_columns.parquet   the names of the values that the loop recorded with its steps,
     <run id>/extras.parquet          these values,
-    <run id>/reset_states.parquet    and what resets without a seed depend on
+    <run id>/reset_states.parquet    what resets without a seed depend on,
+    <run id>/checkpoints.parquet     the references to checkpoints,
+    <run id>/checkpoints/<digest>    and their contents
     <run id>/log.parquet             lines of text
     <run id>/run.parquet             one row: what the run is, its configuration and provenance
     <run id>/transitions.parquet     the environment's possible outcomes, with their events
@@ -60,6 +62,9 @@ FRAMES: Final = "frames.parquet"
 EXTRA_COLUMNS: Final = "extra_columns.parquet"
 EXTRAS: Final = "extras.parquet"
 RESET_STATES: Final = "reset_states.parquet"
+CHECKPOINTS: Final = "checkpoints.parquet"
+CONTENTS: Final = "checkpoints/"
+"""The folder of the contents of checkpoints, named by their digests."""
 LOG: Final = "log.parquet"
 RUN: Final = "run.parquet"
 TRANSITIONS: Final = "transitions.parquet"
@@ -107,6 +112,12 @@ SCHEMAS: Final = {
             *(("shape", pa.list_(pa.int64())), ("dtype", pa.string()), ("data", pa.binary())),
         ]
     ),
+    CHECKPOINTS: pa.schema(
+        [
+            *(*PLACED_IN_PHASE, *_LOGGED),
+            *(("digest", pa.string()), ("size", pa.int64()), ("format", pa.string())),
+        ]
+    ),
     EXTRA_COLUMNS: pa.schema([*_PLACED, ("json", pa.string())]),
     RESET_STATES: pa.schema(
         [
@@ -118,7 +129,7 @@ SCHEMAS: Final = {
 }
 """The columns of the tables that are the same in every archive."""
 
-LEFT_OUT_IF_EMPTY: Final = frozenset({EXTRA_COLUMNS, EXTRAS, RESET_STATES})
+LEFT_OUT_IF_EMPTY: Final = frozenset({EXTRA_COLUMNS, EXTRAS, RESET_STATES, CHECKPOINTS})
 """The tables that an archive need not have."""
 EXTRA_PREFIX: Final = "extra_"
 _MAY_BE_NULL: Final = frozenset({"data", "seed"})

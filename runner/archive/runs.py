@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from runner.archive.layout import CONTENTS
 from runner.archive.manifest import Manifest
 from runner.archive.places import Report, archive_of, check_archive, restore_to
 from runner.archive.restoring import check
@@ -23,6 +24,7 @@ from runner.recording.rewriting import content_of
 from runner.runs.locking import locked
 from runner.runs.resolve import run_of_id
 from runner.runs.run import RECORDING_FILE, RUN_FILE, Run
+from runner.runs.store import Store as Contents
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,9 @@ def _archive(run: Run, store: Store, remove: bool, report: Report, dry_run: bool
     run = run.update(archive=reference)
     if remove:
         run.recording.unlink()
+        contents, name = Contents(run.folder.parent), run.folder.name
+        if {f"{CONTENTS}{digest}" for digest in contents.of_run(name)} <= manifest.files.keys():
+            contents.drop(name)
     return Archived(run, place, manifest, is_new, remove, size)
 
 
@@ -141,9 +146,17 @@ def restore_run(run: Run, report: Report = lambda _: None) -> Run:
         fresh = current.recording.with_suffix(".restoring")
         with archive_of(current) as folder:
             restore_to(folder, fresh, current.archive.digest, report)
+            _restore_contents(folder, current.folder)
         fresh.replace(current.recording)
         facts = {key: value for key, value in current.facts.items() if key != "archive"}
         return Run(current.folder, facts).update()
+
+
+def _restore_contents(archive: Path, folder: Path) -> None:
+    """Put the contents of checkpoints in an archive, which was checked, into the store next to a run."""
+    store = Contents(folder.parent)
+    for path in sorted((archive / CONTENTS).glob("*")):
+        store.put(folder.name, path, expected=path.name)
 
 
 def restore_place(place: str, recordings: Path, report: Report = lambda _: None) -> Run:
@@ -180,6 +193,7 @@ def restore_place(place: str, recordings: Path, report: Report = lambda _: None)
     try:
         with store.reading(run_id) as archive:
             restore_to(archive, folder / RECORDING_FILE, manifest.digest, report)
+            _restore_contents(archive, folder)
         with open_recording(folder / RECORDING_FILE) as recording:
             facts = recording.run_facts() | {"name": manifest.run["name"]}  # it may have been renamed
             facts["summary"] |= {"bytes": recording.size}

@@ -7,6 +7,7 @@ writes in row groups.
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -28,6 +29,7 @@ from runner.recording.messages import decode_q_table, encode_q_table
 from runner.recording.reader import Recording
 from runner.replay.snapshots import DerivedTables, SnapshotVisitor
 from runner.replay.tables import StepReplay
+from runner.runs.checkpoints import read_checkpoints
 
 ROWS_A_GROUP: Final = 1 << 18
 BYTES_A_GROUP: Final = 32 << 20
@@ -134,6 +136,7 @@ class _ArchiveWriter:
                 for batch in self._batches.of(table):
                     writer.add(batch)
                     self._report(self._batches.steps)
+        self._copy_contents()
         topics = self._batches.entries
         self._compare(topics)
         return self._manifest(topics)
@@ -177,6 +180,16 @@ class _ArchiveWriter:
             tables |= description_tables(recording.mdp, self._batches.shape)
         for name, table in tables.items():
             pq.write_table(table, self._folder / name, compression="zstd", compression_level=LEVEL)
+
+    def _copy_contents(self) -> None:
+        """Copy the contents of the checkpoints that are in the store next to the run."""
+        recordings = self._recording.path.absolute().parent.parent
+        for checkpoint in read_checkpoints(self._recording, recordings):
+            path = self._folder / f"{layout.CONTENTS}{checkpoint.digest}"
+            if checkpoint.is_here and not path.exists():
+                checkpoint.check()
+                path.parent.mkdir(exist_ok=True)
+                shutil.copyfile(checkpoint.path, path)
 
     def _write_learning(self, table: Table, steps: TableWriter) -> None:
         """Write the steps of a job, and its snapshots, which follow from them."""
