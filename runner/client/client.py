@@ -119,22 +119,33 @@ class Client(Connection):
             size, digest = hash_of(run.recording)
         except OSError as error:
             raise RunnerError(f"{run.recording}: cannot be read ({error.strerror}).") from error
-        upload = self._deliver(run, size, digest, report, begun)
+        announced = {"digest": digest, "size": size, "name": run.name, "run_id": run.run_id}
+        announced["content_digest"] = run.summary.content_digest
+        upload = self._deliver(run.recording, announced, _about(run), report, begun)
         if upload.state == "refused" and begun is not None:  # the file has changed since it began
-            upload = self._deliver(run, size, digest, report, None)
+            upload = self._deliver(run.recording, announced, _about(run), report, None)
         if upload.state == "refused":
             raise ServerError(f"{self.url}: refused the run {run.run_id}: {upload.problem}")
+        for checkpoint in {each.digest: each for each in run.checkpoints() if each.is_here}.values():
+            announced = {"digest": checkpoint.digest, "size": checkpoint.size, "checkpoint_of": upload.run_id}
+            sent = self._deliver(checkpoint.path, announced, {}, report, None)
+            if sent.state == "refused":
+                raise ServerError(f"{self.url}: refused {checkpoint.reference}: {sent.problem}")
         return upload
 
     def _deliver(
-        self, run: Run, size: int, digest: str, report: Report, begun: UploadStatus | None
+        self,
+        path: Path,
+        announced: dict[str, Any],
+        about: dict[str, Any],
+        report: Report,
+        begun: UploadStatus | None,
     ) -> UploadStatus:
         """Take the next step of an upload until it is stored or refused, and return it.
 
         After a step that failed for now, the upload is taken up again as the server has it.
         """
-        announced = {"digest": digest, "size": size, "name": run.name, "run_id": run.run_id}
-        announced["content_digest"] = run.summary.content_digest
+        size = announced["size"]
         upload, furthest, backoff = None, -1, self.backoff()
         while upload is None or upload.state not in ("stored", "refused"):
             try:
@@ -145,9 +156,9 @@ class Client(Connection):
                     if upload.state == "receiving" and upload.problem:
                         raise ServerUnavailable(f"{self.url}: {upload.problem}")
                 elif upload.offset < size:
-                    upload = self.append_upload(upload, run.recording, size)
+                    upload = self.append_upload(upload, path, size)
                 elif upload.offset == size:
-                    upload = self.complete_upload(upload, run, size, digest)
+                    upload = self.complete_upload(upload, size, announced["digest"], about)
                 else:  # the file became shorter, as one does whose disk was full
                     self.delete_upload(upload)
                     upload = begun = None
@@ -184,13 +195,18 @@ class Client(Connection):
         """Return the state of an upload; wait up to some seconds for its verification."""
         return self._upload("GET", f"/uploads/{upload.id}", params={"wait": wait})
 
-    def complete_upload(self, upload: UploadStatus, run: Run, size: int, digest: str) -> UploadStatus:
-        """Complete the upload of a run, so that it is verified; errors as for `request`."""
-        completion: dict[str, Any] = {"digest": digest, "size": size}
-        if not run.stands_alone:  # an exported recording carries its own record of the run
-            summary = {"seconds": run.summary.seconds, "error": run.summary.error}
-            facts = {"name": run.file.name, "status": run.status, "proof": run.file.proof, "summary": summary}
-            completion |= {"run": facts, "labels": as_json(run.labels)}
+    def complete_upload(
+        self, upload: UploadStatus, size: int, digest: str, about: dict[str, Any] | None = None
+    ) -> UploadStatus:
+        """Complete an upload, so that it is verified; errors as for `request`.
+
+        Args:
+            upload: the upload.
+            size: its number of bytes.
+            digest: the BLAKE3 of all of them.
+            about: what the run's folder has and its recording does not.
+        """
+        completion = {"digest": digest, "size": size} | (about or {})
         return self._upload("POST", f"/uploads/{upload.id}/complete", json=completion)
 
     def delete_upload(self, upload: UploadStatus) -> None:
@@ -203,6 +219,15 @@ class Client(Connection):
             return UploadStatus(**{field.name: response[field.name] for field in fields(UploadStatus)})
         except KeyError as error:
             raise self.unexpected_response() from error
+
+
+def _about(run: Run) -> dict[str, Any]:
+    """Return what a run's folder has and its recording does not."""
+    if run.stands_alone:  # an exported recording carries its own record of the run
+        return {}
+    summary = {"seconds": run.summary.seconds, "error": run.summary.error}
+    facts = {"name": run.file.name, "status": run.status, "proof": run.file.proof, "summary": summary}
+    return {"run": facts, "labels": as_json(run.labels)}
 
 
 def _read_pieces(path: Path, offset: int, size: int) -> Iterator[bytes]:

@@ -22,6 +22,7 @@ from runner.client.connection import Report, ServerUnavailable, find_token
 from runner.errors import RunnerError
 from runner.runs.locking import locked
 from runner.runs.run import Run, list_runs
+from runner.runs.store import Store
 from runner.util.files import read_object, write_object
 
 OUTBOX_VARIABLE: Final = "DUALTAXI_OUTBOX"
@@ -80,6 +81,7 @@ def deliver(run: Run, client: Client, report: Report = lambda *_: None) -> Uploa
         sent = own.folder.with_name(f"{_SENT}{own.folder.name}")
         own.folder.rename(sent)
     shutil.rmtree(sent, ignore_errors=True)
+    Store(own.folder.parent).drop(own.folder.name)
     return upload
 
 

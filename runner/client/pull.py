@@ -15,6 +15,8 @@ from runner.client.connection import Connection, Report, ServerUnavailable
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.recording.labels import labels_from
 from runner.runs.importing import Imported, import_recording
+from runner.runs.run import Run
+from runner.runs.store import Store
 from runner.util.files import storage_errors
 
 FOLDER: Final = ".pulling"
@@ -58,6 +60,7 @@ def pull(client: Connection, name: str, recordings: Path, report: Report = lambd
                 details = {"status": status, "summary": summary}  # the name is the recording's own
                 imported = import_recording(part, recordings, details, labels_from(facts))
                 part.unlink()
+                _pull_contents(client, imported.run, report)
         except Timeout:
             raise busy from None
         except RecordingError as error:
@@ -68,6 +71,29 @@ def pull(client: Connection, name: str, recordings: Path, report: Report = lambd
     with contextlib.suppress(OSError):  # another pull is in progress, or was interrupted
         folder.rmdir()
     return imported
+
+
+def _pull_contents(client: Connection, run: Run, report: Report) -> None:
+    """Download the contents of a run's checkpoints that are at the server and not here.
+
+    Raises:
+        ServerError: the server was unavailable for too long.
+        RecordingError: one has another digest; what came before it stays.
+    """
+    store = Store(run.folder.parent)
+    wanted = {each.digest: each for each in run.checkpoints() if not each.is_here}
+    if not wanted:
+        store.refer(run.folder.name, [each.digest for each in run.checkpoints()])
+        return
+    listed = client.request_object("GET", f"/runs/{quote(run.run_id, safe='')}/checkpoints")
+    there = {each["digest"] for each in listed["checkpoints"] if each["here"]}
+    for digest, checkpoint in wanted.items():
+        if digest in there:
+            part = run.folder.parent / FOLDER / f"{digest}.part"
+            path = f"/runs/{quote(run.run_id, safe='')}/checkpoints/{digest}"
+            _download(client, path, f'"{digest}"', checkpoint.size, part, report)
+            store.put(run.folder.name, part, expected=digest)
+            part.unlink()
 
 
 def _download(client: Connection, path: str, tag: str, size: int, part: Path, report: Report) -> None:

@@ -31,6 +31,8 @@ from runner.errors import RunnerError, RunNotFound, StorageError
 from runner.recording.labels import labels_from
 from runner.runs.importing import import_recording
 from runner.runs.resolve import run_of_id
+from runner.runs.run import Run
+from runner.runs.store import Store
 from runner.service.errors import Busy, TooManyUploads, UploadConflict, UploadTooLarge
 from runner.service.jobs.store import lock_folder, now
 from runner.service.logs import LOG
@@ -71,6 +73,8 @@ class Announcement(BaseModel):
     run_id: Text = ""
     name: Text = ""
     content_digest: Digest | None = None
+    checkpoint_of: Text = ""
+    """The run with a checkpoint of these bytes, if they are not a recording."""
 
 
 class Completion(BaseModel):
@@ -92,6 +96,7 @@ class Upload(UploadStatus):
     owner: str
     """Who may continue it."""
     digest: str | None
+    checkpoint_of: str = ""
     completion: Completion | None = None
     changed: float = field(default_factory=time.time)
     """When it last changed, in seconds since 1970."""
@@ -193,13 +198,18 @@ class Uploads:
         """
         self._forget()
         with self._lock:
-            same = (owner, announced.digest, announced.size)
+            content_of, store = self._checkpointed(announced), Store(self._recordings)
+            same = (owner, announced.digest, announced.size, announced.checkpoint_of)
             for known in self.all() if announced.digest else ():
-                if (known.owner, known.digest, known.size) != same:
+                if (known.owner, known.digest, known.size, known.checkpoint_of) != same:
                     continue
                 if not known.is_over:
                     return known, False
-                if known.state == "stored" and run_of_id(known.run_id, self._recordings) is not None:
+                if (
+                    known.state == "stored"
+                    and not content_of
+                    and run_of_id(known.run_id, self._recordings) is not None
+                ):
                     return known.replace(already=True), False
             upload = Upload(
                 id=secrets.token_hex(16),
@@ -208,7 +218,15 @@ class Uploads:
                 **announced.model_dump(exclude={"content_digest"}),
             )
             run = run_of_id(announced.run_id, self._recordings) if announced.content_digest else None
-            if run is not None and run.summary.content_digest == announced.content_digest:
+            is_there = run is not None and run.summary.content_digest == announced.content_digest
+            if (
+                content_of is not None
+                and announced.digest
+                and store.has(announced.digest, announced.size or 0)
+            ):
+                store.refer(content_of.folder.name, [announced.digest])
+                is_there = True
+            if is_there:
                 upload = upload.replace(state="stored", offset=announced.size or 0, already=True)
             else:
                 owners = [known.owner for known in self.all() if not known.is_over]
@@ -226,6 +244,22 @@ class Uploads:
             self._save(upload)
             self._uploads[upload.id] = upload
         return upload, True
+
+    def _checkpointed(self, announced: Announcement) -> Run | None:
+        """Return the run with a checkpoint of these bytes; None if they are a recording.
+
+        Raises:
+            RunNotFound: there is no such run.
+            UploadConflict: it has no checkpoint of this digest and size.
+        """
+        if not announced.checkpoint_of:
+            return None
+        run = run_of_id(announced.checkpoint_of, self._recordings)
+        if run is None:
+            raise RunNotFound("no such run: push it before the contents of its checkpoints.")
+        if all((one.digest, one.size) != (announced.digest, announced.size) for one in run.checkpoints()):
+            raise UploadConflict(f"run {run.run_id} has no checkpoint of this digest and size.")
+        return run
 
     def append(
         self, upload_id: str, owner: str, offset: int, data: bytes | bytearray, more: int = 0
@@ -373,6 +407,12 @@ def verify(upload: Upload, body: Path, recordings: Path) -> Upload:
                 return upload.refused(
                     "found another digest than sent: bytes changed on the way; send it again."
                 )
+            if upload.checkpoint_of:
+                run = run_of_id(upload.checkpoint_of, recordings)
+                if run is None:
+                    return upload.refused("the run of this checkpoint was removed.")
+                Store(recordings).put(run.folder.name, body, expected=sent.digest)
+                return upload.replace(state="stored", run_id=run.run_id)
             labels = labels_from(sent.labels) if sent.labels else None
             imported = import_recording(body, recordings, sent.run or None, labels)
             return upload.replace(state="stored", run_id=imported.run.run_id, already=imported.already)

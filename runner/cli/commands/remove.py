@@ -170,11 +170,14 @@ def _carry_out(
     Raises:
         RunnerError: confirmation is needed, and there is no terminal.
     """
-    from runner.runs.catalogue.removal import clean, remove
+    from runner.runs.catalogue.removal import clean, contents_freed, remove
 
-    freed = sum(removal.freed for removal in removals)
+    contents = contents_freed(removals)
+    freed = sum(removal.freed for removal in removals) + contents
     if removals and not as_json:
         _draw(removals)
+        if contents:
+            say(f"Checkpoints that no other run refers to go too: {size(contents)}.")
     if removals and not dry_run:
         if not yes and not sys.stdin.isatty():
             raise RunnerError(
@@ -190,7 +193,9 @@ def _carry_out(
     if as_json:
         reasons = [{"run_id": run_id, "why": reason} for run_id, reason in kept.items()]
         removed = [_as_json(removal) for removal in removals]
-        print_json({"dry_run": dry_run, "freed": freed, "removed": removed, "kept": reasons})
+        print_json(
+            {"dry_run": dry_run, "freed": freed, "checkpoints": contents, "removed": removed, "kept": reasons}
+        )
     elif dry_run:
         say(f"Nothing was removed; it would free {size(freed)}.")
     else:

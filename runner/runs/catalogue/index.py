@@ -35,12 +35,12 @@ class Index:
 
     def __init__(self, database: SqliteDatabase, roots: Sequence[str]) -> None:
         self._database = database
-        self._roots = roots
+        self.roots = roots
         database.register_function(matches, "matches", 2, deterministic=True)
 
     def problems(self) -> list[str]:
         """Return the problems of folders whose run files cannot be read."""
-        damaged = Row.select(Row.problem).where(Row.root.in_(self._roots) & Row.problem.is_null(False))
+        damaged = Row.select(Row.problem).where(Row.root.in_(self.roots) & Row.problem.is_null(False))
         return [problem for (problem,) in self._tuples(damaged.order_by(Row.root, Row.entry))]
 
     def select(self, chosen: Filter, *order: Any, columns: Sequence[str] | None = None) -> Rows:
@@ -131,7 +131,7 @@ class Index:
 
     def _recorded_twice(self, digests: Sequence[str] | None = None) -> Any:
         """Return the query for digests that several rows have; mostly few, found in an index of SQLite."""
-        recorded = Row.select(Row.digest).where(Row.digest.is_null(False) & Row.root.in_(self._roots))
+        recorded = Row.select(Row.digest).where(Row.digest.is_null(False) & Row.root.in_(self.roots))
         if digests is not None and len(digests) <= _MAX_VALUES:
             recorded = recorded.where(Row.digest.in_(digests))
         return recorded.group_by(Row.digest).having(fn.COUNT(Row.entry) > 1)
@@ -142,7 +142,7 @@ class Index:
         age, of_first = ((each.created, each.id, each.root, each.entry) for each in (Row, first))
         earlier = first.select(Value(1)).where(
             (first.digest == Row.digest)
-            & first.root.in_(self._roots)
+            & first.root.in_(self.roots)
             & first.id.is_null(False)
             & (Tuple(*of_first) < Tuple(*age))
         )
@@ -191,7 +191,7 @@ class Index:
         return list(query.limit(limit).tuples().bind(self._database))
 
     def _of(self, chosen: Filter, *columns: Any) -> Any:
-        known = Row.root.in_(self._roots) & Row.id.is_null(False)
+        known = Row.root.in_(self.roots) & Row.id.is_null(False)
         return Row.select(*columns).where(known if chosen.condition is None else known & chosen.condition)
 
     def _tuples(self, query: Any) -> Iterator[tuple[Any, ...]]:

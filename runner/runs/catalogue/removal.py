@@ -12,6 +12,7 @@ import secrets
 import shutil
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -27,6 +28,7 @@ from runner.runs.catalogue.usage import REMOVED, Contents, belongs, contents_of,
 from runner.runs.locking import locked
 from runner.runs.resolve import listed_run
 from runner.runs.run import Run
+from runner.runs.store import Store
 from runner.util.humanize import listed
 
 _STRAY_SECONDS: Final = 60
@@ -148,16 +150,29 @@ def remove(removal: Removal, foreign: bool = False) -> None:
             hidden.rename(run.folder)
             raise
         _delete(hidden, foreign)
+        Store(removal.root).drop(run.folder.name)
     except OSError as error:
         raise StorageError(f"{error.filename or hidden}: cannot be removed ({error.strerror}).") from error
 
 
 def clean(root: Path) -> None:
-    """Delete the rest of runs whose removal was interrupted."""
+    """Delete the rest of runs whose removal was interrupted, and the contents that only they refer to."""
     for stray in strays(root):
         with contextlib.suppress(OSError):
             if time.time() - stray.stat().st_mtime > _STRAY_SECONDS:
                 _delete(stray, foreign=False)
+    store = Store(root)
+    for run in store.runs():
+        if not (root / run).exists():
+            store.drop(run)
+
+
+def contents_freed(removals: Sequence[Removal]) -> int:
+    """Return the bytes of the contents of checkpoints that removing these runs frees."""
+    names: dict[Path, list[str]] = {}
+    for removal in removals:
+        names.setdefault(removal.root, []).append(removal.folder.name)
+    return sum(sum(Store(root).only_of(own).values()) for root, own in names.items())
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import stat
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -21,11 +22,12 @@ from runner.runs.catalogue.index import Index, Rows
 from runner.runs.catalogue.rows import Row
 from runner.runs.locking import RUN_LOCK
 from runner.runs.run import RECORDING_FILE, RUN_FILE
+from runner.runs.store import Store
 from runner.util.files import EXPORTS, RESTORED, RUN_SEPARATOR, TABLES, cache_folder
 
 REMOVED: Final = ".removed-"
 """The prefix of a run's folder from the moment it is removed until its files are deleted."""
-KINDS: Final = ("recording", "exports", "restored", "other")
+KINDS: Final = ("recording", "checkpoints", "exports", "restored", "other")
 """The kinds of bytes, attributes of `Usage` and `Sums`."""
 
 _OWN: Final = frozenset((RUN_FILE, RECORDING_FILE, LABELS_FILE, LOCK_FILE, RUN_LOCK))
@@ -113,6 +115,8 @@ class Usage:
     row: dict[str, Any]
     """The run's row in the index."""
     contents: Contents
+    checkpoints: int
+    """The contents of its checkpoints; what several runs share counts for one of them."""
     exports: int
     restored: int
 
@@ -129,7 +133,7 @@ class Usage:
     @property
     def total(self) -> int:
         """All bytes."""
-        return self.recording + self.other + self.exports + self.restored
+        return self.recording + self.other + self.checkpoints + self.exports + self.restored
 
 
 COLUMNS_OF_USAGE: Final = (
@@ -152,6 +156,7 @@ class Sums:
     """Freed by removing interrupted and failed runs; not counting protected runs."""
     left_over: int = 0
     """Left by repairs and interrupted commands; not counting protected runs."""
+    checkpoints: int = 0
     exports: int = 0
     restored: int = 0
 
@@ -201,10 +206,17 @@ def usage_of(
         limit: the maximum number of runs to return; None for all.
     """
     exports, restored = cached(EXPORTS) + cached(TABLES), cached(RESTORED)
-    stored = read(lambda index: _stored(index, chosen, {*exports, *restored}, limit))
+    contents_in = lru_cache(lambda root: Store(Path(root)).sizes())
+
+    def read_index(index: Index) -> _Stored:
+        with_more = {*exports, *restored}.union(*map(contents_in, index.roots))
+        return _stored(index, chosen, with_more, limit)
+
+    stored = read(read_index)
 
     def usage(row: dict[str, Any], contents: Contents) -> Usage:
-        return Usage(row, contents, exports[row["id"]], restored[row["id"]])
+        kept = contents_in(row["root"]).get(row["entry"], 0)
+        return Usage(row, contents, kept, exports[row["id"]], restored[row["id"]])
 
     found = {
         (row["root"], row["entry"]): usage(row, Contents(*(row[name] for name in COLUMNS_OF_USAGE[-4:])))
@@ -222,6 +234,7 @@ def usage_of(
         sums.add(every[-1])
     if measured:
         _store(measured)
+    sums.checkpoints = sum(each.checkpoints for each in every)
     sums.exports = sum(each.exports for each in every)
     sums.restored = sum(each.restored for each in every)
     every.sort(key=lambda usage: (-usage.total, usage.row["id"]))

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import pathlib
 import re
 from http import HTTPStatus
-from pathlib import Path
 from typing import Annotated, Any, Final
 
-from fastapi import APIRouter, Header, Query, Response
+from fastapi import APIRouter, Header, Path, Query, Response
 from fastapi.responses import FileResponse
+from pydantic import BaseModel
 
+from runner.errors import RunNotFound
 from runner.export.rerun.selection import Request
 from runner.runs.run import Run
 from runner.service import computed
@@ -37,6 +39,25 @@ _RANGES: Final = re.compile(r"\d+:\d*|:\d+|\d+")
 IfNoneMatch = Annotated[str | None, Header(max_length=1000)]
 
 
+class CheckpointResponse(BaseModel):
+    """A checkpoint of a loop, after `step` steps of its phase."""
+
+    name: str
+    phase: str
+    step: int
+    episode: int
+    format: str
+    size: int
+    digest: str
+    here: bool
+
+
+class CheckpointsResponse(BaseModel):
+    """The checkpoints of a run, in order."""
+
+    checkpoints: list[CheckpointResponse]
+
+
 class _File(FileResponse):
     chunk_size = BLOCK
 
@@ -46,6 +67,32 @@ class _File(FileResponse):
 def recording(run: RecordedRun, if_none_match: IfNoneMatch = None) -> Response:
     """Return the MCAP file. Its ETag holds the content digest, and changes with every byte of the file."""
     return _file(run.recording, f"{run.file_stem}.mcap", tag_of(run), if_none_match)
+
+
+@router.get("/checkpoints", summary="The checkpoints of a loop.")
+def checkpoints(run: RecordedRun) -> CheckpointsResponse:
+    """Return the checkpoints in order, with their digests; `here` says whether the content is."""
+    return CheckpointsResponse(
+        checkpoints=[
+            CheckpointResponse(**{key: value for key, value in each.as_json().items() if key != "path"})
+            for each in run.checkpoints()
+        ]
+    )
+
+
+@router.get(
+    "/checkpoints/{digest}", response_class=Response, responses=FILE, summary="The content of a checkpoint."
+)
+def checkpoint(
+    run: RecordedRun,
+    digest: Annotated[str, Path(pattern="^[0-9a-f]{64}$", description="Its BLAKE3.")],
+    if_none_match: IfNoneMatch = None,
+) -> Response:
+    """Return the bytes of a checkpoint of this run."""
+    for each in run.checkpoints():
+        if each.digest == digest and each.is_here:
+            return _file(each.path, f"{run.file_stem}-{each.step}.{each.format}", digest, if_none_match)
+    raise RunNotFound(f"run {run.run_id} has no checkpoint of the digest {digest[:16]}… here.")
 
 
 @router.get(
@@ -83,7 +130,7 @@ async def replay_of(
     episodes: str = "",
     evaluations: tuple[int, ...] = (),
     every: int = 0,
-) -> Path:
+) -> pathlib.Path:
     """Return the export of some runs, made in a child process, once for all concurrent requests.
 
     Raises:
@@ -93,7 +140,7 @@ async def replay_of(
     request = Request(_ranges(episodes), evaluations, every)
     key = ("replay", *map(recording_state, runs), request)
     path = await cache.get_or_await(key, lambda: processes(computed.replay, runs, request), max_seconds=0)
-    return Path(os.fsdecode(path))
+    return pathlib.Path(os.fsdecode(path))
 
 
 def tag_of(run: Run) -> str:
@@ -102,7 +149,7 @@ def tag_of(run: Run) -> str:
     return f"{run.summary.get('content_digest') or 'unfinished'}-{size:x}-{changed:x}"
 
 
-def _file(path: Path, name: str, tag: str, if_none_match: str | None) -> Response:
+def _file(path: pathlib.Path, name: str, tag: str, if_none_match: str | None) -> Response:
     headers = {"etag": f'"{tag}"', "accept-ranges": "bytes"}
     known = [part.strip().removeprefix("W/") for part in (if_none_match or "").split(",")]
     if f'"{tag}"' in known or "*" in known:

@@ -268,7 +268,7 @@ def test_a_broken_connection_leaves_what_was_received(server, run):
             client.append_upload(now, run.recording, len(data))
         assert refused.value.status == 409
         with pytest.raises(ServerError, match="expected the"):
-            client.complete_upload(now, run, len(data) + 5, "0" * 64)
+            client.complete_upload(now, len(data) + 5, "0" * 64)
         client.delete_upload(now)
         with pytest.raises(ServerError, match="no such upload"):
             client.upload_status(now)

@@ -1,0 +1,90 @@
+"""Checkpoints go with their runs to a server and back."""
+
+from __future__ import annotations
+
+import gymnasium
+import httpx2
+import pytest
+from blake3 import blake3
+from click.testing import CliRunner
+from served import Served
+
+import runner
+from runner.cli import cli
+from runner.client.client import Client
+from runner.client.connection import ServerError
+from runner.client.outbox import outbox_folder
+from runner.runs.store import Store
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    with Served(tmp_path_factory.mktemp("server") / "runs") as started:
+        yield started
+
+
+@pytest.fixture(autouse=True)
+def outbox(tmp_path, monkeypatch):
+    for name in ("DUALTAXI_TOKEN", "DUALTAXI_TOKEN_FILE", "DUALTAXI_SERVER"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    return outbox_folder()
+
+
+def record_loop(recordings, name):
+    with runner.record(gymnasium.make("CartPole-v1"), recordings, name=name) as rec:
+        rec.reset(seed=0)
+        for k in range(5):
+            rec.step(0, extras={"value": float(k)})
+            rec.checkpoint("policy", bytes([k // 2]) * 1000)
+    return rec.run
+
+
+def test_a_pushed_run_has_its_checkpoints_and_so_has_a_pulled_one(server, tmp_path):
+    run = record_loop(tmp_path / "here", "pushed")
+    words = ["remote", "push", "pushed", "--server", server.url, "--recordings", str(tmp_path / "here")]
+    for _ in range(2):  # the second push sends nothing again
+        done = CliRunner().invoke(cli, words)
+        assert done.exit_code == 0, done.output
+    there = httpx2.get(f"{server.url}/api/v1/runs/{run.run_id}/checkpoints").json()["checkpoints"]
+    assert [(each["step"], each["here"]) for each in there] == [(k, True) for k in range(1, 6)]
+    content = httpx2.get(f"{server.url}/api/v1/runs/{run.run_id}/checkpoints/{there[0]['digest']}").content
+    assert content == bytes(1000)
+    words = ["remote", "pull", run.run_id, "--server", server.url, "--recordings", str(tmp_path / "other")]
+    done = CliRunner().invoke(cli, words)
+    assert done.exit_code == 0, done.output
+    pulled = runner.find_run(run.run_id, tmp_path / "other")
+    assert [each.load() for each in pulled.checkpoints()] == [bytes([k // 2]) * 1000 for k in range(5)]
+    assert list((tmp_path / "other").glob(".pulling/*")) == []
+
+
+def test_a_loop_recorded_for_a_server_leaves_no_content_in_the_outbox(server, outbox):
+    run = record_loop(server.url, "sent")
+    there = httpx2.get(f"{server.url}/api/v1/runs/{run.run_id}/checkpoints").json()["checkpoints"]
+    assert all(each["here"] for each in there)
+    assert list(outbox.glob(".store/objects/*/*")) == []
+
+
+def test_a_server_takes_no_content_that_its_run_does_not_name(server, tmp_path):
+    run = record_loop(tmp_path, "strict")
+    with Client(server.url) as client:
+        client.push(run)
+        digest = blake3(b"strange").hexdigest()
+        with pytest.raises(ServerError, match="has no checkpoint of this digest"):
+            client.begin_upload(digest=digest, size=7, checkpoint_of=run.run_id)
+        with pytest.raises(ServerError, match="push it before"):
+            client.begin_upload(digest=digest, size=7, checkpoint_of="unknown")
+    response = httpx2.get(f"{server.url}/api/v1/runs/{run.run_id}/checkpoints/{digest}")
+    assert response.status_code == 404
+    for strange in ("..%2F..%2Frun.json", "run.json", "A" * 64):
+        response = httpx2.get(f"{server.url}/api/v1/runs/{run.run_id}/checkpoints/{strange}")
+        assert response.status_code in (404, 422), strange
+
+
+def test_a_content_that_is_changed_on_the_way_is_refused(server, tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path) as rec:
+        rec.checkpoint("policy", b"new to the server")
+    run = rec.run
+    Store(tmp_path).path(run.checkpoints()[0].digest).write_bytes(b"NEW to the server")
+    with Client(server.url) as client, pytest.raises(ServerError, match="refused policy@0"):
+        client.push(run)
