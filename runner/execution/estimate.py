@@ -20,7 +20,7 @@ from runner.config import ExperimentConfig
 CLUMSY_EPISODES: Final = 500
 CLUMSY, SKILLED = 0.5, 0.1
 """Typical length of an episode as a share of the step limit: at first and in trials, and later."""
-BYTES_A_STEP: Final = {"zstd": 15, "lz4": 30, "none": 100}
+BYTES_PER_STEP: Final = {"zstd": 15, "lz4": 30, "none": 100}
 """Measured bytes of a step by compression, without the message index."""
 INDEX_BYTES: Final = 16
 """Bytes of the message index for a step."""
@@ -51,7 +51,7 @@ def estimate(config: ExperimentConfig, step_limit: int) -> Estimate:
     clumsy = min(config.episodes, CLUMSY_EPISODES) if learns else config.episodes
     typical = round(step_limit * (CLUMSY * (clumsy + trials) + SKILLED * (config.episodes - clumsy)))
     longest = step_limit * (config.episodes + trials)
-    rate = bytes_a_step(config)
+    rate = bytes_per_step(config)
     return Estimate(evaluations, snapshots, typical, typical * rate, longest, longest * rate)
 
 
@@ -60,12 +60,12 @@ def _occasions(episodes: int, every: int) -> int:
     return -(-episodes // every) + 1
 
 
-def bytes_a_step(config: ExperimentConfig) -> int:
+def bytes_per_step(config: ExperimentConfig) -> int:
     """Return the typical number of bytes of a step in a recording."""
     plan = config.recording
     if plan.steps == "none":
         return OTHER_BYTES
-    return BYTES_A_STEP[plan.compression] + (INDEX_BYTES if plan.index == "message" else 0) + OTHER_BYTES
+    return BYTES_PER_STEP[plan.compression] + (INDEX_BYTES if plan.index == "message" else 0) + OTHER_BYTES
 
 
 def step_limit(config: ExperimentConfig) -> int | None:

@@ -35,7 +35,7 @@ class Plan:
 
     trials: int
     runs: int
-    bytes_a_run: int
+    bytes_per_run: int
     """An estimate: recordings grow with what is learned."""
     excluded: int = 0
     """Points of a grid without runs, because their values contradict each other."""
@@ -43,7 +43,7 @@ class Plan:
     @property
     def bytes(self) -> int:
         """The estimate for all runs together."""
-        return self.runs * self.bytes_a_run
+        return self.runs * self.bytes_per_run
 
 
 def plan_of(sweep: Sweep) -> Plan:
@@ -65,10 +65,10 @@ def plan_of(sweep: Sweep) -> Plan:
         raise errors[0]
     config = configs[0]
     mdp = load_mdp(config.env.id, config.env.kwargs, config.rewards)
-    bytes_a_run = _measured_bytes(config, mdp, sweep.objective.metric) + _estimated_bytes(config, mdp)
+    bytes_per_run = _measured_bytes(config, mdp, sweep.objective.metric) + _estimated_bytes(config, mdp)
     excluded = len(errors) if is_grid else 0
     trials = search.trials - excluded
-    return Plan(trials, trials * len(sweep.seeds), bytes_a_run, excluded)
+    return Plan(trials, trials * len(sweep.seeds), bytes_per_run, excluded)
 
 
 def _measured_bytes(config: ExperimentConfig, mdp: Mdp, metric: str) -> int:
@@ -110,7 +110,7 @@ def require_disk(plan: Plan, done: int, recordings: Path) -> None:
     Raises:
         StorageError: there is too little space.
     """
-    needed, free = max(0, plan.runs - done) * plan.bytes_a_run, free_bytes(recordings)
+    needed, free = max(0, plan.runs - done) * plan.bytes_per_run, free_bytes(recordings)
     if needed > free:
         raise StorageError(
             f"{recordings}: {plan.runs - done:,} runs need about {size(needed)}, and {size(free)} are free: "
@@ -129,8 +129,8 @@ def limit_of(limits: Limits, plan: Plan, recordings: Path, before: int) -> Limit
     """
 
     def reason(status: SweepStatus, task: Task) -> str:
-        runs = before + status.begun - status.resumed
-        in_progress = (status.running + 1) * plan.bytes_a_run
+        runs = before + status.started - status.resumed
+        in_progress = (status.running + 1) * plan.bytes_per_run
         if limits.runs is not None and not task.run_id and runs >= limits.runs:
             return f"limits.runs: {limits.runs:,} runs were started"
         if limits.seconds is not None and status.seconds >= limits.seconds:
@@ -138,10 +138,10 @@ def limit_of(limits: Limits, plan: Plan, recordings: Path, before: int) -> Limit
         if limits.disk is not None and status.bytes + in_progress > limits.disk:
             return (
                 f"limits.disk: {size(status.bytes)} of {size(limits.disk)} are used, and a run needs about "
-                f"{size(plan.bytes_a_run)}"
+                f"{size(plan.bytes_per_run)}"
             )
         if free_bytes(recordings) < in_progress:
-            return f"the disk of {recordings} is full: a run needs about {size(plan.bytes_a_run)}"
+            return f"the disk of {recordings} is full: a run needs about {size(plan.bytes_per_run)}"
         return ""
 
     return reason

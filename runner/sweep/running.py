@@ -36,7 +36,7 @@ class SweepStatus:
     failed: int = 0
     excluded: int = 0
     """Trials without runs, because their values contradict each other."""
-    begun: int = 0
+    started: int = 0
     """Runs that this process started or resumed."""
     resumed: int = 0
     """Those of them that existed before."""
@@ -75,7 +75,7 @@ def run_sweep(
     Raises:
         RunnerError: an existing run cannot be read.
     """
-    runner = _Runner(sweep, recordings, workers, stop, report, limit)
+    runner = _Runner(sweep, recordings, workers, stop=stop, report=report, limit=limit)
     trials, status = runner.trials, runner.status
     while batch := trials.ask():
         runner.prepare(batch, trials.bounds(), accept_changes)
@@ -96,6 +96,7 @@ class _Runner:
         sweep: Sweep,
         recordings: Path,
         workers: Workers,
+        *,
         stop: Callable[[], bool],
         report: Callable[[SweepStatus], None],
         limit: Limit,
@@ -170,7 +171,7 @@ class _Runner:
                 self._workers.submit(replace(task, run_id=task.run_id or self._created(task)))
                 status.running += 1
                 if task.identity not in self._retried:
-                    status.begun += 1
+                    status.started += 1
                     status.resumed += bool(task.run_id)
 
     def _created(self, task: Task) -> str:

@@ -258,7 +258,7 @@ def _status_rows(sweep: Sweep, status: SweepStatus) -> dict[str, str]:
     from runner.sweep.results import objective_text, values_text
 
     left = status.runs - status.done - status.failed
-    ended = status.begun - status.running
+    ended = status.started - status.running
     rate = ended / status.seconds if status.seconds and ended > 0 else 0.0
     bar = "█" * round(20 * status.done / max(status.runs, 1))
     counts = [
@@ -293,7 +293,7 @@ def _print_plan(sweep: Sweep, plan: Plan, as_json: bool) -> None:
         "runs": runs,
         **values,
         "objective": sweep.objective.description,
-        "disk": f"about {size(plan.bytes)}, {size(plan.bytes_a_run)} per run",
+        "disk": f"about {size(plan.bytes)}, {size(plan.bytes_per_run)} per run",
     }
     draw(facts(rows))
 

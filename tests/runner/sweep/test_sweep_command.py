@@ -27,7 +27,7 @@ def type_in(tmp_path):
 def test_a_dry_run_prints_the_plan_and_runs_nothing(type_in, file, tmp_path):
     planned = json.loads(type_in("run", str(file()), "--dry-run", "--json").stdout)
     assert (planned["trials"], planned["runs"]) == (6, 12)
-    assert planned["bytes"] == 12 * planned["bytes_a_run"] > 0
+    assert planned["bytes"] == 12 * planned["bytes_per_run"] > 0
     assert not (tmp_path / "runs").exists()
     assert "0.1 to 1" in type_in("run", str(file()), "--dry-run").stdout
 

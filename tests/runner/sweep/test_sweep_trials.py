@@ -120,11 +120,11 @@ def test_a_task_whose_worker_dies_twice_fails_and_the_sweep_continues(tmp_path):
     assert [trial.state for trial in trials.done] == ["failed", *["finished"] * 5]
     assert trials.done[0].errors == ["seed 0: its worker died twice"]
     again, status = swept(tmp_path, sweep)
-    assert (status.begun, digests(again)) == (0, digests(trials))
+    assert (status.started, digests(again)) == (0, digests(trials))
     assert len(results_of(sweep, tmp_path).ranking) == 6
     state.forget_failures("small", tmp_path)
     _, status = swept(tmp_path, sweep)
-    assert (status.done, status.failed, status.begun) == (6, 0, 1)
+    assert (status.done, status.failed, status.started) == (6, 0, 1)
 
 
 def test_a_process_that_dies_before_its_task_is_replaced(done, monkeypatch):
