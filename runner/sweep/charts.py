@@ -238,7 +238,8 @@ def parallel_chart(picture: Picture) -> Chart:
         chart.shape([(place, 24), (place, 186)], stroke=palette.INK, width=0.7)
         for row, part in enumerate(textwrap.wrap(name.replace(".", ". "), 24)[:2]):
             text = part.replace(". ", ".")
-            chart.text(max(place, 10.0), 198.0 + 10 * row, text, "start" if place < 60 else "middle")
+            side = "start" if place < 60 else "end" if place > 500 else "middle"
+            chart.text({"start": 10.0, "end": 585.0}.get(side, place), 198.0 + 10 * row, text, side)
     for number, axis in enumerate(picture.axes):
         _label_column(chart, number, axis.values, axis.log, axis.choices)
     _label_column(chart, len(picture.axes), picture.values, picture.log, ())
