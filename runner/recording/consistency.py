@@ -19,6 +19,7 @@ from runner.recording.loop_blocks import Block, Blocks, Bools, Inconsistent, Int
 from runner.recording.reader import Recording
 from runner.recording.schema import RESET_ONLY
 
+Floats = NDArray[np.float64]
 Expected = dict[str, NDArray[Any]]
 
 
@@ -47,7 +48,7 @@ class _State:
     """The number of the current or next episode."""
     length: Ints
     """Its steps so far."""
-    returns: NDArray[np.float64]
+    returns: Floats
     counts: Ints
     """Its events and penalties so far."""
     over: Bools
@@ -187,13 +188,7 @@ class _Phase:
         self._carry_over(b, episodes, lengths, returns, counts, ended)
 
     def _carry_over(
-        self,
-        b: Block,
-        episodes: Ints,
-        lengths: Ints,
-        returns: NDArray[np.float64],
-        counts: Ints | None,
-        ended: Bools,
+        self, b: Block, episodes: Ints, lengths: Ints, returns: Floats, counts: Ints | None, ended: Bools
     ) -> None:
         """Keep the state of each environment after its last step of the block."""
         state = self._state
@@ -259,12 +254,12 @@ class _Phase:
         self._findings.begun_without += len(without)
         self._findings.begun_by_reset += int(np.count_nonzero(began & explained))
 
-    def _returns(self, b: Block) -> NDArray[np.float64]:
+    def _returns(self, b: Block) -> Floats:
         """Return the summed rewards of each segment, added in their order as the recorder adds them."""
         rewards, carried = b.rows["rewards"], self._state.returns[b.owner]
         if b.reset_only.any():
             rewards = np.where(b.reset_only[:, np.newaxis], 0.0, rewards)
-        sums: NDArray[np.float64] = np.add.reduceat(rewards, b.heads, axis=0)
+        sums: Floats = np.add.reduceat(rewards, b.heads, axis=0)
         with np.errstate(invalid="ignore", over="ignore"):
             if (np.abs(rewards) < 2**31).all() and (rewards == np.rint(rewards)).all():
                 # Sums of whole numbers are the same in any order.
@@ -294,7 +289,7 @@ class _Phase:
         self,
         b: Block,
         lengths: Ints,
-        returns: NDArray[np.float64],
+        returns: Floats,
         counts: Ints | None,
         ended: Bools,
         interrupted: Bools,
