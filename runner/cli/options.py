@@ -253,6 +253,11 @@ accept_changes_option: Final = click.option(
     is_flag=True,
     help="Resume although code, environment, file or numerical libraries have changed.",
 )
+trust_option: Final = click.option(
+    "--trust",
+    is_flag=True,
+    help="Import what the recording names to make its environment again: run code that you trust only.",
+)
 all_option: Final = click.option(
     "--all", "everything", is_flag=True, help="Include everything, not only a selection."
 )

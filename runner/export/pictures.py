@@ -4,43 +4,40 @@
         for picture in shown:                       # T + 1 of them for an episode of T steps
             print(picture.t, picture.pixels.shape, picture.action, picture.returns)
 
-What a picture shows is decided in one place, by what the recording has: the scene of a tabular environment; a
-frame that was recorded; an observation that is an image; or else the numbers of the observation as bars.
+What the pictures are made from is decided in one place, by what there is: the scene of a tabular environment;
+recorded frames; the environment, made again, which draws the episode while it is compared with the recording;
+observations that are images; or else the numbers of the observations as bars.
 """
 
 from __future__ import annotations
 
-import io
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.drawing import svg
-from runner.drawing.bars import BarRaster
-from runner.drawing.raster import Pixels, SceneRaster, require_packages
+from runner.drawing.raster import Pixels, require_packages
 from runner.environments.mdp import events_of
 from runner.environments.naming import deeds_in_words, events_in_words, exploration_in_words
-from runner.errors import RecordingError
+from runner.errors import CannotRedo
 from runner.export.contents import ENDINGS, ending_of, require_steps
+from runner.export.painting import (
+    EnvironmentDiffers,
+    Painted,
+    frames_every,
+    paint_observation,
+    paint_recorded,
+    paint_redrawn,
+    paint_scene,
+    paint_values,
+)
 from runner.export.values import Values, value_in_words
-from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.replay.steps import check_steps, reset_of, transitions_of
-
-SCENE_SIZE: Final = 480
-"""The largest width and height of the picture of a scene."""
-MAX_PIXELS: Final = 4096 * 4096
-"""The most pixels of a recorded frame."""
-_END_OF_TIME: Final = 2**62
-"""Later than any message, in nanoseconds."""
-
-Paint = Callable[[int, Any], Pixels]
-"""Returns the picture after t steps; called in order, with t and the record of step t, of the first for 0."""
+from runner.replay.capabilities import why_not_redone
+from runner.replay.steps import check_steps, transitions_of
 
 
 class Source(StrEnum):
@@ -49,6 +46,8 @@ class Source(StrEnum):
     SCENE = "scene"
     """The scene of a tabular environment, drawn from the recorded states."""
     RECORDED = "recorded frames"
+    REDRAWN = "pictures drawn again"
+    """Drawn by the environment, which was made again and compared with the recording."""
     OBSERVATION = "observations"
     """Observations that are images."""
     VALUES = "values"
@@ -82,18 +81,19 @@ class Pictures:
 
     Attributes:
         source: what they are made from.
-        reason: why they are not made from anything better; empty for a scene and for frames.
+        reason: why they are not drawn again, as a sentence; empty if they are, or have no need to be.
         steps: steps of the episode; there is one more picture, unless one has a note.
         learners: the names of the learners, one for each reward.
     """
 
-    def __init__(self, recording: Recording, phase: str, episode: int) -> None:
+    def __init__(self, recording: Recording, phase: str, episode: int, trust: bool) -> None:
         require_packages()
         require_steps(recording, "show")
         self._recording, self._phase, self._episode = recording, phase, episode
         self.learners = recording.agents
         self.steps = len(recording.episode_span(phase, episode))
-        self.source, self.reason = source_of(recording, phase)
+        self.source, self.reason = source_of(recording, phase, trust)
+        self._painted = self._begin(trust)
         self._pictures = self._generate()
 
     def __iter__(self) -> Iterator[Picture]:
@@ -103,34 +103,104 @@ class Pictures:
         return next(self._pictures)
 
     def close(self) -> None:
-        """Free what makes the pictures."""
+        """End what makes the pictures."""
         self._pictures.close()
+        self._painted.close()
+
+    def _begin(self, trust: bool) -> Painted:
+        """Return the painted states; from something else where the environment turns out not to draw them."""
+        where = self._recording, self._phase, self._episode
+        if self.source is not Source.REDRAWN:
+            return _PAINTERS[self.source](*where)
+        painted = paint_redrawn(*where, trust)
+        try:
+            return _resumed(next(painted), painted)
+        except (CannotRedo, EnvironmentDiffers) as error:
+            painted.close()
+            self.source, self.reason = _source_of_recorded(self._recording, self._phase), str(error)
+        return _PAINTERS[self.source](*where)
 
     def _generate(self) -> Generator[Picture, None, None]:
         recording, phase, episode = self._recording, self._phase, self._episode
-        paint = _PAINTERS[self.source](recording, phase, episode)
-        describe = _describer(recording)
+        describe, painted = _describer(recording), self._painted
         returns = np.zeros(len(recording.agents))
         none = tuple(returns.tolist())
+        pixels = next(painted)
+        yield Picture(0, pixels, "", none, none, "", "")
         for t, row in enumerate(transitions_of(recording, phase, episode), 1):
-            if t == 1:
-                yield Picture(0, paint(0, row), "", none, none, "", "")
-            pixels = paint(t, row)
+            note = ""
+            try:
+                pixels = next(painted)
+            except (CannotRedo, EnvironmentDiffers) as error:
+                note = str(error)
             action, events = describe(row)
             rewards = np.asarray(row["rewards"], np.float64)
             returns += rewards
             ended = ENDINGS[ending_of(recording, phase, episode)] if t == self.steps else ""
-            yield Picture(t, pixels, action, tuple(rewards.tolist()), tuple(returns.tolist()), events, ended)
+            paid, total = tuple(rewards.tolist()), tuple(returns.tolist())
+            yield Picture(t, pixels, action, paid, total, events, ended, note)
+            if note:
+                return
 
 
-def pictures(recording: Recording, phase: str, episode: int) -> Pictures:
-    """Return the pictures of an episode of a phase (`train` or `eval`), counted from 0.
+def pictures(recording: Recording, phase: str, episode: int, trust: bool = False) -> Pictures:
+    """Return the pictures of an episode.
+
+    Args:
+        recording: the run.
+        phase: `train` or `eval`.
+        episode: among the episodes of the phase, counted from 0.
+        trust: whether what the recording names may be imported, see `runner.replay.makers`.
 
     Raises:
         RecordingError: there is no such episode, or the recording has no steps.
         MissingExtra: a package that draws them is not installed.
     """
-    return Pictures(recording, phase, episode)
+    return Pictures(recording, phase, episode, trust)
+
+
+def source_of(recording: Recording, phase: str, trust: bool = False) -> tuple[Source, str]:
+    """Return what the pictures of a phase are made from, and why it is not anything better.
+
+    Nothing is imported or made: it may turn out that an environment cannot be made again.
+    """
+    recorded = _source_of_recorded(recording, phase)
+    is_complete = recorded is Source.RECORDED and frames_every(recording) == 1
+    if recorded is Source.SCENE or is_complete:
+        return recorded, ""
+    if recording.is_job:
+        return recorded, "The environment has no scene."
+    reason = why_not_redone(recording, trust)
+    return (recorded, reason) if reason else (Source.REDRAWN, "")
+
+
+def _source_of_recorded(recording: Recording, phase: str) -> Source:
+    """Return the best of what the recording itself has."""
+    if recording.tabular and svg.drawing_of(recording.mdp) is not None:
+        return Source.SCENE
+    if not recording.is_job and recording.environments == 1 and recording.has_messages(f"/{phase}/frame"):
+        return Source.RECORDED
+    if recording.kind in ("transition", "variable"):
+        with_image = Values(recording.spaces["observation"], "observation").image is not None
+        return Source.OBSERVATION if with_image else Source.VALUES
+    return Source.VALUES
+
+
+_PAINTERS = {
+    Source.SCENE: paint_scene,
+    Source.RECORDED: paint_recorded,
+    Source.OBSERVATION: paint_observation,
+    Source.VALUES: paint_values,
+}
+
+
+def _resumed(first: Pixels, painted: Painted) -> Painted:
+    """Yield a picture, and those that follow it."""
+    try:
+        yield first
+        yield from painted
+    finally:
+        painted.close()
 
 
 def _describer(recording: Recording) -> Callable[[Any], tuple[str, str]]:
@@ -148,7 +218,9 @@ def _describer(recording: Recording) -> Callable[[Any], tuple[str, str]]:
 
         return describe
     if recording.kind == "step":
-        return lambda row: (f"action {row['action']}", "")
+        start = recording.spaces["action"].get("start")
+        first = start if isinstance(start, int) else 0
+        return lambda row: (f"action {int(row['action']) + first}", "")
     texts, agents = Values(recording.spaces["observation"], "observation"), recording.agents
 
     def describe_values(row: Any) -> tuple[str, str]:
@@ -159,157 +231,3 @@ def _describer(recording: Recording) -> Callable[[Any], tuple[str, str]]:
         return f"action {words}" if words.isdecimal() else words, texts.texts_in(row["next_observation"])
 
     return describe_values
-
-
-def source_of(recording: Recording, phase: str) -> tuple[Source, str]:
-    """Return what the pictures of a phase are made from, and why it is not anything better."""
-    if recording.tabular and svg.drawing_of(recording.mdp) is not None:
-        return Source.SCENE, ""
-    has_frames = not recording.is_job and recording.environments == 1
-    if has_frames and next(recording.messages(recording.topic(f"/{phase}/frame")), None) is not None:
-        return Source.RECORDED, ""
-    reason = "it has no scene, and no frames were recorded"
-    if (
-        recording.kind in ("transition", "variable")
-        and Values(recording.spaces["observation"], "observation").image is not None
-    ):
-        return Source.OBSERVATION, reason
-    return Source.VALUES, reason
-
-
-# --- what pictures are made from --------------------------------------------------------------------------
-
-
-def _paint_scene(recording: Recording, phase: str, episode: int) -> Paint:  # noqa: ARG001
-    """Draw the scene in each state, with the way that led there."""
-    mdp = recording.mdp
-    drawing = svg.drawing_of(mdp)
-    assert drawing is not None
-    raster = SceneRaster(drawing, SCENE_SIZE, SCENE_SIZE)
-    places: deque[NDArray[np.int16]] = deque(maxlen=svg.TRAIL)
-
-    def paint(t: int, row: Any) -> Pixels:
-        check_steps(np.asarray(row).reshape(1), mdp, str(recording.path), schema.PHASE_NAMES[phase])
-        state = row["next_state" if t else "state"]
-        places.append(drawing.places(mdp, np.array([state]))[0])
-        return raster.draw(np.stack(places))
-
-    return paint
-
-
-def _paint_recorded(recording: Recording, phase: str, episode: int) -> Paint:
-    """Show the last frame that was recorded up to each step."""
-    topic, every = recording.topic(f"/{phase}/frame"), _frames_every(recording)
-    frames: Iterator[dict[str, Any]] = iter(())
-    following: dict[str, Any] | None = None
-    shown: Pixels | None = None
-
-    def show_next() -> None:
-        nonlocal following, shown
-        assert following is not None
-        where = f"{recording.path}: the frame at {following['log_time']} ns"
-        shown = _pixels(following["data"], where, shown)
-        following = next(frames, None)
-
-    def paint(t: int, row: Any) -> Pixels:
-        nonlocal frames, following
-        time, over = int(row["log_time"]), row["terminated"] or row["truncated"]
-        if t == 0:
-            reset = reset_of(recording, phase, episode)
-            first = time if reset is None else int(reset["log_time"])
-            frames = recording.decoded(topic, times=range(first, _END_OF_TIME))
-            following = next(frames, None)
-        while following is not None and following["log_time"] < time:
-            show_next()
-        # A frame at the time of the episode's last step may be that of the next reset.
-        if t and following is not None and following["log_time"] == time and (over or t % every == 0):
-            show_next()
-        if shown is None:
-            raise RecordingError(f"{recording.path}: the first frame of {phase} episode {episode} was lost.")
-        return shown
-
-    return paint
-
-
-def _frames_every(recording: Recording) -> int:
-    """Return after how many steps of an episode a frame was recorded, as its configuration says."""
-    frames = recording.config.get("frames")
-    every = frames.get("every") if isinstance(frames, Mapping) else None
-    return every if isinstance(every, int) and every > 0 else 1
-
-
-def _pixels(data: bytes, where: str, before: Pixels | None) -> Pixels:
-    """Return a recorded frame in the size of the one before it, if there is one.
-
-    Raises:
-        RecordingError: it is no picture, or too large.
-    """
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
-            if image.width * image.height > MAX_PIXELS:
-                raise RecordingError(f"{where}: has {image.width}x{image.height} pixels, too many to show.")
-            picture = image.convert("RGB")
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
-        raise RecordingError(f"{where}: cannot be shown ({error}).") from error
-    if before is not None and picture.size != before.shape[1::-1]:
-        picture = picture.resize(before.shape[1::-1])
-    return np.asarray(picture)
-
-
-def _paint_observation(recording: Recording, phase: str, episode: int) -> Paint:
-    """Show the image in each observation."""
-    values = Values(recording.spaces["observation"], "observation")
-    reset = reset_of(recording, phase, episode)
-
-    def paint(t: int, row: Any) -> Pixels:
-        if t == 0:
-            return values.pixels_in(row["next_observation"] if reset is None else reset["observation"])
-        return values.pixels_in(row["next_observation"])
-
-    return paint
-
-
-def _paint_values(recording: Recording, phase: str, episode: int) -> Paint:
-    """Draw the numbers of each observation and the rewards as bars, each on a scale of its own."""
-    learners = recording.agents
-    rewards = [f"reward {agent}" for agent in learners] if len(learners) > 1 else ["reward"]
-    names, read = _numbers(recording)
-    reset = None if recording.kind in ("job", "step") else reset_of(recording, phase, episode)
-
-    def values(t: int, row: Any) -> NDArray[np.float64]:
-        paid = row["rewards"] if t else np.full(len(learners), np.nan)
-        return np.append(read(t, row, reset), paid)
-
-    low = high = np.zeros(len(names) + len(rewards))
-    for t, row in enumerate(transitions_of(recording, phase, episode), 1):
-        for now in (values(0, row), values(1, row)) if t == 1 else (values(t, row),):
-            low, high = np.fmin(low, now), np.fmax(high, now)
-    raster = BarRaster([*names, *rewards], low, high)
-    return lambda t, row: raster.draw(values(t, row))
-
-
-def _numbers(recording: Recording) -> tuple[list[str], Callable[[int, Any, Any], NDArray[np.float64]]]:
-    """Return the names of an observation's numbers, and how to read them from t, a step and the reset.
-
-    The numbers before the first step are nan if its reset was lost.
-    """
-    if recording.kind in ("job", "step"):
-        return ["state"], lambda t, row, _: np.array([row["next_state" if t else "state"]], np.float64)
-    shown = Values(recording.spaces["observation"], "observation")
-
-    def read(t: int, row: Any, reset: Any) -> NDArray[np.float64]:
-        if t == 0 and reset is None:
-            return np.full(len(shown.names), np.nan)
-        return shown.numbers_in(row["next_observation"] if t else reset["observation"])
-
-    return shown.names, read
-
-
-_PAINTERS: Final[Mapping[Source, Callable[[Recording, str, int], Paint]]] = {
-    Source.SCENE: _paint_scene,
-    Source.RECORDED: _paint_recorded,
-    Source.OBSERVATION: _paint_observation,
-    Source.VALUES: _paint_values,
-}

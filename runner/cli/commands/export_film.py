@@ -14,15 +14,20 @@ from runner.cli.options import (
     episode_option,
     run_argument,
     trial_option,
+    trust_option,
     writing_options,
 )
 from runner.cli.output import print_written, say
 from runner.cli.progress import count_line
 from runner.cli.runs import opened_run
+from runner.errors import ExitCode
 from runner.util.humanize import size
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from runner.export.episodes import EpisodeChoice
+    from runner.export.pictures import Pictures
     from runner.recording.reader import Recording
 
 _SCENE_FPS = 4.0
@@ -54,6 +59,7 @@ _FPS = 30.0
     metavar="PIXELS",
     help="Width of the film.  [default: about that of the pictures]",
 )
+@trust_option
 @writing_options("exports/NAME-RUN.mp4")
 def command(
     run_name: str,
@@ -65,15 +71,17 @@ def command(
     output: Path | None,
     fps: float | None,
     width: int | None,
+    trust: bool,
     force: bool,
     recordings: Path | None,
     as_json: bool,
 ) -> None:
     """Make a film of a recorded episode of RUN; the ending of the file chooses the format.
 
-    Each frame has step, action, rewards and events written below it. What it shows is the best that the run
-    has: the scene of a tabular environment, recorded frames, observations that are images, or else the
-    observation's numbers as bars.
+    Each frame has step, action, rewards and events written below it. What it shows is the best that there
+    is: the scene of a tabular environment; recorded frames; pictures that the environment draws when it is
+    made again and repeats the recorded actions, compared with the recording as it goes; observations that
+    are images; or else the observation's numbers as bars.
 
     By default it is the typical trial of the last evaluation: the median by success, return and length; of
     your own loop the first trial of its last evaluation; of a run without evaluations the last training
@@ -102,36 +110,42 @@ def command(
             shown = _ranked(recording, grid, best)
         else:
             shown = [chosen_episode(recording, episode, trial)]
-        source, reason = source_of(recording, shown[0].phase)
-        if reason:
-            say(f"The film shows {source}, because {reason}.")
-        speed = fps or (_SCENE_FPS if source is Source.SCENE else _FPS)
-        shots = (
-            film.Shot(f"{run.title}: {one.title}", pictures(recording, one.phase, one.number))
-            for one in shown
-        )
+        is_scene = source_of(recording, shown[0].phase, trust)[0] is Source.SCENE
+        speed = fps or (_SCENE_FPS if is_scene else _FPS)
+        opened: list[Pictures] = []
+
+        def shots() -> Iterator[film.Shot]:
+            for one in shown:
+                opened.append(pictures(recording, one.phase, one.number, trust))
+                yield film.Shot(f"{run.title}: {one.title}", opened[-1])
+
         steps = sum(len(recording.episode_span(one.phase, one.number)) for one in shown)
         made: list[film.Film] = []
         with count_line("frames", steps + len(shown)) as progress:
 
             def write(path: Path) -> None:
                 if grid:
-                    made.append(film.write_grid(path, shots, grid[1], speed, width, progress))
+                    made.append(film.write_grid(path, shots(), grid[1], speed, width, progress))
                 else:
-                    made.append(film.write_film(path, next(shots), speed, width, progress))
+                    made.append(film.write_film(path, next(shots()), speed, width, progress))
 
             write_new(path, force, write)
+    for note in dict.fromkeys(each.reason for each in opened if each.reason):
+        say(f"The film shows {opened[0].source}: {note}")
     for note in made[0].notes:
         say(note)
     what = shown[0].title if len(shown) == 1 else f"{len(shown)} episodes"
     facts = f"{made[0].frames:,} frames of {made[0].width}x{made[0].height}, {size(path.stat().st_size)}"
     print_written(
-        f"{path}: {what}, {facts}",
+        f"{path}: {what}, {opened[0].source}, {facts}",
         as_json,
         path,
         episodes=[one.title for one in shown],
+        source=str(opened[0].source),
         frames=made[0].frames,
     )
+    if made[0].notes:
+        raise SystemExit(ExitCode.DIFFERENT)
 
 
 def _ranked(recording: Recording, grid: tuple[int, int] | None, best: bool) -> list[EpisodeChoice]:

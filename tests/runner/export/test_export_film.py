@@ -18,7 +18,8 @@ from runner.export.episodes import ranked_episodes
 from runner.export.pictures import pictures
 from runner.export.reports.episode import typical_trial
 from runner.recording.reader import open_recording
-from tests.runner.loops.making import make, play
+from tests.runner.export.making import made_otherwise
+from tests.runner.loops.making import Rooms, play
 
 ENDINGS = tuple(films.FORMATS)
 
@@ -72,7 +73,8 @@ def test_a_film_shows_what_the_environment_drew(pole, tmp_path, ending):
     assert result.exit_code == 0, result.output
     frames = frames_of(path)
     assert (
-        f"training episode 1, {len(drawn[1])} frames of {frames.shape[2]}x{frames.shape[1]}" in result.stdout
+        f"training episode 1, recorded frames, {len(drawn[1])} frames of {frames.shape[2]}x{frames.shape[1]}"
+        in result.stdout
     )
     assert frames.shape[1] % 2 == frames.shape[2] % 2 == 0
     if ending == ".webp":  # equal frames are one, shown for longer
@@ -114,12 +116,23 @@ def test_every_world_becomes_a_film(pictured, tmp_path, world):
 
 
 def test_values_and_their_reason_are_shown(tmp_path):
-    with runner.record(make("Blackjack-v1"), tmp_path / "runs") as rec:
+    with runner.record(Rooms(), tmp_path / "runs") as rec:
         list(play(rec, 30))
-    result = film(rec.run.recording, "--episode", 2, "-o", tmp_path / "film.webm")
+    result = film(rec.run.recording, "--episode", 1, "-o", tmp_path / "film.webm")
     assert result.exit_code == 0, result.output
-    assert "The film shows values, because" in result.stderr
-    assert len(frames_of(tmp_path / "film.webm")) >= 2
+    assert "The film shows values: " in result.stderr
+    with open_recording(rec.run.recording) as recording:
+        assert len(frames_of(tmp_path / "film.webm")) == len(recording.episode_steps("train", 1)) + 1
+
+
+def test_a_film_ends_with_a_note_where_the_environment_differs(tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path / "runs") as rec:
+        list(play(rec, 120))
+    other = made_otherwise(rec.run.recording, tmp_path / "other.mcap", max_episode_steps=4)
+    result = film(other, "--episode", 0, "-o", tmp_path / "film.mp4")
+    assert result.exit_code == 1
+    assert "At step 4 the environment differs from the recording: truncated" in result.stderr
+    assert len(frames_of(tmp_path / "film.mp4")) == 5
 
 
 def test_best_and_worst_are_chosen_by_return(pictured, tmp_path):
@@ -140,7 +153,7 @@ def test_without_evaluations_training_episodes_are_ranked(pole, tmp_path):
     result = film(run.recording, "--best", "-o", tmp_path / "film.mp4")
     with open_recording(run.recording) as recording:
         best = recording.episodes("train")["returns"].sum(axis=1).argmax()
-    assert f"training episode {best}, {len(drawn[best])} frames" in result.stdout
+    assert f"training episode {best}, recorded frames, {len(drawn[best])} frames" in result.stdout
 
 
 def test_a_grid_shows_episodes_from_best_to_worst_side_by_side(pole, tmp_path):
@@ -173,7 +186,7 @@ def test_a_grid_larger_than_the_run_has_empty_cells(pictured, tmp_path):
 
 
 def test_an_episode_that_never_ended_is_shown_up_to_its_last_step(tmp_path):
-    env = runner.record(make("FrozenLake-v1"), tmp_path / "runs")
+    env = runner.record(gymnasium.make("FrozenLake-v1"), tmp_path / "runs")
     env.reset(seed=0)
     env.step(1)
     env._loop.close("interrupted")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control.cartpole import CartPoleEnv
 from PIL import Image
 
 import runner
@@ -13,6 +16,7 @@ from runner.drawing.svg import Drawing
 from runner.errors import RecordingError
 from runner.export.pictures import Source, pictures
 from runner.recording.reader import open_recording
+from tests.runner.export.making import made_otherwise
 from tests.runner.loops.making import Rooms, make, play
 
 
@@ -81,24 +85,95 @@ def test_recorded_frames_are_those_that_the_environment_drew(tmp_path):
 
 
 def test_a_frame_is_shown_until_the_next_recorded_one(tmp_path):
-    recording, drawn = recorded(
-        tmp_path, gymnasium.make("CartPole-v1", render_mode="rgb_array"), frames_every=4
-    )
+    recording, drawn = recorded(tmp_path, Rooms(), frames_every=4)
     with recording:
         for episode, frames in enumerate(drawn[:-1]):
+            shown = pictures(recording, "train", episode)
+            assert shown.source is Source.RECORDED
+            assert "gymnasium.make" in shown.reason  # which is why it is not drawn again
             last = len(frames) - 1
             expected = [frames[t if t == last else t - t % 4] for t in range(last + 1)]
-            np.testing.assert_array_equal(
-                [one.pixels for one in pictures(recording, "train", episode)], expected
-            )
+            np.testing.assert_array_equal([picture.pixels for picture in shown], expected)
+
+
+DRAWN_AGAIN = {
+    "CartPole": ("CartPole-v1", {}, 0),
+    "with a frame now and then": ("CartPole-v1", {"frames_every": 5}, 0),
+    "LunarLander": ("LunarLander-v3", {}, 0),
+    "Blackjack": ("Blackjack-v1", {}, 0),
+    "Pong": ("ALE/Pong-v5", {}, 30),
+}
+
+
+@pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")  # of Box2D when it is imported
+@pytest.mark.parametrize("case", DRAWN_AGAIN)
+def test_pictures_drawn_again_are_those_of_the_environment(tmp_path, case):
+    env_id, options, steps = DRAWN_AGAIN[case]
+    if env_id.startswith("ALE/"):
+        gymnasium.register_envs(pytest.importorskip("ale_py"))
+    recording, drawn = recorded(
+        tmp_path, gymnasium.make(env_id, render_mode="rgb_array"), steps or 150, **options
+    )
+    with recording:
+        for episode in {0, min(1, len(drawn) - 1)}:
+            with contextlib.closing(pictures(recording, "train", episode)) as shown:
+                assert (shown.source, shown.reason) == (Source.REDRAWN, "")
+                np.testing.assert_array_equal([picture.pixels for picture in shown], drawn[episode])
+
+
+def own_pole(render_mode=None):
+    """Return an environment that this function alone makes."""
+    return CartPoleEnv(render_mode=render_mode)
+
+
+def test_what_a_recording_names_is_imported_if_it_is_trusted_only(tmp_path):
+    with runner.record(own_pole(), tmp_path, make=own_pole) as rec:
+        list(play(rec, 60))
+    with open_recording(rec.run.recording) as recording:
+        shown = pictures(recording, "train", 0)
+        assert shown.source is Source.VALUES
+        assert "--trust" in shown.reason
+        with contextlib.closing(pictures(recording, "train", 0, trust=True)) as shown:
+            assert shown.source is Source.REDRAWN
+            assert next(shown).pixels.shape == (400, 600, 3)
+
+
+def test_pictures_end_with_a_note_where_the_environment_differs(tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path / "runs") as rec:
+        list(play(rec, 120))
+    other = made_otherwise(rec.run.recording, tmp_path / "other.mcap", max_episode_steps=5)
+    with open_recording(other) as recording:
+        shown = list(pictures(recording, "train", 0))
+        steps = recording.episode_steps("train", 0)
+        later = pictures(recording, "train", 1)  # its reset needs those before it
+    assert later.source is Source.VALUES
+    assert "before, at train episode 0, t 4: truncated" in later.reason
+    expected = "At step 5 the environment differs from the recording: truncated: recorded False, got True."
+    assert shown[-1].note == expected
+    assert [picture.t for picture in shown] == list(range(6))
+    assert not any(picture.note for picture in shown[:-1])
+    np.testing.assert_array_equal(shown[-1].pixels, shown[-2].pixels)
+    assert shown[-1].returns[0] == steps["rewards"][:5].sum()
+
+
+@pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")  # of Box2D when it is imported
+def test_values_are_shown_where_the_environment_begins_otherwise(tmp_path):
+    with runner.record(gymnasium.make("LunarLander-v3"), tmp_path / "runs") as rec:
+        list(play(rec, 150))
+    other = made_otherwise(rec.run.recording, tmp_path / "other.mcap", kwargs={"gravity": -5.0})
+    with open_recording(other) as recording:
+        shown = pictures(recording, "train", 0)
+        assert shown.source is Source.VALUES
+        assert "first observation" in shown.reason
+        assert len(list(shown)) == len(recording.episode_steps("train", 0)) + 1
 
 
 def test_values_are_drawn_as_bars_that_follow_them(tmp_path):
-    recording, _ = recorded(tmp_path, make("CartPole-v1"))
+    recording, _ = recorded(tmp_path, CartPoleEnv())
     with recording:
         shown = pictures(recording, "train", 0)
         assert shown.source is Source.VALUES
-        assert "no frames were recorded" in shown.reason
+        assert "gymnasium.make" in shown.reason
         frames = [picture.pixels for picture in shown]
         values = recording.episode_steps("train", 0)["next_observation"][:, 2]
     blue = [(frame[50:70] == [0, 0x72, 0xB2]).all(axis=2).sum() for frame in frames[1:]]
@@ -129,7 +204,10 @@ def test_games_and_vectors_have_pictures(tmp_path):
         game.step(dict.fromkeys(game.agents, 1))
     game.close()
     with open_recording(game.run.recording) as recording:
-        last = list(pictures(recording, "train", 0))[-1]
+        shown = pictures(recording, "train", 0)
+        assert shown.source is Source.REDRAWN
+        last = list(shown)[-1]
+        assert last.pixels.shape == (700, 700, 3)
         assert last.action == "agent_0 1, agent_1 1, agent_2 1"
         assert len(last.returns) == 3
         np.testing.assert_allclose(last.returns, recording.episodes("train")[0]["returns"])

@@ -176,7 +176,7 @@ def test_the_grid_of_a_loop_becomes_a_film(folder, tmp_path):
     assert done.exit_code == 0, done.output
     with open_recording(runner.find_run("lake", folder).recording) as recording:
         steps = len(recording.episode_steps("train", 2))
-    assert f"training episode 2, {steps + 1} frames" in done.stdout
+    assert f"training episode 2, scene, {steps + 1} frames" in done.stdout
 
 
 def test_an_evaluation_of_a_loop_is_played(folder):

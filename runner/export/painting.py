@@ -1,0 +1,185 @@
+"""The pictures of an episode's states, by what they are made from: T + 1 of them for an episode of T steps.
+
+Each function is a generator of pictures, uint8 [height, width, 3] of one size; close it to free what it uses.
+"""
+
+from __future__ import annotations
+
+import io
+from collections import deque
+from collections.abc import Generator, Iterator, Mapping
+from contextlib import closing
+from itertools import chain
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.drawing import svg
+from runner.drawing.bars import BarRaster
+from runner.drawing.raster import Pixels, SceneRaster
+from runner.errors import RecordingError
+from runner.export.values import Values
+from runner.recording import schema
+from runner.recording.reader import Recording
+from runner.replay.environment import redo_in_child
+from runner.replay.steps import check_steps, reset_of, transitions_of
+
+SCENE_SIZE: Final = 480
+"""The largest width and height of the picture of a scene."""
+MAX_PIXELS: Final = 4096 * 4096
+"""The most pixels of a recorded frame."""
+_END_OF_TIME: Final = 2**62
+"""Later than any message, in nanoseconds."""
+
+Painted = Generator[Pixels, None, None]
+
+
+class EnvironmentDiffers(Exception):
+    """An environment that was made again does not do what was recorded; the message is where."""
+
+
+def paint_scene(recording: Recording, phase: str, episode: int) -> Painted:
+    """Draw the scene in each state, with the way that led there."""
+    mdp = recording.mdp
+    drawing = svg.drawing_of(mdp)
+    assert drawing is not None
+    raster = SceneRaster(drawing, SCENE_SIZE, SCENE_SIZE)
+    places: deque[NDArray[np.int16]] = deque(maxlen=svg.TRAIL)
+    for t, row in enumerate(transitions_of(recording, phase, episode)):
+        check_steps(np.asarray(row).reshape(1), mdp, str(recording.path), schema.PHASE_NAMES[phase])
+        for state in (row["next_state"],) if t else (row["state"], row["next_state"]):
+            places.append(drawing.places(mdp, np.array([state]))[0])
+            yield raster.draw(np.stack(places))
+
+
+def paint_recorded(recording: Recording, phase: str, episode: int) -> Painted:
+    """Show the last frame that was recorded up to each step."""
+    every, reset = frames_every(recording), reset_of(recording, phase, episode)
+    steps = transitions_of(recording, phase, episode)
+    first_step = next(steps)
+    start = int((first_step if reset is None else reset)["log_time"])
+    frames = recording.decoded(recording.topic(f"/{phase}/frame"), times=range(start, _END_OF_TIME))
+    following = next(frames, None)
+    shown: Pixels | None = None
+    for t, row in enumerate(chain([first_step, first_step], steps)):
+        time = int(row["log_time"])
+        while following is not None and following["log_time"] < time:
+            shown, following = _pixels(recording, following, shown), next(frames, None)
+        # The frame of the reset is the last one before the first step. One at the time of the last step may
+        # be that of the next reset.
+        is_recorded = t > 0 and (row["terminated"] or row["truncated"] or t % every == 0)
+        if is_recorded and following is not None and following["log_time"] == time:
+            shown, following = _pixels(recording, following, shown), next(frames, None)
+        if shown is None:
+            raise RecordingError(f"{recording.path}: the first frame of {phase} episode {episode} is lost.")
+        yield shown
+
+
+def frames_every(recording: Recording) -> int:
+    """Return after how many steps of an episode a frame was recorded, as its configuration says."""
+    frames = recording.config.get("frames")
+    every = frames.get("every") if isinstance(frames, Mapping) else None
+    return every if isinstance(every, int) and every > 0 else 1
+
+
+def _pixels(recording: Recording, frame: Mapping[str, Any], before: Pixels | None) -> Pixels:
+    """Return a recorded frame in the size of the one before it, if there is one.
+
+    Raises:
+        RecordingError: it is no picture, or too large.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    where = f"{recording.path}: the frame at {frame['log_time']} ns"
+    try:
+        with Image.open(io.BytesIO(frame["data"]), formats=("PNG", "JPEG")) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise RecordingError(f"{where}: has {image.width}x{image.height} pixels, too many to show.")
+            picture = image.convert("RGB")
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
+        raise RecordingError(f"{where}: cannot be shown ({error}).") from error
+    return _like(np.asarray(picture), before)
+
+
+def _like(pixels: Pixels, before: Pixels | None) -> Pixels:
+    """Return a picture in the size of the one before it, if there is one."""
+    from PIL import Image
+
+    if before is None or pixels.shape == before.shape:
+        return pixels
+    return np.asarray(Image.fromarray(pixels).resize(before.shape[1::-1]))
+
+
+def paint_redrawn(recording: Recording, phase: str, episode: int, trust: bool = False) -> Painted:
+    """Draw each state by the environment, made again in a child process and compared with the recording.
+
+    Raises:
+        CannotRedo: the environment cannot be made again, or draws no pictures.
+        EnvironmentDiffers: it differs from the recording, of which no picture comes after that step.
+    """
+    blocks: Any = redo_in_child(recording.path, phase, [episode], render=True, trust=trust)
+    shown: Pixels | None = None
+    with closing(blocks):
+        for steps in blocks:
+            differs = steps.difference
+            frames = [start.frame for start in steps.starts if start.frame is not None]
+            frames += steps.frames
+            if differs is not None:  # the last of them is not a picture of what was recorded
+                frames = frames[:-1]
+            for frame in frames:
+                shown = _like(frame, shown)
+                yield shown
+            if differs is not None and (differs.phase, differs.episode) != (phase, episode):
+                raise EnvironmentDiffers(f"The environment differs from the recording before, at {differs}.")
+            if differs is not None:
+                raise EnvironmentDiffers(
+                    f"At step {differs.t + 1:,} the environment differs from the recording: {differs.field}: "
+                    f"recorded {differs.recorded}, got {differs.got}."
+                )
+
+
+def paint_observation(recording: Recording, phase: str, episode: int) -> Painted:
+    """Show the image in each observation."""
+    values = Values(recording.spaces["observation"], "observation")
+    reset = reset_of(recording, phase, episode)
+    for t, row in enumerate(transitions_of(recording, phase, episode)):
+        if t == 0:
+            yield values.pixels_in(row["next_observation"] if reset is None else reset["observation"])
+        yield values.pixels_in(row["next_observation"])
+
+
+def paint_values(recording: Recording, phase: str, episode: int) -> Painted:
+    """Draw the numbers of each observation and the rewards as bars, each on a scale of its own."""
+    learners = recording.agents
+    names = [f"reward {agent}" for agent in learners] if len(learners) > 1 else ["reward"]
+    unpaid = np.full(len(names), np.nan)
+    if recording.kind in ("job", "step"):
+        names = ["state", *names]
+
+        def numbers() -> Iterator[NDArray[np.float64]]:
+            for t, row in enumerate(transitions_of(recording, phase, episode)):
+                if t == 0:
+                    yield np.append(row["state"], unpaid)
+                yield np.append(row["next_state"], row["rewards"])
+
+    else:
+        values = Values(recording.spaces["observation"], "observation")
+        reset = reset_of(recording, phase, episode)
+        unknown = np.full(len(values.names), np.nan)
+        names = [*values.names, *names]
+
+        def numbers() -> Iterator[NDArray[np.float64]]:
+            for t, row in enumerate(transitions_of(recording, phase, episode)):
+                if t == 0:
+                    first = unknown if reset is None else values.numbers_in(reset["observation"])
+                    yield np.append(first, unpaid)
+                yield np.append(values.numbers_in(row["next_observation"]), row["rewards"])
+
+    low = high = np.zeros(len(names))
+    for now in numbers():
+        finite = np.where(np.isfinite(now), now, np.nan)
+        low, high = np.fmin(low, finite), np.fmax(high, finite)
+    raster = BarRaster(names, low, high)
+    for now in numbers():
+        yield raster.draw(now)
