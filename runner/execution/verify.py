@@ -71,6 +71,8 @@ class Verification:
     """The differences between the recording's provenance and this process's."""
     not_compared: str = ""
     """What of the recording was not compared."""
+    is_loop: bool = False
+    """Whether it is of a user's own loop, whose steps `runner.execution.redo` does again."""
     nothing_yet: bool = False
     """Whether the run was interrupted before it recorded anything."""
 
@@ -265,19 +267,19 @@ def _compare_result(found: Verification, recording: Recording, expected: dict[st
 
 
 def _verify_loop(recording: Recording) -> Verification:
-    """Verify the recording of a user's own loop, which cannot be run again here.
+    """Verify the recording of a user's own loop; `runner.execution.redo` does its steps again.
 
     Compared are the numbers of its messages, its steps with the environment's outcomes where it is tabular,
     steps, resets and episodes with one another, and its digest with its messages.
     """
     finished = "content_digest" in recording.result
-    notes = ["recorded from a loop, which alone can repeat it: its steps were not recomputed"]
-    notes += [] if finished else [_NOT_COMPLETE]
+    notes = [] if finished else [_NOT_COMPLETE]
     found = Verification(
         recording.path,
         train_steps=recording.count(schema.TRAIN_STEP),
         eval_steps=recording.count(schema.EVAL_STEP),
         not_compared=LOOP_NOT_COMPARED,
+        is_loop=True,
     )
     try:
         _compare_names(recording)

@@ -12,6 +12,7 @@ limits on memory and time. Whether a recording can be done again is for `runner.
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
@@ -114,13 +115,40 @@ def redo_in_child(
         RecordingError: see `redo`.
     """
     arguments = {"render": render, "trust": trust, "tolerance": tolerance}
+    for found in stream_from_child(
+        _redo_path, path, phase, episodes, seconds=seconds, memory_bytes=memory_bytes, **arguments
+    ):
+        if isinstance(found, int):
+            report(found)
+        else:
+            yield found
+
+
+def stream_from_child(
+    function: Callable[..., None],
+    path: Path,
+    *arguments: Any,
+    seconds: float = SECONDS,
+    memory_bytes: int = MEMORY_BYTES,
+    **keywords: Any,
+) -> Iterator[Any]:
+    """Yield what a function that runs foreign code passes to `report_progress` in a child process.
+
+    Args:
+        function: of a module; called with the path and the other arguments.
+        path: of a recording.
+        arguments: for the function.
+        seconds: how long it may take for each value.
+        memory_bytes: how much the process may allocate.
+        keywords: for the function.
+
+    Raises:
+        CannotRedo: the process hangs, crashes or needs more memory.
+        RunnerError: the function raised it.
+    """
     with ChildProcess(memory_bytes) as child:
         try:
-            for found in child.stream(_redo_path, seconds, path, phase, episodes, **arguments):
-                if isinstance(found, int):
-                    report(found)
-                else:
-                    yield found
+            yield from child.stream(_quietly, seconds, function, path, *arguments, **keywords)
         except TimedOut:
             raise CannotRedo(
                 f"The environment took longer than {seconds:g} s to be made or stepped, and was stopped."
@@ -129,11 +157,17 @@ def redo_in_child(
             raise CannotRedo(f"The environment ended its process: {error}") from error
 
 
-def _redo_path(
-    path: Path, phase: str | None, episodes: Sequence[int] | None, **arguments: bool | float
-) -> None:
-    """Pass the redone steps of a recording to the process that called this one."""
+def _quietly(function: Callable[..., None], *arguments: Any, **keywords: Any) -> None:
+    """Call a function in a child process, without what environments print: it would be mixed with results."""
     warnings.simplefilter("ignore")
+    with open(os.devnull, "wb") as nothing:  # noqa: PTH123 - a device
+        for stream in (1, 2):
+            os.dup2(nothing.fileno(), stream)
+    function(*arguments, **keywords)
+
+
+def _redo_path(path: Path, phase: str | None, episodes: Sequence[int] | None, **arguments: Any) -> None:
+    """Pass the redone steps of a recording to the process that called this one."""
     with open_recording(path) as recording:
-        for steps in redo(recording, phase, episodes, report=report_progress, **arguments):  # type: ignore[arg-type]
+        for steps in redo(recording, phase, episodes, report=report_progress, **arguments):
             report_progress(steps)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -11,13 +12,14 @@ import click
 from runner.cli import Command
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json
-from runner.cli.progress import bytes_line
+from runner.cli.progress import bytes_line, count_line
 from runner.cli.runs import command_for, find_recording, job_progress, require_over
 from runner.errors import Diverged, ExitCode
 from runner.runs.locking import locked
 from runner.util.humanize import UNKNOWN, size
 
 if TYPE_CHECKING:
+    from runner.execution.redo import Redone
     from runner.execution.verify import Verification
     from runner.recording.repair import Repair
     from runner.runs.run import Run
@@ -25,20 +27,44 @@ if TYPE_CHECKING:
 
 @click.command("verify", cls=Command)
 @run_argument
-@click.option("--rerun", is_flag=True, help="Compare with the installed environment.")
+@click.option(
+    "--rerun/--no-rerun",
+    default=None,
+    help="Run it again in the installed environment; by default loops only, where that is possible.",
+)
+@click.option("--sample", type=click.IntRange(1), help="Do only N episodes of a loop again, evenly spread.")
+@click.option(
+    "--tolerance",
+    type=click.FloatRange(0, 1),
+    default=0.0,
+    help="Accept this absolute and relative difference of a loop's observations and rewards.",
+)
+@click.option("--trust", is_flag=True, help="Import what the recording names to make its environment.")
 @recordings_option
 @json_option
 @click.pass_context
 def verify_command(
-    ctx: click.Context, run_name: str, rerun: bool, recordings: Path | None, as_json: bool
+    ctx: click.Context,
+    run_name: str,
+    rerun: bool | None,
+    sample: int | None,
+    tolerance: float,
+    trust: bool,
+    recordings: Path | None,
+    as_json: bool,
 ) -> None:
     """Check RUN, or a recording by its path: every byte, step, episode, figure and table.
 
-    The run is trained again in memory, with the environment in the recording, and compared. The first
-    difference is named: topic, episode, step, field, what was found and what was expected. With --rerun the
-    run is trained with the installed environment: the verdict says whether it can be reproduced here, and if
-    not, at which step it diverges and what differs: packages, processor, code. It also compares how the
-    recording describes its environment: scene and names.
+    A run that was trained here is trained again in memory, with the environment in the recording, and
+    compared. The first difference is named: topic, episode, step, field, what was found and what was
+    expected. With --rerun the run is trained with the installed environment: the verdict says whether it can
+    be reproduced here, and if not, at which step it diverges and what differs: packages, processor, code. It
+    also compares how the recording describes its environment: scene and names.
+
+    A loop's environment is made again, in a process with limits, and takes the recorded resets and actions:
+    every observation, reward and end is compared. Only installed packages of environments are imported;
+    --trust allows all that the recording names. Where the environment cannot be had, or depends on more than
+    its seed, the verdict says why; that is an error with --rerun only. --no-rerun leaves it out.
 
     A run that was interrupted before it recorded anything is neither sound nor wrong: there is nothing to
     verify yet.
@@ -48,8 +74,10 @@ def verify_command(
     Examples:
       dualtaxi verify @latest
       dualtaxi verify k3v9m2xq --rerun
+      dualtaxi verify k3v9m2xq --sample 20 --tolerance 1e-6
       dualtaxi verify backup/recording.mcap --json
     """
+    from runner.execution.redo import verify_by_redoing
     from runner.execution.verify import damage_of, verify
 
     path, run = find_recording(run_name, recordings)
@@ -58,13 +86,59 @@ def verify_command(
     with bytes_line("reading") as reading:
         damage = damage_of(path, reading)
     with job_progress("verifying", episodes) as (report, _):
-        found = verify(path, rerun, report, damage)
+        found = verify(path, bool(rerun), report, damage)
+    redone = None
+    if found.is_loop and found.sound and not found.nothing_yet and rerun is not False:
+        steps = found.train_steps + found.eval_steps
+        with count_line("steps done again", 0 if sample else steps) as count:
+            redone = verify_by_redoing(path, sample, tolerance, trust, count)
     if as_json:
-        print_json(_verification_as_json(found, rerun))
+        print_json(_verification_as_json(found, bool(rerun)) | {"redone": redone and _redone_as_json(redone)})
     else:
-        draw(facts(_verification(found, rerun)))
-    if not found.sound:
+        draw(facts(_verification(found, bool(rerun)) | (_redone(redone) if redone else {})))
+    is_missing = redone is not None and redone.verdict == "impossible" and rerun is True
+    if not found.sound or is_missing or (redone is not None and redone.verdict == "differs"):
         ctx.exit(ExitCode.DIFFERENT)
+
+
+def _redone(redone: Redone) -> dict[str, str]:
+    """Return what came of doing a loop again, as rows."""
+    compared = f"{redone.episodes:,} episodes, {redone.steps:,} steps"
+    if redone.of_episodes is not None:
+        compared = f"{redone.episodes:,} of {redone.of_episodes:,} episodes, {redone.steps:,} steps"
+    exactness = f"within {redone.tolerance:g}" if redone.tolerance else "every byte"
+    rows = {"verdict": f"reproduced: {compared}, {exactness}"}
+    if redone.verdict == "differs":
+        rows = {"verdict": "differs", "first": str(redone.difference)}
+        rows["compared"] = f"{compared}, {exactness}"
+    elif redone.verdict == "impossible":
+        rows = {"verdict": "sound; it cannot be reproduced here", "reason": redone.reason}
+        rows["first"] = str(redone.difference or "")
+    notes = [
+        f"{wrapper}: its arguments were not recorded; the default ones were taken"
+        for wrapper in redone.assumed
+    ]
+    if redone.left_out:
+        notes.append(
+            f"{redone.left_out:,} steps were left out: the random generators before them are not known"
+        )
+    rows["done again"] = "\n".join(notes)
+    if redone.verdict != "reproduced":
+        rows["differs"] = "\n".join(
+            f"{name}: {then or 'unknown'} then, {now or 'unknown'} here"
+            for name, (then, now) in redone.versions.items()
+        )
+        if redone.verdict == "differs" and not redone.versions:
+            rows["differs"] = "no version: the same packages and platform as recorded"
+    return {key: text for key, text in rows.items() if text}
+
+
+def _redone_as_json(redone: Redone) -> dict[str, Any]:
+    values = asdict(redone)
+    return values | {
+        "assumed": list(redone.assumed),
+        "versions": {key: {"then": then, "here": here} for key, (then, here) in redone.versions.items()},
+    }
 
 
 def _verdict(found: Verification, rerun: bool) -> str:

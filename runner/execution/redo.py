@@ -1,0 +1,197 @@
+"""Verify a loop by doing it again: its environment takes the recorded actions, and every result is compared.
+
+This shows that the recorded returns were really obtained, whoever or whatever chose the actions.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import platform
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+
+from runner.errors import CannotRedo, RecordingError
+from runner.recording import schema
+from runner.recording.maker import EnvironmentMaker
+from runner.recording.reader import Recording, open_recording
+from runner.replay.capabilities import why_not_redone
+from runner.replay.comparing import Difference
+from runner.replay.engine import Replay
+from runner.replay.environment import MEMORY_BYTES, SECONDS, redo, stream_from_child
+from runner.runs.provenance import Differences
+from runner.util.processes import report_progress
+
+Report = Callable[[int], None]
+_OUTSIDE: Final = (
+    "The environment gives other results each time for the same seed and actions: it depends on more than "
+    "its seed, such as the global random generators, the clock or threads."
+)
+
+
+@dataclass(frozen=True)
+class Redone:
+    """What came of doing the episodes of a loop again."""
+
+    verdict: Literal["reproduced", "differs", "impossible"]
+    episodes: int = 0
+    """Episodes that were compared."""
+    steps: int = 0
+    """Steps that were compared; all before the first difference were equal."""
+    left_out: int = 0
+    """Steps that could not be compared: the random generators' state at their beginning was not recorded."""
+    difference: Difference | None = None
+    """The first difference; of an impossible verdict that with which the environment was found out."""
+    reason: str = ""
+    """Why it is impossible, as a sentence."""
+    of_episodes: int | None = None
+    """Of how many episodes those compared are a sample; None if all were to be compared."""
+    tolerance: float = 0.0
+    """Absolute and relative, for floating-point values; 0 if bytes were compared."""
+    assumed: tuple[str, ...] = ()
+    """The wrappers whose arguments were not recorded: their default values were taken."""
+    versions: Differences = field(default_factory=dict)
+    """The packages, and the platform, that are others than recorded."""
+
+
+def verify_by_redoing(
+    path: Path,
+    sample: int | None = None,
+    tolerance: float = 0.0,
+    trust: bool = False,
+    report: Report = lambda _: None,
+    seconds: float = SECONDS,
+    memory_bytes: int = MEMORY_BYTES,
+) -> Redone:
+    """Do the episodes of a loop again, in a child process with limits, and compare every step.
+
+    Args:
+        path: of the recording.
+        sample: how many episodes to do again, at even distances; None for all that happened.
+        tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
+        trust: whether what the recording names may be imported, see `runner.replay.makers`.
+        report: called with the number of steps taken so far.
+        seconds: how long a block of steps may take, which is meant to take 0.2 s.
+        memory_bytes: how much the process may allocate.
+
+    Raises:
+        RecordingError: the recording is damaged.
+    """
+    result = Redone("impossible", tolerance=tolerance)
+    with open_recording(path) as recording:
+        if reason := why_not_redone(recording, trust):
+            return replace(result, reason=reason)
+        if recording.maker is not None:
+            result = replace(
+                result, versions=_other_versions(recording.maker), assumed=recording.maker.assumed
+            )
+    try:
+        for found in stream_from_child(
+            _compare, path, sample, tolerance, trust, seconds=seconds, memory_bytes=memory_bytes
+        ):
+            if isinstance(found, int):
+                report(found)
+            else:
+                result = replace(found, versions=result.versions, assumed=result.assumed)
+    except CannotRedo as error:
+        return replace(result, reason=str(error))
+    return result
+
+
+def _compare(path: Path, sample: int | None, tolerance: float, trust: bool) -> None:
+    """Report the number of steps taken, and at last the result; runs in a child process."""
+    with open_recording(path) as recording:
+        if sample is None:
+            found = _compare_all(recording, tolerance, trust)
+        else:
+            found = _compare_sample(recording, sample, tolerance, trust)
+        if found.difference is not None and not _is_repeatable(recording, found, trust):
+            found = replace(found, verdict="impossible", reason=_OUTSIDE)
+    report_progress(found)
+
+
+def _compare_all(recording: Recording, tolerance: float, trust: bool) -> Redone:
+    found = Redone("reproduced", tolerance=tolerance)
+    with closing(Replay(recording, trust, tolerance, report_progress, render=False)) as replay:
+        for steps in replay.all():
+            found = replace(
+                found,
+                episodes=found.episodes + int(np.count_nonzero(steps.t == 0)),
+                steps=found.steps + len(steps),
+                difference=steps.difference,
+            )
+        found = replace(found, left_out=replay.skipped)
+    if found.difference is not None:
+        return replace(found, verdict="differs")
+    if not found.steps:
+        reason = "No reset had a seed, and the state of the random generators was not recorded."
+        return replace(found, verdict="impossible", reason=reason)
+    return found
+
+
+def _compare_sample(recording: Recording, sample: int, tolerance: float, trust: bool) -> Redone:
+    """Compare some episodes, at even distances, of training and evaluation together."""
+    ended = [
+        (phase, number)
+        for phase in schema.PHASES
+        for number in range(recording.count(recording.topic(f"/{phase}/episode")))
+    ]
+    places = np.unique(np.linspace(0, len(ended) - 1, min(sample, len(ended))).round().astype(int))
+    found = Redone("reproduced", of_episodes=len(ended), tolerance=tolerance)
+    reason = "No episode ended."
+    for phase, number in (ended[place] for place in places):
+        taken = found.steps
+
+        def report(steps: int, taken: int = taken) -> None:
+            report_progress(taken + steps)
+
+        try:
+            for steps in redo(recording, phase, [number], trust=trust, tolerance=tolerance, report=report):
+                found = replace(found, steps=found.steps + len(steps), difference=steps.difference)
+        except CannotRedo as error:
+            reason = str(error)
+            span = recording.episode_span(phase, number)
+            found = replace(found, left_out=found.left_out + len(span))
+            continue
+        found = replace(found, episodes=found.episodes + 1)
+        if found.difference is not None:
+            return replace(found, verdict="differs")
+    return found if found.episodes else replace(found, verdict="impossible", reason=reason)
+
+
+def _is_repeatable(recording: Recording, found: Redone, trust: bool) -> bool:
+    """Return whether the environment differs in the same way when it is done again once more."""
+    first = found.difference
+    assert first is not None
+
+    def report(_: int) -> None:
+        report_progress(found.steps)
+
+    episodes = None if first.episode is None else [first.episode]
+    with contextlib.suppress(RecordingError):  # an episode without steps
+        for steps in redo(
+            recording, first.phase, episodes, trust=trust, tolerance=found.tolerance, report=report
+        ):
+            if steps.difference is not None:
+                return steps.difference == first
+    return False
+
+
+def _other_versions(maker: EnvironmentMaker) -> Differences:
+    """Return the packages that determine what the environment does, where they are others than recorded."""
+    here = {name: _version(name) for name in maker.packages}
+    here |= {"platform": platform.platform(), "machine": platform.machine()}
+    recorded = {**maker.packages, "platform": maker.platform, "machine": maker.machine}
+    return {name: (recorded[name], here[name]) for name in recorded if recorded[name] != here[name]}
+
+
+def _version(distribution: str) -> str:
+    try:
+        return importlib.metadata.version(distribution)
+    except (importlib.metadata.PackageNotFoundError, ValueError):
+        return "not installed"
