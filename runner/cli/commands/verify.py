@@ -92,12 +92,13 @@ def verify_command(
         steps = found.train_steps + found.eval_steps
         with count_line("steps done again", 0 if sample else steps) as count:
             redone = verify_by_redoing(path, sample, tolerance, trust, count)
+    with_installed = bool(rerun) and not found.is_loop
     if as_json:
-        print_json(_verification_as_json(found, bool(rerun)) | {"redone": redone and _redone_as_json(redone)})
+        print_json(_verification_as_json(found, with_installed) | (_redone_as_json(redone) if redone else {}))
     else:
-        draw(facts(_verification(found, bool(rerun)) | (_redone(redone) if redone else {})))
-    is_missing = redone is not None and redone.verdict == "impossible" and rerun is True
-    if not found.sound or is_missing or (redone is not None and redone.verdict == "differs"):
+        draw(facts(_verification(found, with_installed) | (_redone(redone) if redone else {})))
+    failures = ("differs", "impossible") if rerun else ("differs",)
+    if not found.sound or (redone is not None and redone.verdict in failures):
         ctx.exit(ExitCode.DIFFERENT)
 
 
@@ -114,10 +115,7 @@ def _redone(redone: Redone) -> dict[str, str]:
     elif redone.verdict == "impossible":
         rows = {"verdict": "sound; it cannot be reproduced here", "reason": redone.reason}
         rows["first"] = str(redone.difference or "")
-    notes = [
-        f"{wrapper}: its arguments were not recorded; the default ones were taken"
-        for wrapper in redone.assumed
-    ]
+    notes = [f"{wrapper}: made with default arguments, as its own were unknown" for wrapper in redone.assumed]
     if redone.left_out:
         notes.append(
             f"{redone.left_out:,} steps were left out: the random generators before them are not known"
@@ -134,11 +132,9 @@ def _redone(redone: Redone) -> dict[str, str]:
 
 
 def _redone_as_json(redone: Redone) -> dict[str, Any]:
-    values = asdict(redone)
-    return values | {
-        "assumed": list(redone.assumed),
-        "versions": {key: {"then": then, "here": here} for key, (then, here) in redone.versions.items()},
-    }
+    versions = {key: {"then": then, "here": here} for key, (then, here) in redone.versions.items()}
+    verdict = {} if redone.verdict == "impossible" else {"verdict": redone.verdict}
+    return verdict | {"redone": asdict(redone) | {"assumed": list(redone.assumed), "versions": versions}}
 
 
 def _verdict(found: Verification, rerun: bool) -> str:
@@ -183,6 +179,7 @@ def _verification_as_json(found: Verification, rerun: bool) -> dict[str, Any]:
         "content_digest": found.content_digest or None,
         "notes": list(found.notes),
         "not_compared": found.not_compared or None,
+        "redone": None,
         "provenance": {key: {"then": then, "here": here} for key, (then, here) in found.provenance.items()},
     }
 
