@@ -7,7 +7,6 @@ import os
 import sys
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Generic, Literal, Self
 
 import gymnasium
@@ -243,7 +242,7 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
             self._loop.activate(self._rows)
             self._rows.reset(observation, seed)
             if state is not None:
-                self._messages.reset_state(self._phase, replace(state, reset=self._rows.resets - 1))
+                self._messages.reset_state(self._phase, state._replace(reset=self._rows.resets - 1))
         self._messages.reset_info(self._phase, info, before, seed)
         if self._options.frames_every:
             self._until_frame = self._options.frames_every

@@ -1,14 +1,14 @@
 """What resets without a seed depend on, read from environments without changing them.
 
-Gymnasium's property `np_random` makes a generator where there is none, so only the attributes that it keeps
-are read.
+Gymnasium's property `np_random` makes a generator where there is none, so only the attribute behind it is
+read. Nothing here takes the `__dict__` of an environment: in Python 3.11 this makes its attributes, and so
+its steps, slower for good.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 
-from runner.recording.reset_states import ALE_STEPS_BETWEEN, SEED_BYTES, STEPS_BETWEEN, ResetState
+from runner.recording.reset_states import SEED_BYTES, STEPS_BETWEEN, ResetState
 
 States = dict[int, ResetState]
 """What resets depend on, by the index of the environment."""
@@ -30,19 +30,15 @@ class GeneratorWatch:
     """
 
     def __init__(self, env: Any) -> None:
-        self._attributes: Mapping[str, Any] = getattr(getattr(env, "unwrapped", env), "__dict__", {})
-        ale = self._attributes.get("ale")
-        self._ale: Any = ale if type(ale).__module__.partition(".")[0] == "ale_py" else None
-        self._between = STEPS_BETWEEN if self._ale is None else ALE_STEPS_BETWEEN
+        self._base: Any = getattr(env, "unwrapped", env)
+        self._ale: Any = self._base.ale if is_atari(self._base) else None
+        has_private = isinstance(self._base, gymnasium.Env | VectorEnv)
+        is_computed = isinstance(getattr(type(self._base), "np_random", None), property)
+        self._name = "_np_random" if has_private or is_computed else "np_random"
         self._generator: Any = None
         """The generator at the last reset."""
         self.due: float = 0
         """The number of steps from which on a state is recorded again."""
-
-    def _now(self) -> Any:
-        """Return the generator: of Gymnasium's environments, else of PettingZoo's."""
-        generator = self._attributes.get("_np_random")
-        return self._attributes.get("np_random") if generator is None else generator
 
     def before(self, steps: int) -> ResetState | None:
         """Return what a reset without a seed is going to depend on; None if it is not to be recorded.
@@ -50,14 +46,14 @@ class GeneratorWatch:
         Args:
             steps: the number of steps of the environment so far.
         """
-        generator, last = self._now(), self._generator
+        generator, last = getattr(self._base, self._name, None), self._generator
         self._generator = generator
         if steps < self.due and generator is last:
             return None
         ale_state = b"" if self._ale is None else self._ale.cloneState(include_rng=True).serialize()
         bits = getattr(generator, "bit_generator", None)
         state: Any = bits.state if type(bits) is np.random.PCG64 else None
-        self.due = steps + self._between
+        self.due = steps + STEPS_BETWEEN
         if state is None and not ale_state:
             return None
         return ResetState(bit_generator=state, ale_state=ale_state)
@@ -69,7 +65,7 @@ class GeneratorWatch:
             state: what `before` returned; None for a reset with a seed.
             seed: the seed of the reset.
         """
-        generator, before = self._now(), self._generator
+        generator, before = getattr(self._base, self._name, None), self._generator
         self._generator = generator
         if seed is None and generator is not before and (drawn := seed_of(generator)) is not None:
             return ResetState(np_random_seed=drawn)
@@ -99,7 +95,7 @@ class VectorWatch:
             self._watches = [GeneratorWatch(env) for env in base.envs]
         elif not isinstance(base, AsyncVectorEnv):
             self._watches = [GeneratorWatch(base)]
-        elif isinstance(first, gymnasium.Env) and "ale" not in vars(first.unwrapped):
+        elif isinstance(first, gymnasium.Env) and not is_atari(first.unwrapped):
             self._async = base  # the seed of an Atari environment's generator does not determine its emulator
         self.steps = 0
         """The steps of the vector."""
@@ -136,7 +132,7 @@ class VectorWatch:
         states: States = {}
         for i in which:
             if i < len(self._watches) and (state := self._watches[i].before(self.steps)) is not None:
-                states[i] = replace(state, environment=i)
+                states[i] = state._replace(environment=i)
         return states
 
     def after_reset(self, states: States, which: NDArray[np.bool_], seeds: Sequence[int | None]) -> States:
@@ -154,7 +150,13 @@ class VectorWatch:
             for i, seed in chosen.items()
             if i < len(self._watches)
         }
-        return {i: replace(state, environment=i) for i, state in found.items() if state is not None}
+        return {i: state._replace(environment=i) for i, state in found.items() if state is not None}
+
+
+def is_atari(base: Any) -> bool:
+    """Return whether an environment, without its wrappers, is one of the Arcade Learning Environment."""
+    modules = (kind.__module__.partition(".")[0] for kind in type(base).__mro__)
+    return "ale_py" in modules and hasattr(base, "ale")
 
 
 def seed_of(generator: Any) -> int | None:

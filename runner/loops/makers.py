@@ -1,4 +1,7 @@
-"""How a loop's environment was made: read from the environment, without changing it."""
+"""How a loop's environment was made: read from the environment, without changing it.
+
+Nothing here takes the `__dict__` of an environment, for the reason in `runner.loops.generators`.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
+from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import HumanRendering, OrderEnforcing, PassiveEnvChecker, RecordVideo, TimeLimit
 from gymnasium.wrappers.vector import HumanRendering as VectorHumanRendering
@@ -145,7 +149,8 @@ def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
     try:
         has_function = callable(getattr(sys.modules.get(module), "parallel_env", None))
         foreign = [layer for layer in layers[:-1] if not type(layer).__module__.startswith("pettingzoo.")]
-        if outer is not base and not (has_function and hasattr(outer, "aec_env")):
+        is_converted = getattr(outer, "env", None) is None and hasattr(outer, "aec_env")
+        if outer is not base and not (has_function and is_converted):
             foreign.append(outer)
         if foreign:
             raise _Unknown(f"the wrapper {_class_name(foreign[0])} does not record its arguments")
@@ -171,7 +176,8 @@ def _layers(env: Any) -> Iterator[Any]:
     innermost = getattr(env, "unwrapped", env)
     while env is not innermost and env is not None:
         yield env
-        env = vars(env).get("aec_env", vars(env).get("env"))
+        # PettingZoo's wrappers look up what they do not have inside: `env` comes first.
+        env = getattr(env, "env", None) or getattr(env, "aec_env", None)
     yield innermost
 
 
@@ -196,7 +202,7 @@ def _wrapper_spec(wrapper: Any, assumed: list[str]) -> dict[str, Any]:
     """Return the fields of a `WrapperSpec`; add the wrapper to `assumed` if its arguments are unknown."""
     kind, name = type(wrapper), _class_name(wrapper)
     parameters = inspect.signature(kind).parameters
-    kwargs = vars(wrapper).get("_saved_kwargs")
+    kwargs = getattr(wrapper, "_saved_kwargs", None) if isinstance(wrapper, RecordConstructorArgs) else None
     kwargs = None if kwargs is None else {key: value for key, value in kwargs.items() if key != "env"}
     # A class that inherits from one that records its arguments may have others.
     if kwargs is None or not kwargs.keys() <= parameters.keys():

@@ -84,6 +84,8 @@ class Messages:
         self._series: dict[tuple[str, str], _Series] = {}
         self._numbers: list[tuple[_Series, float, int, int, int]] = []
         """Logged numbers that the recorder does not have yet: series, value, position, step, episode."""
+        self._states: list[tuple[Topic, ResetState, int]] = []
+        """Reset states that it does not have yet, with their positions."""
 
     def log(self, phase: str, name: str, value: Any) -> None:
         """Record a number or a text under a name, at this moment.
@@ -112,7 +114,10 @@ class Messages:
                 self.commit()
 
     def commit(self) -> None:
-        """Hand the logged numbers to the recorder. The caller holds the lock."""
+        """Hand logged numbers and reset states to the recorder. The caller holds the lock."""
+        states, self._states = self._states, []
+        for topic, state, position in states:
+            self._recorder.append(topic, state.to_payload(), position)
         numbers, self._numbers = self._numbers, []
         if numbers:
             payloads = [series.encode(value, step, episode) for series, value, _, step, episode in numbers]
@@ -229,11 +234,9 @@ class Messages:
         return "{" + ", ".join(pieces) + "}"
 
     def reset_state(self, phase: str, state: ResetState) -> None:
-        """Record what a reset depended on, of the reset that was just put down."""
-        with self._loop.lock:
-            if self._loop.records():
-                topic = self._topics[f"/{phase}/reset_state"]
-                self._recorder.append(topic, state.to_payload(), self._loop.position)
+        """Record what a reset depended on, of the reset that was just put down. The caller holds the lock."""
+        if self._loop.records():
+            self._states.append((self._topics[f"/{phase}/reset_state"], state, self._loop.position))
 
     def frame(self, phase: str, image: Any) -> None:
         """Record a picture, [height, width, 3] of uint8; another thread encodes it.

@@ -275,7 +275,7 @@ class RecordedParallel(Recorded[AgentRows]):
             self._loop.activate(self._rows)
             self._rows.reset(result[0], seed)
             if state is not None:
-                self._messages.reset_state(self._phase, replace(state, reset=self._rows.resets - 1))
+                self._messages.reset_state(self._phase, state._replace(reset=self._rows.resets - 1))
         self._messages.reset_info(self._phase, _by_field(result[1]), options, seed)
         return result  # type: ignore[no-any-return]
 

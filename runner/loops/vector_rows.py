@@ -8,7 +8,6 @@ episodes, the resets that environments do by themselves) is computed for a block
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -436,7 +435,7 @@ class VectorRows:
         other = sum(self._recorder.steps.values()) - self._recorder.steps[self._phase]
         for k, state in enumerate(states):
             if state is not None:
-                payload = replace(state, reset=self._reset_count + k).to_payload()
+                payload = state._replace(reset=self._reset_count + k).to_payload()
                 self._recorder.append(self._reset_states, payload, other + int(steps[k]))
         self._reset_count += len(which)
 

@@ -9,17 +9,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.messages import decode, encode
 
-STEPS_BETWEEN: Final = 500
+STEPS_BETWEEN: Final = 1_000
 """The least steps of an environment from one recorded state to the next."""
-ALE_STEPS_BETWEEN: Final = 1_000
-"""The same for an Atari environment: the state of its emulator has some 14 kB."""
 SEED_BYTES: Final = 16
 MAX_ALE_STATE: Final = 1 << 20
 """The most bytes of an emulator's state."""
@@ -27,8 +24,7 @@ _PCG64: Final = struct.Struct("<16s16sII")
 """State, increment, `uinteger`, `has_uint32`."""
 
 
-@dataclass(frozen=True)
-class ResetState:
+class ResetState(NamedTuple):
     """What one reset without a seed depends on.
 
     To repeat the episode that begins with it, call `reset(seed=np_random_seed)` if that is there; otherwise
