@@ -20,6 +20,7 @@ from runner.drawing import svg
 from runner.environments.naming import spoken
 from runner.errors import RecordingError
 from runner.export.contents import flat_text, shortcomings, why_no_steps
+from runner.export.encoded import why_no_pictures
 from runner.export.plots.curves import Plot, footnote, plots_of
 from runner.export.reports.episode import (
     episode_at,
@@ -32,6 +33,7 @@ from runner.export.reports.evaluations import EvaluationTable, evaluation_table
 from runner.export.reports.maps import MapRow, maps_of, stages_of
 from runner.export.reports.playback import MAX_VALUES, playback_of, titled
 from runner.export.reports.rendering import LegendEntry, View, embedded, render, templates
+from runner.export.reports.thumbnails import Thumbnails, thumbnails
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 
@@ -49,6 +51,8 @@ class Replay:
     key: str
     data: str
     """JSON for `replay.js`."""
+    has_frames: bool
+    """Whether it has pictures of the environment."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +143,7 @@ def render_report(
         progress(f"reading run {count} of {len(recordings)}")
         with open_recording(path) as recording:
             series.append(read_series(recording))
-            runs.append(_run(recording, len(runs), chosen))
+            runs.append(_run(recording, len(runs), chosen, progress))
     progress("drawing")
     groups = groups_of(series)
     legend = [LegendEntry("", group.described) for group in groups]
@@ -147,11 +151,13 @@ def render_report(
     return page, [*(note for run in runs for note in run.notes), *values_left_out(series)]
 
 
-def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> ReportedRun:
+def _run(
+    recording: Recording, number: int, chosen: Sequence[Choice], progress: Callable[[str], None]
+) -> ReportedRun:
     evaluations = evaluation_records(recording)
     environment = recording.environment
     episodes = _episodes(recording, chosen)
-    replay = _replay(recording, episodes)
+    replay = _replay(recording, episodes, progress)
     drawing = None if environment["scene"] is None else svg.Drawing(environment["scene"])
     events, is_job = environment["event_names"], recording.is_job
     table = evaluation_table(evaluations, recording.agents, events, is_job) if evaluations else None
@@ -263,7 +269,11 @@ def _maps(recording: Recording, episode: tuple[int, ...] | None) -> list[MapRow]
         return []
 
 
-def _replay(recording: Recording, episodes: Mapping[tuple[int, ...], list[str]]) -> Replay | None:
+def _replay(
+    recording: Recording,
+    episodes: Mapping[tuple[int, ...], list[str]],
+    progress: Callable[[str], None],
+) -> Replay | None:
     """Return what the page replays; None if no episode can be."""
     shown = []
     for which, names in episodes.items():
@@ -280,8 +290,18 @@ def _replay(recording: Recording, episodes: Mapping[tuple[int, ...], list[str]])
         places = np.array(first.grid.places, np.int16)[first.grid.at[:1]].reshape(1, -1, 3)
         picture = drawing.frame(places[0], "The grid at the step shown below it", places, style="")
         key = drawing.key()
-    data = [asdict(episode) | {"pictures": [], "picture": [], "picture_note": ""} for _, episode in shown]
-    return Replay([episode.title for _, episode in shown], picture, key, embedded(data))
+    data, has_frames = [], False
+    for number, (which, episode) in enumerate(shown, 1):
+        own = Thumbnails()
+        if episode.grid is None:
+            progress(f"pictures of episode {number} of {len(shown)}")
+            place = place_of(recording, which)
+            own = thumbnails(recording.path, place.phase, place.number, len(episode.reward) + 1)
+            if not own.pictures and not own.picture_note:
+                own.picture_note = why_no_pictures(recording)
+        has_frames = has_frames or bool(own.pictures)
+        data.append(asdict(episode) | asdict(own))
+    return Replay([episode.title for _, episode in shown], picture, key, embedded(data), has_frames)
 
 
 def _title(runs: Sequence[ReportedRun]) -> str:

@@ -99,7 +99,7 @@ class Replay {
     this.slider.value = k;
     this.slider.setAttribute("aria-valuetext", count);
     this.find(".count").textContent = count;
-    if (this.image && this.pictures) this.pictures(k, (address, message) => this.k === k && this.picture(address, message));
+    if (this.pictures) this.pictures(k, (address, message) => this.k === k && this.picture(address, message));
     if (!this.holds(k)) {
       const loaded = await this.load(k);
       if (this.k !== k) return;
@@ -116,12 +116,13 @@ class Replay {
   }
 
   picture(address, message = "") {
-    if (address && this.image.getAttribute("src") !== address) this.image.src = address;
-    this.image.hidden = !this.image.getAttribute("src");
-    this.image.alt = `The environment after ${this.k} of ${this.length} steps`;
     const note = this.find(".frame-note");
     note.textContent = message;
     note.hidden = !message;
+    if (!this.image) return;
+    if (address && this.image.getAttribute("src") !== address) this.image.src = address;
+    this.image.hidden = !this.image.getAttribute("src");
+    this.image.alt = `The environment after ${this.k} of ${this.length} steps`;
   }
 
   place(i, thing) {
@@ -321,7 +322,7 @@ for (const root of document.querySelectorAll(".replay[data-replay]")) {
   const choose = root.querySelector(".episode"), chosen = () => episodes[Number(choose.value)];
   const pictures = (k, show) => {
     const { pictures: addresses, picture, picture_note: note } = chosen();
-    if (addresses.length) show(addresses[picture[k]], note);
+    show(addresses[picture[k]] ?? "", k < picture.length && addresses.length && picture[k] < addresses.length - 1 ? "" : note);
   };
   const replay = new Replay(root, { pictures });
   choose.addEventListener("change", () => replay.begin(chosen()));
