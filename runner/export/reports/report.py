@@ -35,6 +35,7 @@ from runner.export.reports.playback import MAX_VALUES, playback_of, titled
 from runner.export.reports.rendering import LegendEntry, View, embedded, render, templates
 from runner.export.reports.thumbnails import Thumbnails, thumbnails
 from runner.recording import schema
+from runner.recording.metrics import METRICS, Metric
 from runner.recording.reader import Recording, open_recording
 
 Choice = tuple[str, int, int]
@@ -94,6 +95,8 @@ class _ReportView(View):
     plots: list[Plot]
     legend: list[LegendEntry]
     footnote: str
+    columns: Sequence[Metric]
+    """The metrics of the last evaluations that any run knows."""
     max_values: int = MAX_VALUES
 
 
@@ -147,7 +150,13 @@ def render_report(
     progress("drawing")
     groups = groups_of(series)
     legend = [LegendEntry("", group.described) for group in groups]
-    page = render(_ReportView(_title(runs), runs, plots_of(groups), legend, footnote(groups)))
+    columns = [
+        metric
+        for metric in METRICS
+        if not (metric.per_agent and any(run.is_job for run in runs))
+        and any(run.last is not None and run.last.value(metric.name) is not None for run in runs)
+    ]
+    page = render(_ReportView(_title(runs), runs, plots_of(groups), legend, footnote(groups), columns))
     return page, [*(note for run in runs for note in run.notes), *values_left_out(series)]
 
 

@@ -246,7 +246,12 @@ def _flat(run: Run) -> dict[str, str]:
 def _results(runs: list[Run]) -> Rows:
     """Return the results of runs, a row for each measure."""
     last = [last_evaluation(each) for each in runs]
-    metrics = [metric for metric in METRICS if not metric.per_agent or any(map(is_loop, runs))]
+    metrics = [
+        metric
+        for metric in METRICS
+        if not (metric.per_agent and not any(map(is_loop, runs)))
+        and any(each.values.get(metric.name) is not None for each in last)
+    ]
     digests = [str(each.summary.content_digest or humanize.UNKNOWN)[:16] for each in runs]
     return [
         ("Status", [each.status for each in runs]),
