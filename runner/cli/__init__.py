@@ -42,6 +42,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "verify": ("verify", "Check every step of a run by training it again."),
         "checkpoints": ("checkpoints", "List the checkpoints that a loop recorded."),
         "checkpoint": ("checkpoints", "Write a checkpoint of a run into a file."),
+        "values": ("checkpoints", "Compute what a checkpoint's agent thinks along an old episode."),
         "qtable": ("tables", "Show the exact Q-table of a run at any step."),
         "table": ("tables", "Print an environment's transition table with names."),
     },

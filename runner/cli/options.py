@@ -258,6 +258,12 @@ trust_option: Final = click.option(
     is_flag=True,
     help="Import what the recording names to make its environment again: run code that you trust only.",
 )
+checkpoint_option: Final = click.option(
+    "--checkpoint", metavar="[NAME]@STEP", help="The last checkpoint at or before this step, of this name."
+)
+policy_option: Final = click.option(
+    "--policy", metavar="MODULE:FUNCTION", help="Your function that makes a policy of a checkpoint."
+)
 all_option: Final = click.option(
     "--all", "everything", is_flag=True, help="Include everything, not only a selection."
 )

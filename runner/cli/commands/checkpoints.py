@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import re
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import click
 
 from runner.cli import Command, Group
-from runner.cli.options import force_option, json_option, output_option, recordings_option, run_argument
+from runner.cli.options import (
+    checkpoint_option,
+    episode_option,
+    force_option,
+    json_option,
+    output_option,
+    policy_option,
+    recordings_option,
+    run_argument,
+    trial_option,
+    trust_option,
+)
 from runner.cli.output import draw, print_json, say, table
+from runner.cli.progress import stage_line
 from runner.cli.runs import find_recorded
-from runner.export.places import write_new
+from runner.export.places import write_new, write_text_new
 from runner.util.humanize import size
 
 _HEADINGS: Final = ("checkpoint", "phase", "episode", "format", "size", "digest", "content")
@@ -93,3 +108,94 @@ def get_command(
         print_json(checkpoint.as_json() | {"output": str(path.absolute())})
     else:
         click.echo(f"{path}  {size(checkpoint.size)}, {checkpoint.reference}, {checkpoint.format}")
+
+
+@click.command("values", cls=Command)
+@run_argument
+@episode_option
+@trial_option
+@checkpoint_option
+@policy_option
+@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FILE.csv", help="Write a CSV file.")
+@force_option
+@trust_option
+@recordings_option
+@json_option
+def values_command(
+    run_name: str,
+    episode: int | None,
+    trial: tuple[int, int] | None,
+    checkpoint: str | None,
+    policy: str | None,
+    output: Path | None,
+    force: bool,
+    trust: bool,
+    recordings: Path | None,
+    as_json: bool,
+) -> None:
+    """Compute what the agent of a checkpoint of RUN thinks along an old episode of it.
+
+    --policy names a function of yours that takes the checkpoint's content (arrays by name, or bytes) and the
+    spaces of observations and actions, and returns a function. That is called with the recorded observation
+    before each step, and returns a number, an array, or a mapping of names to these. A checkpoint that is a
+    pickle is loaded only with --trust.
+
+    Examples:
+      dualtaxi values cartpole --episode 3 --checkpoint @20000 --policy agent:values
+      dualtaxi values cartpole --episode 3 --checkpoint policy@0 --policy agent:values -o values.csv
+    """
+    from runner.analysis.evaluations import evaluation_after, evaluations_of
+    from runner.loops.policies import values_along
+    from runner.recording.reader import open_recording
+    from runner.runs.checkpoints import find_checkpoint
+
+    if checkpoint is None or policy is None or (episode is None) == (trial is None):
+        raise click.UsageError("expected --episode N or --eval N:TRIAL, --checkpoint and --policy")
+    run = find_recorded(run_name, recordings)
+    chosen = find_checkpoint(run.checkpoints(), checkpoint, f"run {run.run_id}")
+    with open_recording(run.recording) as recording, stage_line("computing values"):
+        phase, number, where = "train", episode or 0, str(recording.path)
+        if trial is not None:
+            evaluation = evaluation_after(evaluations_of(recording), trial[0], where)
+            phase, number = "eval", evaluation.trial(trial[1], where)
+        along = values_along(recording, phase, number, chosen, policy, trust)
+    columns = {"t": list(range(len(along.rewards)))}
+    columns |= _columns("action", along.actions) | _columns("reward", along.rewards.sum(axis=1))
+    for name, values in along.values.items():
+        columns |= _columns(name, values)
+    rows = list(zip(*columns.values(), strict=True))
+    if output is not None:
+        write_text_new(output, force, _csv(columns, rows))
+    if as_json:
+        facts = {"phase": phase, "episode": number, "checkpoint": chosen.as_json(), "policy": policy}
+        steps = [dict(zip(columns, row, strict=True)) for row in rows]
+        files = [] if output is None else [{"path": str(output), "bytes": output.stat().st_size}]
+        print_json({"run_id": run.run_id, **facts, "steps": steps, "files": files})
+    elif output is not None:
+        click.echo(f"{output}  {size(output.stat().st_size)}, {len(rows):,} steps")
+    else:
+        grid = table(*columns)
+        for row in rows:
+            grid.add_row(*(f"{value:.4g}" if isinstance(value, float) else str(value) for value in row))
+        draw(grid)
+
+
+def _columns(name: str, values: Any) -> dict[str, list[Any]]:
+    """Return values, nested as their space, as a column for each number."""
+    if isinstance(values, Mapping):
+        parts = (_columns(f"{name}.{key}", part) for key, part in values.items())
+        return {key: column for part in parts for key, column in part.items()}
+    if isinstance(values, tuple):
+        return _columns(name, {str(i): part for i, part in enumerate(values)})
+    if isinstance(values, list) or values.ndim == 1:
+        return {name: values if isinstance(values, list) else values.tolist()}
+    flat = values.reshape(len(values), -1)
+    return {f"{name}[{i}]": flat[:, i].tolist() for i in range(flat.shape[1])}
+
+
+def _csv(columns: Mapping[str, list[Any]], rows: list[tuple[Any, ...]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return text.getvalue()

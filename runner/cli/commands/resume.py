@@ -12,11 +12,15 @@ from runner.cli.options import (
     COUNT,
     INDEX,
     accept_changes_option,
+    checkpoint_option,
     json_option,
+    policy_option,
     recordings_option,
     run_argument,
+    trust_option,
 )
 from runner.cli.output import console, draw, facts, print_json, say
+from runner.cli.progress import count_line
 from runner.cli.runs import (
     command_for,
     find,
@@ -28,9 +32,11 @@ from runner.cli.runs import (
 )
 from runner.errors import ExitCode
 from runner.runs.run import recordings_folder
+from runner.util.humanize import number
 
 if TYPE_CHECKING:
     from runner.execution.rerecord import Start
+    from runner.runs.run import Run
 
 
 @click.command("resume", cls=Command)
@@ -103,12 +109,19 @@ def rerecord_command(run_name: str, recordings: Path | None, as_json: bool) -> N
 
 
 TRIALS: Final = 200
+LOOP_TRIALS: Final = 20
+"""Episodes of an evaluation of a checkpoint, whose environment may be slow."""
 
 
 @click.command("evaluate", cls=Command)
 @run_argument
 @click.option("--step", type=INDEX, metavar="N", help="After N training steps.  [default: the last]")
-@click.option("--trials", type=COUNT, metavar="K", help=f"Number of episodes.  [default: {TRIALS}]")
+@click.option(
+    "--trials",
+    type=COUNT,
+    metavar="K",
+    help=f"Number of episodes.  [default: {TRIALS}, of a loop {LOOP_TRIALS}]",
+)
 @click.option(
     "--start",
     default="random",
@@ -124,6 +137,9 @@ TRIALS: Final = 200
     metavar="S",
     help="Seed of the new episodes.",
 )
+@checkpoint_option
+@policy_option
+@trust_option
 @recordings_option
 @json_option
 @click.pass_context
@@ -134,6 +150,9 @@ def evaluate_command(
     trials: int | None,
     start: str,
     seed: int,
+    checkpoint: str | None,
+    policy: str | None,
+    trust: bool,
     recordings: Path | None,
     as_json: bool,
 ) -> None:
@@ -142,8 +161,13 @@ def evaluate_command(
     The table at any step can be evaluated. The episodes are recorded as a separate run, whose configuration
     names the run and the step of the table.
 
+    Of a loop, a checkpoint is evaluated in its environment, which is made again. --policy names a function of
+    yours that takes the checkpoint's content (arrays by name, or bytes) and the spaces of observations and
+    actions, and returns a function from an observation to an action. Trial K resets with the seed S + K.
+
     Examples:
       dualtaxi evaluate @latest
+      dualtaxi evaluate cartpole --checkpoint @20000 --policy agent:policy --trials 50
       dualtaxi evaluate k3v9m2xq --step 50000 --trials 1000 --seed 7
       dualtaxi evaluate k3v9m2xq --start each
     """
@@ -157,11 +181,23 @@ def evaluate_command(
     from runner.recording.reader import open_recording
 
     source = find_recorded(run_name, recordings)
-    count = None if start == "each" else trials or TRIALS
+    if "made_by" in source.file.config or checkpoint is not None or policy is not None:
+        if checkpoint is None or policy is None:
+            raise click.UsageError(
+                "a loop is evaluated by --checkpoint [NAME]@STEP and --policy module:function; "
+                f"`{command_for(source, 'checkpoints')}` lists its checkpoints."
+            )
+        if step is not None or start != "random":
+            raise click.UsageError("--step and --start are for runs that were trained here, not for loops.")
+        _evaluate_checkpoint(
+            source, recordings, checkpoint, policy, trials or LOOP_TRIALS, seed, trust, as_json
+        )
+        return
+    to_play = None if start == "each" else trials or TRIALS
     start_state: Start = int(start) if start.isdecimal() else "random"
     with job_progress("", 0) as (report, interrupt):
         run = evaluate(
-            source, recordings_folder(recordings), step, count, start_state, seed, report, interrupt
+            source, recordings_folder(recordings), step, to_play, start_state, seed, report, interrupt
         )
     origin = run.file.config["initial_q"]
     if as_json:
@@ -176,3 +212,36 @@ def evaluate_command(
     if interrupt.came and run.status == "interrupted":
         say(f"Interrupted: the episodes so far are kept; `{command_for(run, 'resume')}` plays the rest.")
         ctx.exit(ExitCode.INTERRUPTED)
+
+
+def _evaluate_checkpoint(
+    source: Run,
+    recordings: Path | None,
+    reference: str,
+    policy: str,
+    trials: int,
+    seed: int,
+    trust: bool,
+    as_json: bool,
+) -> None:
+    """Play a checkpoint of a loop, and print the run that it was recorded in."""
+    from runner.loops.policies import play_checkpoint
+    from runner.runs.checkpoints import find_checkpoint
+
+    checkpoint = find_checkpoint(source.checkpoints(), reference, f"run {source.run_id}")
+    folder = recordings_folder(recordings)
+    with count_line("episodes", trials) as report:
+        run = play_checkpoint(source, checkpoint, policy, folder, trials, seed, trust, report)
+    origin = run.file.config["config"]["origin"]
+    if as_json:
+        print_json(run_as_json(run) | {"origin": origin})
+        return
+    found = run.summary.last_evaluation
+    means = {} if found is None else found.values
+    results = {
+        "played": f"{checkpoint.reference} of run {source.run_id}, {checkpoint.digest[:16]}, by {policy}",
+        "mean return": number(means.get("mean_return")),
+        "mean length": number(means.get("mean_length")),
+        "next": command_for(run, "show"),
+    }
+    draw(facts(run_facts(run) | results))

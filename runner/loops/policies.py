@@ -1,0 +1,242 @@
+"""A checkpoint of a loop at work: played in the recorded environment, or along an episode of the past.
+
+    # agent.py
+    def policy(weights, observation_space, action_space):
+        return lambda observation: int((observation @ weights["w"]).argmax())
+
+`weights` is what `Checkpoint.load` returns: arrays by name of safetensors, else bytes. Nothing is imported
+but what the user names, and the environment, as `runner.replay.makers` allows.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from runner.errors import CannotRedo, ConfigError, RecordingError, RunnerError
+from runner.export.minari_episodes import episodes_in
+from runner.loops.env import record
+from runner.loops.values import as_array
+from runner.loops.vector import record_parallel
+from runner.recording.gym_spaces import restore_space
+from runner.recording.reader import Recording, open_recording
+from runner.replay.makers import make_environment, why_not_made
+from runner.runs.checkpoints import Checkpoint
+from runner.runs.run import Run
+
+MAX_NUMBERS: Final = 256
+"""The most numbers in one of the values that a policy returns along an episode."""
+Policy = Callable[[Any], Any]
+"""Takes an observation; returns an action, or what is to be shown of it."""
+MakePolicy = Callable[[Any, Any, Any], Policy]
+"""Takes the content of a checkpoint, and the spaces of observations and actions."""
+
+
+def policy_named(name: str) -> MakePolicy:
+    """Return the function `module:function`; the module is imported, also from the current folder.
+
+    Raises:
+        ConfigError: there is none of that name, or importing the module fails.
+    """
+    module_name, _, function_name = name.partition(":")
+    if not module_name or not function_name:
+        raise ConfigError(f"--policy: found {name!r}, expected module:function")
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        function = getattr(importlib.import_module(module_name), function_name)
+    except Exception as error:  # a module of the user's may raise anything
+        raise ConfigError(
+            f"--policy: {name!r} cannot be imported ({type(error).__name__}: {error}); it is looked for on "
+            "Python's path and in the current folder"
+        ) from error
+    finally:
+        sys.path.pop(0)
+    if not callable(function):
+        raise ConfigError(f"--policy: found {type(function).__name__} at {name!r}, expected a function")
+    made: MakePolicy = function
+    return made
+
+
+def play_checkpoint(
+    run: Run,
+    checkpoint: Checkpoint,
+    policy: str,
+    recordings: Path,
+    episodes: int,
+    seed: int = 0,
+    trust: bool = False,
+    report: Callable[[int], None] = lambda _: None,
+) -> Run:
+    """Play a checkpoint in the recorded environment; return the run that it was recorded in.
+
+    Args:
+        run: the run that the checkpoint is of.
+        checkpoint: the checkpoint.
+        policy: `module:function`, see `policy_named`.
+        recordings: the recordings folder of the new run, whose settings name the run, step and digest.
+        episodes: the number of evaluation episodes.
+        seed: of the first reset; the following ones have the next numbers.
+        trust: whether to import what the recording names, and to load a pickle.
+        report: called with the number of episodes played.
+
+    Raises:
+        CannotRedo: the environment cannot be made again.
+        ConfigError: the policy cannot be imported.
+        RunnerError: the policy fails; what was played is kept.
+        RecordingError: the content of the checkpoint is not here, or was changed.
+    """
+    with open_recording(run.recording) as recording:
+        maker = recording.maker_of("eval")
+    if maker is None or (reason := why_not_made(maker, trust)):
+        raise CannotRedo(reason if maker else why_not_made(None, trust))
+    make, weights = policy_named(policy), checkpoint.load(trust)
+    env = make_environment(maker, trust)
+    is_game = maker.kind == "pettingzoo"
+    origin = {"run": run.run_id, "checkpoint": checkpoint.name, "step": checkpoint.step}
+    settings = {"origin": origin | {"digest": checkpoint.digest}, "policy": policy}
+    own = _game_spaces(env) if is_game else (env.observation_space, env.action_space)
+    try:
+        with _from_policy(policy):
+            act = make(weights, *own)
+    except BaseException:
+        env.close()
+        raise
+    begin: Any = record_parallel if is_game else record
+    name = f"{run.name[:90]}.evaluated"
+    with begin(env, recordings, name=name, seed=seed, config=settings) as rec, rec.phase("eval"):
+        for number in range(episodes):
+            _play(rec, act, seed + number, policy, is_game)
+            report(number + 1)
+    played: Run = rec.run
+    return played
+
+
+def _play(rec: Any, act: Policy, seed: int, name: str, is_game: bool) -> None:
+    """Play an episode."""
+    observation, over = rec.reset(seed=seed)[0], False
+    while not over:
+        with _from_policy(name):
+            action = act(observation)
+        observation, _, terminated, truncated, _ = rec.step(action)
+        over = not rec.agents if is_game else terminated or truncated
+
+
+def _game_spaces(env: Any) -> tuple[spaces.Dict, spaces.Dict]:
+    agents = env.possible_agents
+    observations = spaces.Dict({agent: env.observation_space(agent) for agent in agents})
+    return observations, spaces.Dict({agent: env.action_space(agent) for agent in agents})
+
+
+@dataclass(frozen=True)
+class ValuesAlong:
+    """What a policy returned along a recorded episode of T steps."""
+
+    actions: Any
+    """The T recorded actions, nested as their space."""
+    rewards: NDArray[np.float64]
+    """[T, agents]."""
+    values: Mapping[str, NDArray[Any]]
+    """What the policy returned for the observation before each step, by name: [T, ...]."""
+
+
+def values_along(
+    recording: Recording, phase: str, episode: int, checkpoint: Checkpoint, policy: str, trust: bool = False
+) -> ValuesAlong:
+    """Return what a checkpoint's agent would have thought along an old episode.
+
+    The policy is called with each recorded observation before a step. It may return a number, an array, or a
+    mapping of names to these; without names, the name is `value`.
+
+    Args:
+        recording: of a loop.
+        phase: `train` or `eval`.
+        episode: the number of an episode that ended.
+        checkpoint: of this run, or of another one with the same spaces.
+        policy: `module:function`, see `policy_named`.
+        trust: whether to load a pickle.
+
+    Raises:
+        ConfigError: the policy cannot be imported, or returns something else.
+        RunnerError: the policy fails.
+        RecordingError: there is no such episode, or the content of the checkpoint is not here.
+    """
+    recording.episode_span(phase, episode)  # with its message, if there is none
+    found = next(episodes_in(recording, phase, ((episode, episode + 1),)), None)
+    if found is None:
+        raise RecordingError(
+            f"{recording.path}: the observations of {phase} episode {episode} are not all there: it has not "
+            "ended, or a part of it was lost."
+        )
+    own = (restore_space(recording.spaces[name]) for name in ("observation", "action"))
+    make, weights = policy_named(policy), checkpoint.load(trust)
+    with _from_policy(policy):
+        act = make(weights, *own)
+    rows: dict[str, list[NDArray[Any]]] = {}
+    steps = len(found.rewards)
+    for t in range(steps):
+        with _from_policy(policy):
+            thought = act(_element(found.observations, t))
+        for name, value in _named(thought).items():
+            rows.setdefault(name, []).append(value)
+    try:
+        values = {name: np.stack(each) for name, each in rows.items()}
+    except ValueError as error:
+        raise ConfigError(f"--policy: {policy!r} returned arrays of different shapes ({error})") from error
+    if any(len(each) != steps for each in values.values()):
+        raise ConfigError(f"--policy: {policy!r} returned other names at some steps, expected the same ones")
+    return ValuesAlong(found.actions, found.rewards, values)
+
+
+def _named(value: Any) -> dict[str, NDArray[Any]]:
+    """Return what a policy returned, by name.
+
+    Raises:
+        ConfigError: it is no number, array, or mapping of these.
+    """
+    pieces = value if isinstance(value, Mapping) else {"value": value}
+    named = {}
+    for name, piece in pieces.items():
+        try:
+            array = as_array(piece)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ConfigError(f"--policy: found no numbers for {name!r} ({error})") from error
+        if array.dtype.kind not in "biuf" or not 0 < array.size <= MAX_NUMBERS:
+            raise ConfigError(
+                f"--policy: found {array.dtype} of shape {array.shape} for {name!r}, expected 1 to "
+                f"{MAX_NUMBERS} numbers"
+            )
+        named[str(name)] = array
+    return named
+
+
+def _element(values: Any, i: int) -> Any:
+    """Return one of many values that are nested as their space."""
+    if isinstance(values, Mapping):
+        return {name: _element(part, i) for name, part in values.items()}
+    if isinstance(values, tuple):
+        return tuple(_element(part, i) for part in values)
+    return values[i]
+
+
+@contextlib.contextmanager
+def _from_policy(name: str) -> Iterator[None]:
+    """Raise what the user's policy raises as an error with its place."""
+    try:
+        yield
+    except RunnerError:
+        raise
+    except Exception as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        raise RunnerError(
+            f"the policy {name} failed at {last.filename}:{last.lineno}: {type(error).__name__}: {error}"
+        ) from error
