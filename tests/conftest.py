@@ -1,10 +1,15 @@
-"""What all tests share: a cache folder of their own."""
+"""What all tests share: a cache folder of their own, and drawing without a display."""
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Iterator
 
 import pytest
+
+if sys.platform == "linux":
+    os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported
 
 
 @pytest.fixture(autouse=True, scope="session")
