@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, pairwise
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,7 @@ _ROWS: Final = 1024
 _FOREVER: Final = 2**63 - 1
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedReset:
+class RecordedReset(NamedTuple):
     """A reset of one environment."""
 
     number: int
@@ -97,29 +96,26 @@ def resets_of(
     extras = _Extras(recording, phase, range(start_time, stop))
     states = recording.reset_states(phase, range(start_time, stop))
     state = next(states, None)
+    for number, environment, episode, step, time, seed, seeded, observation in _reset_rows(
+        recording, topic, range(start_time, stop)
+    ):
+        own = None
+        while state is not None and state.reset <= number:
+            own, state = state if state.reset == number else None, next(states, None)
+        options, large_seed = extras.of(step, time)
+        known_seed = seed if seeded else large_seed
+        yield RecordedReset(number, environment, episode, step, time, observation, known_seed, options, own)
+
+
+def _reset_rows(recording: Recording, topic: schema.Topic, times: range) -> Iterator[tuple[Any, ...]]:
+    """Yield number, environment, episode, step, time, seed, whether it has one, and observation."""
+    names = ("reset", "environment", "episode", "step", "log_time", "seed", "seeded")
     if topic in recording.dtypes:
-        blocks = recording.blocks_between(topic, start_time, stop)
-        records: Iterator[Any] = (record for block in blocks for record in block)
+        for block in recording.blocks_between(topic, times.start, times.stop):
+            yield from zip(*(block[name].tolist() for name in names), block["observation"], strict=True)
     else:
-        records = recording.decoded(topic, times=range(start_time, stop))
-    for record in records:
-        number, environment, step = int(record["reset"]), int(record["environment"]), int(record["step"])
-        time = int(record["log_time"])
-        own, state = None, _skipped(state, states, number)
-        while state is not None and state.reset == number:
-            own, state = state, next(states, None)
-        options, seed = extras.of(step, time)
-        if record["seeded"]:
-            seed = int(record["seed"])
-        yield RecordedReset(
-            number, environment, int(record["episode"]), step, time, record["observation"], seed, options, own
-        )
-
-
-def _skipped(state: ResetState | None, states: Iterator[ResetState], number: int) -> ResetState | None:
-    while state is not None and state.reset < number:
-        state = next(states, None)
-    return state
+        for message in recording.decoded(topic, times=times):
+            yield (*(message[name] for name in names), message["observation"])
 
 
 class _Extras:
@@ -139,6 +135,8 @@ class _Extras:
 
     def of(self, step: int, time: int) -> tuple[dict[str, Any] | None, int | None]:
         """Return options and seed of the reset at this place; those of one call hold for all its resets."""
+        if self._next is None and self._last is None:
+            return None, None
         while self._next is not None and (self._next[1], self._next[0]) <= (time, step):
             self._last, self._next = self._next, next(self._messages, None)
         if self._last is None or self._last[:2] != (step, time):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +42,7 @@ class Values:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class RedoneStart:
+class RedoneStart(NamedTuple):
     """The beginning of an episode that was done again."""
 
     row: int
@@ -89,7 +88,7 @@ class RedoneSteps:
         """Return what came from a step of the phase on."""
         at = int(np.searchsorted(self.step, step))
         kept = {name: getattr(self, name)[at:] for name in ("step", "episode", "t", "actions", "frames")}
-        starts = tuple(replace(start, row=start.row - at) for start in self.starts if start.row >= at)
+        starts = tuple(start._replace(row=start.row - at) for start in self.starts if start.row >= at)
         return replace(self, **kept, recorded=self.recorded.since(at), got=self.got.since(at), starts=starts)
 
     def without_rows(self) -> RedoneSteps:
