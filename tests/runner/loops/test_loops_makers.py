@@ -1,0 +1,242 @@
+"""How an environment was made is recorded, with the reason where it cannot be made again."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from types import ModuleType
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import wrappers
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import runner
+from runner.errors import ConfigError, RecordingError
+from runner.recording.maker import EnvironmentMaker, VectorMaker, parse_maker
+from runner.recording.metadata import json_object
+from runner.recording.reader import open_recording
+from runner.recording.reset_states import ResetState, decode_reset_state
+from tests.runner.loops.making import Leaving
+
+
+class Doubled(gymnasium.RewardWrapper):
+    """Takes the environment alone."""
+
+    def reward(self, reward: Any) -> Any:
+        return reward * 2
+
+
+class Scaled(gymnasium.RewardWrapper):
+    """Does not record its argument, which has a default."""
+
+    def __init__(self, env: Any, factor: float = 2.0) -> None:
+        super().__init__(env)
+        self.factor = factor
+
+    def reward(self, reward: Any) -> Any:
+        return reward * self.factor
+
+
+class Shifted(Scaled):
+    """Does not record its argument, which has no default."""
+
+    def __init__(self, env: Any, by: float) -> None:
+        super().__init__(env, by)
+
+
+class Halved(wrappers.TransformReward):
+    """Inherits from one that records its arguments, and has others."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env, lambda reward: reward / 2)
+
+
+def make_pole() -> Any:
+    return gymnasium.make("CartPole-v1")
+
+
+def maker_of(rec: Any, phase: str = "train") -> EnvironmentMaker:
+    rec.close()
+    with open_recording(rec.run.recording) as recording:
+        found = recording.maker_of(phase)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(
+    ("wrap", "reason"),
+    [
+        (lambda env: wrappers.TransformReward(env, lambda reward: reward), "the argument func, of .*JSON"),
+        (lambda env: Shifted(env, 1.0), "Shifted does not record its arguments"),
+        (
+            type("Local", (Doubled,), {"__qualname__": "f.<locals>.Local"}),
+            "imported by name",
+        ),
+    ],
+)
+def test_the_reason_is_recorded_where_wrappers_cannot_be_made_again(wrap, reason, tmp_path):
+    env = wrap(make_pole())
+    maker = maker_of(runner.record(env, tmp_path))
+    assert maker.spec == ""
+    assert re.search(reason, maker.reason)
+    assert 'make="module:function"' in maker.reason
+    assert maker.wrappers[0].endswith(type(env).__qualname__)
+
+
+@pytest.mark.parametrize(("wrapper", "is_assumed"), [(Doubled, False), (Scaled, True), (Halved, False)])
+def test_wrappers_without_arguments_are_made_again(wrapper, is_assumed, tmp_path):
+    maker = maker_of(runner.record(wrapper(make_pole()), tmp_path))
+    assert not maker.reason
+    assert maker.assumed == ((f"{__name__}:{wrapper.__name__}",) if is_assumed else ())
+    spec = json.loads(maker.spec)
+    assert spec["additional_wrappers"] == [
+        {"name": wrapper.__name__, "entry_point": f"{__name__}:{wrapper.__name__}", "kwargs": {}}
+    ]
+
+
+def test_an_environment_that_was_not_made_by_gymnasium_has_a_reason(tmp_path):
+    from gymnasium.envs.classic_control import CartPoleEnv
+
+    maker = maker_of(runner.record(CartPoleEnv(), tmp_path))
+    assert "not made by gymnasium.make" in maker.reason
+    assert maker.wrappers == ()
+
+
+def test_videos_are_not_made_again(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "moviepy", ModuleType("moviepy"))  # no video is made
+    env = gymnasium.make("CartPole-v1", render_mode="rgb_array")
+    env = wrappers.RecordVideo(env, str(tmp_path / "videos"), episode_trigger=lambda _: False)
+    maker = maker_of(runner.record(env, tmp_path / "recordings"))
+    assert not maker.reason
+    assert json.loads(maker.spec)["additional_wrappers"] == []
+    assert maker.wrappers[0].endswith("RecordVideo")
+
+
+def test_environments_of_a_vector_that_differ_are_named(tmp_path):
+    envs = SyncVectorEnv(
+        [lambda g=g: gymnasium.make("Pendulum-v1", g=g) for g in (9.0, 9.0, 3.0)],
+        autoreset_mode=AutoresetMode.DISABLED,
+    )
+    envs = wrappers.vector.NormalizeObservation(wrappers.vector.RecordEpisodeStatistics(envs))
+    maker = maker_of(runner.record_vector(envs, tmp_path))
+    assert "not all made in the same way" in maker.reason
+    assert maker.vector is not None
+    assert (maker.vector.number, maker.vector.mode, maker.vector.autoreset) == (3, "sync", "Disabled")
+    specs = json.loads(maker.vector.wrapper_specs)
+    assert [spec["name"] for spec in specs] == ["RecordEpisodeStatistics", "NormalizeObservation"]
+    assert specs[1]["kwargs"] == {"epsilon": 1e-8}
+    assert len(maker.assumed) == 1
+
+
+def test_a_vector_of_its_own_class_is_made_by_make_vec(tmp_path):
+    envs = gymnasium.make_vec("CartPole-v1", 3, vectorization_mode="vector_entry_point")
+    maker = maker_of(runner.record_vector(envs, tmp_path))
+    assert maker.vector is not None
+    assert (maker.reason, maker.vector.mode) == ("", "custom")
+    made = gymnasium.make_vec(gymnasium.envs.registration.EnvSpec.from_json(maker.spec))
+    assert (type(made), made.num_envs) == (type(envs), 3)
+
+
+def test_a_game_is_made_by_the_function_of_its_module(tmp_path):
+    from mpe2 import simple_spread_v3
+
+    maker = maker_of(runner.record_parallel(simple_spread_v3.parallel_env(N=2), tmp_path))
+    spec = json.loads(maker.spec)
+    assert (maker.kind, maker.reason, maker.registered_by) == ("pettingzoo", "", "mpe2")
+    assert spec["entry_point"] == "mpe2.simple_spread.simple_spread:parallel_env"
+    assert spec["kwargs"]["N"] == 2
+    own = maker_of(runner.record_parallel(Leaving(), tmp_path))
+    assert json.loads(own.spec) == {"entry_point": "tests.runner.loops.making:Leaving", "kwargs": {}}
+
+
+def test_an_environment_for_evaluation_has_a_maker_of_its_own(tmp_path):
+    train = runner.record(Doubled(make_pole()), tmp_path)
+    runner.record(make_pole(), into=train, phase="eval")
+    assert maker_of(train).wrappers != maker_of(train, "eval").wrappers
+    same = runner.record(make_pole(), tmp_path)
+    runner.record(make_pole(), into=same, phase="eval")
+    assert maker_of(same) == maker_of(same, "eval")
+
+
+# --- the user's own function --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [make_pole, f"{__name__}:make_pole"])
+def test_a_function_that_makes_the_environment_is_recorded_by_name(make, tmp_path):
+    maker = maker_of(runner.record(Shifted(make_pole(), 1.0), tmp_path, make=make))
+    assert maker.make == f"{__name__}:make_pole"
+    assert maker.reason
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: None, "train", "no_such_module:make", f"{__name__}:nothing", f"{__name__}:__doc__", 3]
+)
+def test_a_function_that_cannot_be_imported_is_refused(make, tmp_path):
+    with pytest.raises(ConfigError, match="make: "):
+        runner.record(make_pole(), tmp_path, make=make)
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_function_of_the_script_is_recorded_by_the_name_of_the_script(tmp_path):
+    script = tmp_path / "train.py"
+    script.write_text(
+        "import gymnasium, runner\n"
+        "def make_env(): return gymnasium.make('CartPole-v1')\n"
+        "if __name__ == '__main__':\n"
+        "    with runner.record(make_env(), 'recordings', make=make_env) as env:\n"
+        "        print(env.run.recording)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, script.name], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=True
+    )
+    with open_recording(tmp_path / done.stdout.strip()) as recording:
+        assert recording.maker is not None
+        assert recording.maker.make == "train:make_env"
+
+
+# --- what comes in ------------------------------------------------------------------------------------
+
+GOOD = EnvironmentMaker(
+    "vector",
+    spec="{}",
+    registered_by="ale_py",
+    vector=VectorMaker(2, "sync", "Disabled"),
+    packages={"a": "1"},
+)
+
+
+def test_a_maker_comes_back():
+    assert parse_maker(json_object(GOOD.to_metadata()["json"], "it"), "it") == GOOD
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("kind", "gym"), ("kind", None), ("spec", 3), ("spec", "{"), ("spec", "[]"), ("spec", "x" * 2**21)),
+        ("spec", "[" * 10_000 + "]" * 10_000),
+        *(("registered_by", "os; x"), ("make", "os.system"), ("make", "a:b:c"), ("reason", "x" * 3_000)),
+        *(("wrappers", "abc"), ("wrappers", ["x"] * 200), ("wrappers", [3]), ("assumed", {})),
+        *(("vector", 3), ("vector", {"number": 0}), ("packages", {"a": 1}), ("machine", "x" * 300)),
+    ],
+)
+def test_a_maker_with_an_impossible_value_is_refused(key, value):
+    values = json_object(GOOD.to_metadata()["json"], "it") | {key: value}
+    with pytest.raises(RecordingError, match=r"it: .* is damaged"):
+        parse_maker(values, "it")
+
+
+def test_a_state_comes_back_and_damaged_ones_are_refused():
+    generator = np.random.default_rng(3)
+    generator.integers(5, dtype=np.int32)
+    state = ResetState(5, 2, None, generator.bit_generator.state, b"emulator")
+    assert decode_reset_state(state.to_payload()) == state
+    seeded = ResetState(0, 0, 2**128 - 1)
+    assert decode_reset_state(seeded.to_payload()) == seeded
+    for payload in (b"\x1a\x03abc", b"\x22\x02ab", b"\x22\x28" + bytes(40), b"\xff"):
+        with pytest.raises(RecordingError):
+            decode_reset_state(payload)
