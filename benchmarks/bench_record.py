@@ -244,11 +244,12 @@ class Observed(gymnasium.Env[Any, Any]):
 def _extras(folder: Path, steps: int, repetitions: int) -> list[Figure]:
     """Return what extras of 4 float32 add to a step, next to an observation of the same size."""
     numbers = np.random.default_rng(0).normal(size=(steps + 1, 4)).astype(np.float32)
+    rows = list(numbers)
 
     def play(env: Any, with_extras: bool) -> None:
         env.reset()
         for k in range(steps):
-            result = env.step(0, {"logits": numbers[k]}) if with_extras else env.step(0)
+            result = env.step(0, {"logits": rows[k]}) if with_extras else env.step(0)
             if result[2]:
                 env.reset()
 

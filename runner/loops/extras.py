@@ -75,14 +75,14 @@ class Extras:
         if row >= self._room:
             self._write(row)
             row = 0
-        self._phase = phase
+        self._phase, put = phase, self._put
         try:
             for name, value in values.items():
-                self._put[name](row, value)
+                put[name](row, value)
         except (KeyError, AttributeError):
             row = self._put_new(row, values)
         self._steps.append(self._taken[phase] + rows.filled - self._n)
-        if len(values) != len(self._put):
+        if len(values) != len(put):
             self._partial[row] = set(values)
 
     def extend(self, phase: str, rows: PhaseRows, values: Mapping[str, Any]) -> None:

@@ -25,7 +25,7 @@ from runner.cli.options import (
     trial_option,
     trust_option,
 )
-from runner.cli.output import draw, print_json, say, table
+from runner.cli.output import draw, files_written, print_json, say, table
 from runner.cli.progress import stage_line
 from runner.cli.runs import find_recorded
 from runner.export.places import write_new, write_text_new
@@ -48,7 +48,7 @@ def checkpoints_command(run_name: str, recordings: Path | None, as_json: bool) -
     """
     checkpoints = find_recorded(run_name, recordings).checkpoints()
     if as_json:
-        print_json([checkpoint.as_json() for checkpoint in checkpoints])
+        print_json({"checkpoints": [checkpoint.as_json() for checkpoint in checkpoints]})
         return
     if not checkpoints:
         say("There are no checkpoints; a loop records one by rec.checkpoint(name, value).")
@@ -79,7 +79,7 @@ def checkpoint_command() -> None:
 
 @checkpoint_command.command("get", short_help="Write a checkpoint into a file.")
 @run_argument
-@click.argument("reference", metavar="[NAME]@STEP")
+@click.argument("reference", metavar="[NAME]@STEP", default="@latest")
 @output_option("NAME-STEP.FORMAT")
 @force_option
 @recordings_option
@@ -90,7 +90,7 @@ def get_command(
     """Write a checkpoint of RUN into a file, after comparing its digest.
 
     @STEP is the last checkpoint at or before that step, NAME@STEP the last one of that name; @latest is the
-    last of all. Nothing is unpickled.
+    last of all, and the default. Nothing is unpickled.
 
     Examples:
       dualtaxi checkpoint get cartpole @20000 -o policy.safetensors
@@ -105,7 +105,7 @@ def get_command(
     checkpoint.check()
     write_new(path, force, lambda fresh: shutil.copyfile(checkpoint.path, fresh))
     if as_json:
-        print_json(checkpoint.as_json() | {"output": str(path.absolute())})
+        print_json(checkpoint.as_json() | {"files": files_written(path)})
     else:
         click.echo(f"{path}  {size(checkpoint.size)}, {checkpoint.reference}, {checkpoint.format}")
 
@@ -149,9 +149,9 @@ def values_command(
     from runner.recording.reader import open_recording
     from runner.runs.checkpoints import find_checkpoint
 
-    if checkpoint is None or policy is None or (episode is None) == (trial is None):
-        raise click.UsageError("expected --episode N or --eval N:TRIAL, --checkpoint and --policy")
     run = find_recorded(run_name, recordings)
+    if checkpoint is None or policy is None or (episode is None) == (trial is None):
+        raise click.UsageError("expected --episode N or --eval N:TRIAL, --checkpoint and --policy.")
     chosen = find_checkpoint(run.checkpoints(), checkpoint, f"run {run.run_id}")
     with open_recording(run.recording) as recording, stage_line("computing values"):
         phase, number, where = "train", episode or 0, str(recording.path)
@@ -169,7 +169,7 @@ def values_command(
     if as_json:
         facts = {"phase": phase, "episode": number, "checkpoint": chosen.as_json(), "policy": policy}
         steps = [dict(zip(columns, row, strict=True)) for row in rows]
-        files = [] if output is None else [{"path": str(output), "bytes": output.stat().st_size}]
+        files = [] if output is None else files_written(output)
         print_json({"run_id": run.run_id, **facts, "steps": steps, "files": files})
     elif output is not None:
         click.echo(f"{output}  {size(output.stat().st_size)}, {len(rows):,} steps")

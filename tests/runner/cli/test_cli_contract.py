@@ -11,9 +11,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import click
+import gymnasium
 import pytest
 from click.testing import CliRunner
 
+import runner
 from runner.cli import cli
 from runner.cli.commands import remote
 from runner.cli.options import RunName
@@ -39,6 +41,7 @@ WITH_JSON = {
 
 LISTS = {
     "ls": "runs",
+    "checkpoints": "checkpoints",
     "du": "runs",
     "config ls": "configs",
     "sweep ls": "sweeps",
@@ -59,8 +62,11 @@ WRITING = {
     "export minari": "{run} --phase eval -o {folder}/minari",
     "export tensorboard": "{run} -o {folder}/tensorboard",
     "qtable": "{run} --state 0 -o {folder}/table.npy",
+    "checkpoint get": "{loop} -o {folder}/policy.bin",
+    "values": "{loop} --episode 0 --checkpoint @0 --policy {policy} -o {folder}/values.csv",
 }
 """Commands whose JSON lists the files that they wrote, and what is typed after them."""
+LOOPS = {"checkpoints": "{loop}"}
 WITHOUT_JSON = ("view", "completion", "serve")
 """Commands that print an address, a script or nothing."""
 LINES = ("run", "play", "table", "archive")
@@ -101,6 +107,11 @@ WORDS = {
 JOB = RemoteJob(1, "config", "tiny", "finished", 1, "", None, {3: "k3v9m2xq"})
 
 
+def always_left(content, *spaces):
+    """Return the policy of the loop's checkpoint."""
+    return lambda observation: ("left", "right").index(content.decode())
+
+
 @pytest.fixture(scope="module")
 def place(tmp_path_factory, recorded_run, command_in):
     """A folder with two runs, an archive of one, and a sweep."""
@@ -112,6 +123,11 @@ def place(tmp_path_factory, recorded_run, command_in):
     command = command_in(recordings)
     other = command.json("run", tiny, "--set", "discount=0.5", "--name", "other")
     command.json("archive", other["run_id"], "--to", folder / "archived", "--remove")
+    with runner.record(gymnasium.make("CartPole-v1"), folder / "loops", name="loop") as loop:
+        loop.checkpoint("policy", b"left")
+        loop.reset(seed=0)
+        while not any(loop.step(0)[2:4]):
+            pass
     sweep = folder / "small.yaml"
     sweep.write_text("base: tiny.yaml\nstrategy: grid\nseeds: [0]\nparameters: {discount: [0.5, 0.9]}\n")
     done = command("sweep", "run", sweep, "--workers", 1)
@@ -123,6 +139,8 @@ def place(tmp_path_factory, recorded_run, command_in):
         sweep=sweep,
         recording=recorded_run.recording,
         run=recorded_run.run_id,
+        loop=loop.run.folder,
+        policy=f"{__name__}:always_left",
     )
 
 
@@ -153,7 +171,7 @@ def test_every_command_with_json_is_tested():
 @pytest.mark.parametrize("path", WITH_JSON, ids=" ".join)
 def test_json_is_an_object_or_one_per_line(place, path):
     name = " ".join(path)
-    words = (WORDS | WRITING).get(name, "").format(**vars(place)).split()
+    words = (WORDS | WRITING | LOOPS).get(name, "").format(**vars(place)).split()
     if name == "token revoke":
         place.command("token", "create", "laptop")
     done = place.command(*path, *words, "--json")

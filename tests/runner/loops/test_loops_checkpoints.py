@@ -104,7 +104,7 @@ def test_what_is_no_checkpoint_is_refused(tmp_path, name, value, message):
 
 def test_commands_list_and_get_checkpoints(tmp_path):
     record_loop(tmp_path, "one")
-    listed = json.loads(dualtaxi(tmp_path, "checkpoints", "one", "--json").stdout)
+    listed = json.loads(dualtaxi(tmp_path, "checkpoints", "one", "--json").stdout)["checkpoints"]
     assert [(each["name"], each["step"], each["here"]) for each in listed] == [
         *(("policy", step, True) for step in (1, 41, 81)),
         ("notes", 100, True),
@@ -173,7 +173,7 @@ def test_an_archive_has_the_contents_and_a_restore_brings_them_back(tmp_path):
     done = dualtaxi(folder, "archive", "one", "--to", str(archive), "--remove")
     assert done.exit_code == 0, done.output
     assert objects(folder) == []
-    listed = json.loads(dualtaxi(folder, "checkpoints", "one", "--json").stdout)
+    listed = json.loads(dualtaxi(folder, "checkpoints", "one", "--json").stdout)["checkpoints"]
     assert [each["here"] for each in listed] == [False] * 4
     assert dualtaxi(folder, "restore", "one").exit_code == 0
     assert objects(folder) == before
