@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from runner.cli import Command
-from runner.cli.options import json_option, recordings_option, run_argument
+from runner.cli.options import json_option, recordings_option, run_argument, trust_option
 from runner.cli.output import draw, facts, print_json
 from runner.cli.progress import bytes_line, count_line
 from runner.cli.runs import command_for, find_recording, job_progress, require_over
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     default=0.0,
     help="Accept this absolute and relative difference of a loop's observations and rewards.",
 )
-@click.option("--trust", is_flag=True, help="Import what the recording names to make its environment.")
+@trust_option
 @recordings_option
 @json_option
 @click.pass_context

@@ -308,7 +308,7 @@ def test_the_commands(lake, taxis, tmp_path, monkeypatch):
     monkeypatch.setenv("DUALTAXI_RECORDINGS", str(lake.folder.parent))
     exported = CliRunner().invoke(cli, ["export", "mcap", lake.run_id, "-o", "lake.mcap", "--json"])
     assert exported.exit_code == 0, exported.output
-    assert Path(json.loads(exported.stdout)["path"]) == tmp_path / "lake.mcap"
+    assert Path(json.loads(exported.stdout)["files"][0]["path"]) == tmp_path / "lake.mcap"
     imported = CliRunner().invoke(cli, ["import", "lake.mcap", "--recordings", "theirs"])
     assert imported.exit_code == 0, imported.output
     assert f"dualtaxi show {lake.run_id}" in imported.stdout
