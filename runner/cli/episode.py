@@ -1,97 +1,195 @@
-"""A recorded episode, step by step: as JSON, and as frames for the terminal."""
+"""A recorded episode of any run, step by step: as JSON, and as frames for the terminal."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+import io
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from runner.drawing.text import Drawing
 from runner.environments.mdp import events_of
-from runner.environments.naming import actions_in_words, event_in_words, states_in_words
+from runner.environments.naming import actions_in_words, states_in_words
+from runner.export.contents import ENDINGS, ending_of
+from runner.export.pictures import describer
+from runner.export.values import plain_value, value_in_words
+from runner.replay.steps import check_steps, reset_of, transitions_of
 from runner.util.humanize import number
+from runner.util.jsonable import as_json
 
 if TYPE_CHECKING:
     from rich.text import Text
 
+    from runner.drawing.raster import Pixels
+    from runner.export.episodes import EpisodeChoice
+    from runner.export.pictures import Pictures
     from runner.recording.reader import Recording
+
+_MAX_NUMBERS: Final = 32
+"""Larger arrays of an observation are not written out."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a terminal shows of a step."""
+
+    above: Text
+    below: Text
+    picture: bytes = b""
+    """A PNG between the texts; empty if there is none."""
 
 
 class Episode:
-    """One episode of a recording, read whole: it has at most as many steps as the step limit.
+    """One episode of an open recording, read as it is needed.
 
     Args:
-        recording: the open recording; it may be closed afterwards.
-        phase: `train` or `eval`.
-        number: the episode of the phase, counted from 0.
+        recording: the run.
+        choice: the episode.
         title: the first line of each frame.
 
     Raises:
         RecordingError: there is no such episode, or the recording holds no steps.
     """
 
-    def __init__(self, recording: Recording, phase: str, number: int, title: str) -> None:
-        self._mdp = recording.mdp
-        self._records = recording.episode_steps(phase, number)
-        self._events = events_of(self._mdp, self._records)
-        self._agents = recording.agents
+    def __init__(self, recording: Recording, choice: EpisodeChoice, title: str) -> None:
+        self._recording, self._phase, self._number = recording, choice.phase, choice.number
+        self._length = len(recording.episode_span(choice.phase, choice.number))
         self._title = title
-        self._drawing = Drawing(self._mdp.scene) if self._mdp.scene is not None else None
-        self._states, self._actions = states_in_words(self._mdp), actions_in_words(self._mdp)
 
     def steps(self) -> Iterator[dict[str, Any]]:
-        """Yield each step as JSON, with numbers and names."""
-        for record, events in zip(self._records, self._events.tolist(), strict=True):
-            state, action, next_state = (int(record[name]) for name in ("state", "action", "next_state"))
+        """Yield each step as JSON: with names where the environment's table has them."""
+        recording, agents = self._recording, self._recording.agents
+        describe = _named(recording) if recording.tabular else _valued(recording)
+        for row in transitions_of(recording, self._phase, self._number):
             yield {
-                "t": int(record["t"]),
-                "state": state,
-                "state_in_words": self._states[state],
-                "action": action,
-                "action_in_words": self._actions[action],
-                "next_state": next_state,
-                "next_state_in_words": self._states[next_state],
-                "rewards": dict(zip(self._agents, record["rewards"].tolist(), strict=True)),
-                "events": [name for bit, name in enumerate(self._mdp.event_names) if events >> bit & 1],
-                "explored": [
-                    agent for i, agent in enumerate(self._agents) if int(record["explored"]) >> i & 1
-                ],
-                "terminated": bool(record["terminated"]),
-                "truncated": bool(record["truncated"]),
+                "t": int(row["t"]),
+                **describe(row),
+                "rewards": dict(zip(agents, as_json(np.asarray(row["rewards"])), strict=True)),
+                "terminated": bool(row["terminated"]),
+                "truncated": bool(row["truncated"]),
             }
 
-    def frames(self) -> Iterator[Text]:
-        """Yield a frame of the first state, and one after each step."""
-        totals = np.zeros(len(self._agents))
-        yield self._frame(0, int(self._records[0]["state"]), ["", "the start", ""])
-        for i, step in enumerate(self.steps()):
-            totals += self._records[i]["rewards"]
-            explored = " (explored)" if step["explored"] else ""
-            rewards = _joined(list(step["rewards"].values()))
-            events = [event_in_words(name) for name in step["events"]]
-            events += ["the end"] if step["terminated"] else ["the step limit"] if step["truncated"] else []
-            lines = [
-                f"{step['action_in_words']}{explored}",
-                f"reward {rewards}, so far {_joined(totals.tolist())}",
-                ", ".join(events),
-            ]
-            yield self._frame(i + 1, step["next_state"], lines)
-
-    def _frame(self, count: int, state: int, lines: list[str]) -> Text:
+    def frames(self) -> Iterator[Frame]:
+        """Yield a frame of the first state, and one after each step, in text alone."""
         from rich.text import Text
 
-        frame = Text.assemble((self._title, "bold"), f"\nstep {count:,} of {len(self._records):,}\n\n")
-        mdp = self._mdp
-        if self._drawing is not None and mdp.scene_cells is not None:
+        recording, phase, episode = self._recording, self._phase, self._number
+        show, describe = _state_drawer(recording, phase, episode), describer(recording)
+        returns = np.zeros(len(recording.agents))
+        for t, row in enumerate(transitions_of(recording, phase, episode), 1):
+            if t == 1:
+                yield Frame(self._above(0) + show(row, is_first=True), Text("the start"))
+            action, events = describe(row)
+            rewards = np.asarray(row["rewards"], np.float64)
+            returns += rewards
+            ended = ENDINGS[ending_of(recording, phase, episode)] if t == self._length else ""
+            below = _below(action, rewards.tolist(), returns.tolist(), events, ended)
+            yield Frame(self._above(t) + show(row, is_first=False), below)
+
+    def illustrated(self, pictures: Pictures) -> Iterator[Frame]:
+        """Yield a frame for each picture of the episode."""
+        for picture in pictures:
+            below = _below(picture.action, picture.rewards, picture.returns, picture.events, picture.ended)
+            if picture.note:
+                below.append(f"\n{picture.note}")
+            yield Frame(self._above(picture.t), below, _png(picture.pixels))
+
+    def _above(self, t: int) -> Text:
+        from rich.text import Text
+
+        return Text.assemble((self._title, "bold"), f"\nstep {t:,} of {self._length:,}\n\n")
+
+
+def _below(action: str, rewards: Sequence[float], returns: Sequence[float], events: str, ended: str) -> Text:
+    from rich.text import Text
+
+    if not action:
+        return Text("the start\n\n")
+    return Text(
+        f"{action}\nreward {_joined(rewards)}, so far {_joined(returns)}\n"
+        + ", ".join(filter(None, [events, ended]))
+    )
+
+
+def _state_drawer(recording: Recording, phase: str, episode: int) -> Callable[..., Text]:
+    """Return a function that draws the state before or after a step, or puts it into words."""
+    from rich.text import Text
+
+    if not recording.tabular:
+        reset = reset_of(recording, phase, episode)
+
+        def words(row: Any, is_first: bool) -> Text:
+            if recording.kind == "step":
+                return Text(f"state {row['state' if is_first else 'next_state']}\n")
+            if not is_first:
+                return Text(f"{value_in_words(row['next_observation'])}\n")
+            first = (
+                "the first observation was lost" if reset is None else value_in_words(reset["observation"])
+            )
+            return Text(f"{first}\n")
+
+        return words
+    mdp = recording.mdp
+    names, drawing = states_in_words(mdp), Drawing(mdp.scene) if mdp.scene is not None else None
+
+    def drawn(row: Any, is_first: bool) -> Text:
+        check_steps(np.asarray(row).reshape(1), mdp, str(recording.path), "recorded")
+        state, text = int(row["state" if is_first else "next_state"]), Text()
+        if drawing is not None and mdp.scene_cells is not None:
             cells = mdp.scene_cells[state]
             carriers = np.full(len(cells), -1) if mdp.scene_carriers is None else mdp.scene_carriers[state]
-            frame.append(self._drawing.draw(cells.tolist(), carriers.tolist()))
-            frame.append(f"\n{self._drawing.legend}\n\n", style="dim")
-        frame.append("\n".join([self._states[state], *lines]))
-        return frame
+            text.append(drawing.draw(cells.tolist(), carriers.tolist()))
+            text.append(f"\n{drawing.legend}\n\n", style="dim")
+        return text.append(f"{names[state]}\n")
+
+    return drawn
 
 
-def _joined(rewards: list[float]) -> str:
+def _named(recording: Recording) -> Callable[[Any], dict[str, Any]]:
+    """Return a function that gives the states, action and events of a step with their names."""
+    mdp, agents = recording.mdp, recording.agents
+    states, actions = states_in_words(mdp), actions_in_words(mdp)
+    words = {"state": states, "action": actions, "next_state": states}
+
+    def describe(row: Any) -> dict[str, Any]:
+        step = np.asarray(row).reshape(1)
+        check_steps(step, mdp, str(recording.path), "recorded")
+        events, explored = int(events_of(mdp, step)[0]), int(row["explored"])
+        found: dict[str, Any] = {}
+        for name, names in words.items():
+            found |= {name: int(row[name]), f"{name}_in_words": names[int(row[name])]}
+        return found | {
+            "events": [name for bit, name in enumerate(mdp.event_names) if events >> bit & 1],
+            "explored": [agent for i, agent in enumerate(agents) if explored >> i & 1],
+        }
+
+    return describe
+
+
+def _valued(recording: Recording) -> Callable[[Any], dict[str, Any]]:
+    """Return a function that gives the action of a step and the observation after it."""
+    if recording.kind == "step":
+        return lambda row: {name: int(row[name]) for name in ("state", "action", "next_state")}
+
+    def describe(row: Any) -> dict[str, Any]:
+        found = {name: as_json(plain_value(row[name])) for name in ("action", "next_observation")}
+        if len(recording.agents) > 1:
+            found["acted"] = [a for i, a in enumerate(recording.agents) if int(row["acted"]) >> i & 1]
+        return found
+
+    return describe
+
+
+def _png(pixels: Pixels) -> bytes:
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG", compress_level=1)
+    return buffer.getvalue()
+
+
+def _joined(rewards: Sequence[float]) -> str:
     """Return rewards as text: `-4`, or `-2 / -2` of several agents."""
     return " / ".join(number(reward, 0 if reward == round(reward) else 2) for reward in rewards)

@@ -122,7 +122,7 @@ class Pictures:
 
     def _generate(self) -> Generator[Picture, None, None]:
         recording, phase, episode = self._recording, self._phase, self._episode
-        describe, painted = _describer(recording), self._painted
+        describe, painted = describer(recording), self._painted
         returns = np.zeros(len(recording.agents))
         none = tuple(returns.tolist())
         pixels = next(painted)
@@ -203,7 +203,7 @@ def _resumed(first: Pixels, painted: Painted) -> Painted:
         painted.close()
 
 
-def _describer(recording: Recording) -> Callable[[Any], tuple[str, str]]:
+def describer(recording: Recording) -> Callable[[Any], tuple[str, str]]:
     """Return how to put a step's action, and what happened in it, in words."""
     if recording.tabular:
         mdp, learners = recording.mdp, recording.agents

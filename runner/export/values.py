@@ -14,7 +14,7 @@ from runner.recording.spaces import Leaf, leaves_of
 
 MAX_NUMBERS: Final = 64
 """Leaves of more numbers are not shown number by number."""
-_FEW: Final = 8
+FEW: Final = 8
 """An array of at most so many numbers is written out in words."""
 _LEAST_SIDE: Final = 16
 """An array of bytes is an image if it has at least this height and width."""
@@ -61,25 +61,32 @@ class Values:
         return np.ascontiguousarray(np.stack([pixels] * 3, axis=-1) if pixels.ndim == 2 else pixels)
 
 
-def value_in_words(value: Any) -> str:
+def value_in_words(value: Any, limit: int = FEW) -> str:
     """Return a value of any space as text on one line: `3`, `[0.12 -0.5]`, `go 3, push [0.5]`.
 
-    Arrays of more than a few numbers are described by their shape.
+    Arrays of more numbers than `limit` are described by their shape.
     """
-    if isinstance(value, np.void) and value.dtype.names:
-        value = {name: value[name] for name in value.dtype.names}
+    value = plain_value(value)
     if isinstance(value, Mapping):
-        return ", ".join(f"{name} {value_in_words(part)}" for name, part in value.items())
+        return ", ".join(f"{name} {value_in_words(part, limit)}" for name, part in value.items())
     if isinstance(value, tuple):
-        return f"({', '.join(map(value_in_words, value))})"
+        return f"({', '.join(value_in_words(part, limit) for part in value)})"
     if isinstance(value, str):
         return repr(value)
     array = np.asarray(value)
-    if array.size > _FEW:
+    if array.size > limit:
         return f"{array.dtype} [{', '.join(map(str, array.shape))}]"
     if array.ndim:
         return f"[{' '.join(f'{number:.3g}' for number in array.ravel().tolist())}]"
     return f"{array.item():.3g}" if array.dtype.kind == "f" else f"{array.item()}"
+
+
+def plain_value(value: Any) -> Any:
+    """Return a value whose records are dictionaries, or tuples if their fields are numbered."""
+    if not isinstance(value, np.void) or not value.dtype.names:
+        return value
+    parts = {name: plain_value(value[name]) for name in value.dtype.names}
+    return tuple(parts.values()) if list(parts) == [str(i) for i in range(len(parts))] else parts
 
 
 def _part(value: Any, leaf: Leaf) -> Any:

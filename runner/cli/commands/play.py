@@ -3,24 +3,39 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import itertools
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from runner.cli import Command
-from runner.cli.options import episode_option, json_option, recordings_option, run_argument, trial_option
-from runner.cli.output import console, print_json
+from runner.cli.options import (
+    episode_option,
+    json_option,
+    recordings_option,
+    run_argument,
+    trial_option,
+    trust_option,
+)
+from runner.cli.output import console, print_json, say
+from runner.cli.progress import stage_line
 from runner.cli.runs import find_recorded
+from runner.errors import MissingExtra
+from runner.util.extras import require
 
 if TYPE_CHECKING:
-    from rich.text import Text
+    from rich.console import Console, ConsoleOptions, RenderResult
+    from rich.live import Live
 
+    from runner.cli.episode import Frame
+    from runner.export.episodes import EpisodeChoice
+    from runner.export.pictures import Pictures
     from runner.recording.reader import Recording
 
 ReadKey = Callable[[float | None], str]
@@ -35,6 +50,8 @@ _MEANINGS: Final = {
     **dict.fromkeys((b"n", b"\x1b[C", b"\xe0M"), "forward"),
 }
 """The bytes that terminals send (of arrows escape sequences, on Windows after 0xE0), and their meaning."""
+_MAX_COLUMNS: Final = 100
+"""The largest width of a picture."""
 _POLL_SECONDS: Final = 0.02
 
 
@@ -50,6 +67,8 @@ _POLL_SECONDS: Final = 0.02
     metavar="STEPS",
     help="Steps per second.",
 )
+@click.option("--no-pictures", is_flag=True, help="Show text alone.")
+@trust_option
 @recordings_option
 @json_option
 def play_command(
@@ -57,16 +76,22 @@ def play_command(
     episode: int | None,
     trial: tuple[int, int] | None,
     speed: float,
+    no_pictures: bool,
+    trust: bool,
     recordings: Path | None,
     as_json: bool,
 ) -> None:
-    """Replay a recorded episode of RUN, frame by frame, with actions and rewards.
+    """Replay a recorded episode of RUN, step by step, with actions and rewards.
 
-    By default it is the typical trial of the last evaluation: the median by success, return and length; of a
-    run without evaluations the last training episode. Everything is drawn from the recording; its environment
-    need not be installed. In a terminal the space bar pauses, the arrow keys (or b and n) step back and
-    forward, and q quits. Where stdout is no terminal, the frames come one after another, without waiting.
-    With --json, one line for each step.
+    By default it is the typical trial of the last evaluation: the median by success, return and length; of
+    your own loop the first trial of its last evaluation; of a run without evaluations the last training
+    episode. The space bar pauses, the arrow keys (or b and n) step back and forward, and q quits. Where
+    stdout is no terminal, the frames come one after another, without waiting. With --json, one line for each
+    step.
+
+    In a terminal it shows pictures, as `dualtaxi export film` does: by the terminal's graphics (kitty,
+    sixel), else by coloured half blocks. Scenes are drawn in text where there are no graphics. NO_COLOR and
+    --no-pictures turn pictures off.
 
     Examples:
       dualtaxi play @latest
@@ -76,51 +101,116 @@ def play_command(
     if episode is not None and trial is not None:
         raise click.UsageError("--episode and --eval exclude each other: choose one.")
     from runner.cli.episode import Episode
-    from runner.export.contents import require_steps
+    from runner.export.episodes import chosen_episode
     from runner.recording.reader import open_recording
 
-    run = find_recorded(run_name, recordings)
-    with open_recording(run.recording) as recording:
-        require_steps(recording, "play")
-        phase, number, title = _chosen(recording, episode, trial)
-        played = Episode(recording, phase, number, f"{run.title}: {title}")
-    terminal = console()
-    if as_json:
-        for step in played.steps():
-            print_json(step, indent=None)
-    elif not terminal.is_terminal:
-        for frame in played.frames():
-            click.echo("\n".join(line.rstrip() for line in frame.plain.splitlines()) + "\n")
-    else:
+    run, terminal = find_recorded(run_name, recordings), console()
+    with open_recording(run.recording) as recording, contextlib.ExitStack() as stack:
+        choice = chosen_episode(recording, episode, trial)
+        played = Episode(recording, choice, f"{run.title}: {choice.title}")
+        if as_json:
+            for step in played.steps():
+                print_json(step, indent=None)
+            return
+        if not terminal.is_terminal:
+            for frame in played.frames():
+                text = (frame.above + frame.below).plain
+                click.echo("\n".join(line.rstrip() for line in text.splitlines()) + "\n")
+            return
+        image = None if no_pictures else _image_type(recording.tabular)
+        frames = played.frames()
+        if image is not None and (shown := _pictures(recording, choice, trust, stack)) is not None:
+            frames = played.illustrated(shown)
+
         from rich.live import Live
 
-        with Live(console=terminal, auto_refresh=False) as live, _key_reader() as read_key:
-            _play(played.frames(), 1 / speed, read_key, lambda frame: live.update(frame, refresh=True))
+        live = stack.enter_context(Live(console=terminal, auto_refresh=False, vertical_overflow="crop"))
+        read_key = stack.enter_context(_key_reader())
+        _play(frames, 1 / speed, read_key, _Screen(live, image).show)
 
 
-def _chosen(recording: Recording, episode: int | None, trial: tuple[int, int] | None) -> tuple[str, int, str]:
-    """Return phase, number and title of the chosen episode.
+def _image_type(is_tabular: bool) -> Any:
+    """Return what draws pictures in this terminal, a renderable of `textual_image`; None for nothing.
 
-    Raises:
-        RecordingError: the recording has no such evaluation or trial.
+    To find out, the terminal is asked once, and answers on stdin.
     """
-    from runner.analysis.evaluations import evaluation_after, evaluations_of
-    from runner.environments.naming import trial_in_words
-    from runner.export.reports.episode import default_trial
-    from runner.recording.schema import TRAIN_EPISODE
+    if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or not sys.stdin.isatty():
+        return None
+    try:
+        drawn = require("textual_image.renderable", "PIL", extra="film", purpose="play with pictures")
+    except MissingExtra as error:
+        if not is_tabular:  # a scene is drawn in text
+            say(str(error))
+        return None
+    has_graphics = drawn.Image in (drawn.SixelImage, drawn.TGPImage)
+    return drawn.Image if has_graphics or not is_tabular else None
 
-    evaluations = [] if episode is not None else evaluations_of(recording)
-    if trial is None and not evaluations:
-        number = max(recording.count(TRAIN_EPISODE) - 1, 0) if episode is None else episode
-        return "train", number, f"training episode {number:,}"
-    after, number = trial or default_trial(recording) or (evaluations[-1].after, 0)
-    where = str(recording.path)
-    index = evaluation_after(evaluations, after, where).trial(number, where)
-    return "eval", index, trial_in_words(after, number)
+
+def _pictures(
+    recording: Recording, choice: EpisodeChoice, trust: bool, stack: contextlib.ExitStack
+) -> Pictures | None:
+    """Return the pictures of an episode, closed with the stack; None if there are only values."""
+    from runner.export.pictures import Source, pictures
+
+    with stage_line("drawing the first picture"):
+        shown = pictures(recording, choice.phase, choice.number, trust)
+    stack.callback(shown.close)
+    if shown.source is Source.VALUES:
+        say(f"There are no pictures: {shown.reason}")
+        return None
+    return shown
+
+
+class _Screen:
+    """Shows frames in a live display.
+
+    Args:
+        live: the display.
+        image: draws pictures, a renderable of `textual_image`; None if there are none.
+    """
+
+    def __init__(self, live: Live, image: Any) -> None:
+        self._live, self._image = live, image
+        self._shown: Any = None
+
+    def show(self, frame: Frame, keys: str) -> None:
+        """Show a frame, and a line about the keys below it if that is not empty."""
+        from rich.console import Group
+        from rich.text import Text
+
+        below = Text.assemble(frame.below, (f"\n{keys}" if keys else "", "dim"))
+        if not frame.picture:
+            self._live.update(frame.above + below, refresh=True)
+            return
+        before, self._shown = self._shown, self._image(io.BytesIO(frame.picture), "auto", "auto")
+        lines = len(frame.above.plain.splitlines()) + len(below.plain.splitlines()) + 2
+        height = max(self._live.console.height - lines, 4)
+        picture = _Bounded(self._shown, _MAX_COLUMNS, height)
+        self._live.update(Group(frame.above, picture, below), refresh=True)
+        if before is not None:
+            before.cleanup()  # a terminal with graphics keeps every picture until it is removed
+
+
+class _Bounded:
+    """A renderable of at most some columns and lines.
+
+    Args:
+        inner: what is shown.
+        columns: the largest width.
+        lines: the largest height.
+    """
+
+    def __init__(self, inner: Any, columns: int, lines: int) -> None:
+        self._inner, self._columns, self._lines = inner, columns, lines
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Render it within these bounds."""
+        width = min(options.max_width, self._columns)
+        yield from console.render(self._inner, options.update(width=width, height=self._lines))
 
 
 def _play(
-    frames: Iterator[Text], seconds: float, read_key: ReadKey | None, show: Callable[[Text], None]
+    frames: Iterator[Frame], seconds: float, read_key: ReadKey | None, show: Callable[[Frame, str], None]
 ) -> None:
     """Show frames at even intervals; keys pause, step back and forward, and quit.
 
@@ -128,15 +218,13 @@ def _play(
         frames: the frames of the episode.
         seconds: between two of them.
         read_key: waits for a key; None if stdin is no terminal.
-        show: draws a frame.
+        show: draws a frame, and a text about the keys.
     """
-    from rich.text import Text
-
     seen = list(itertools.islice(frames, 1))
     number, paused, due = 0, False, time.monotonic() + seconds
     while number < len(seen):
         keys = _PAUSED_KEYS if paused else _KEYS
-        show(Text.assemble(seen[number], ("\n" + keys, "dim")) if read_key else seen[number])
+        show(seen[number], keys if read_key else "")
         key = ""
         if read_key is None:
             time.sleep(max(due - time.monotonic(), 0))

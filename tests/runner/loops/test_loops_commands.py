@@ -155,8 +155,6 @@ def test_verify_finds_a_digest_that_does_not_match_the_messages(folder, tmp_path
     [
         ("evaluate", "pole"),
         ("qtable", "lake"),
-        ("play", "pole"),
-        ("play", "rooms"),
     ],
     ids=" ".join,
 )
@@ -193,6 +191,30 @@ def test_the_grid_of_a_loop_is_played(folder):
     done = dualtaxi(folder, "play", "lake", "--episode", "2")
     assert done.exit_code == 0
     assert "player" in done.stdout
+
+
+def test_the_steps_of_any_loop_are_played(folder):
+    for name in ("pole", "rooms"):
+        with open_recording(runner.find_run(name, folder).recording) as recording:
+            length = int(recording.episodes("train", 1, 2)[0]["length"])
+            steps = [step for step in recording.transitions("train") if step["episode"] == 1]
+        frames = (
+            dualtaxi(folder, "play", name, "--episode", "1").stdout.rstrip().split(f"\n\n{name}, seed 0: ")
+        )
+        assert len(frames) == length + 1
+        assert frames[-1].splitlines()[1] == f"step {length} of {length}"
+        assert f"reward {steps[-1]['rewards'][0]:g}, so far" in frames[-1]
+        lines = dualtaxi(folder, "play", name, "--episode", "1", "--json").stdout.splitlines()
+        played = [json.loads(line) for line in lines]
+        assert [line["rewards"]["agent"] for line in played] == [step["rewards"][0] for step in steps]
+        if name == "pole":
+            observations = np.array([line["next_observation"] for line in played], np.float32)
+            np.testing.assert_array_equal(observations, [step["next_observation"] for step in steps])
+            assert "action 1\n" in frames[1] + frames[2] + frames[3] or "action 0\n" in frames[1]
+        else:
+            missions = [step["next_observation"]["mission"] for step in steps]
+            assert [line["next_observation"]["mission"] for line in played] == missions
+            assert all(repr(mission) in frame for mission, frame in zip(missions, frames[1:], strict=True))
 
 
 def test_a_loop_is_exported_and_imported_with_the_same_content(folder, tmp_path):
