@@ -1,38 +1,120 @@
-"""Time until a browser with an empty cache shows the first page, with ten thousand runs."""
+"""Time until a browser shows the first page, with ten thousand runs; and the first picture of an episode."""
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import tempfile
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from benchmarks.bench_catalogue import LISTED, many, one_run
 from benchmarks.figures import Figure, figure
-from benchmarks.serving import response_times, serving
+from benchmarks.serving import memory_of, response_times, serving
+from runner.service.pictures import IDLE_SECONDS
 from runner.util.files import CACHE_VARIABLE
 
 COLD: Final = (1000, 300)
 """Targets in milliseconds: at least, and aim."""
+CARTPOLE: Final = (1000, 400)
+PONG: Final = (2000, 1000)
+MEMORY: Final = (500, 300)
+"""Targets in MB: at least, and aim."""
 LOADED: Final = "return performance.getEntriesByType('navigation')[0].loadEventEnd"
+PICTURED: Final = """
+document.addEventListener("load", ({ target }) => {
+  if (target.matches?.("img.frame")) window.pictured ??= performance.now();
+}, true);
+"""
+"""Keeps the time of the first picture, in milliseconds since the page was requested."""
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return the milliseconds until the page is loaded, each time in a new browser."""
+    """Return the milliseconds until a page is loaded, or its first picture shown, each in a new browser."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {CACHE_VARIABLE: f"{folder}/cache"}
         recordings = many(one_run(Path(folder, "one")), Path(folder, "many"), LISTED, recordings=False)
         with serving(recordings, environment=environment) as service:
             response_times(service, ["/api/v1/runs"], clients=1, seconds=0.5)
             times = [_loaded(f"{service.url}/runs") for _ in range(3 if quick else 7)]
-    detail = f"{LISTED:,} runs; Chromium with an empty cache, until completely loaded"
-    return [figure("first page, cold", times, "ms", COLD, higher_is_better=False, detail=detail)]
+        detail = f"{LISTED:,} runs; Chromium with an empty cache, until completely loaded"
+        found = [figure("first page, cold", times, "ms", COLD, higher_is_better=False, detail=detail)]
+        return found + _pictures(Path(folder, "loops"), environment, range(1 if quick else 5))
+
+
+def _pictures(recordings: Path, environment: dict[str, str], repetitions: range) -> list[Figure]:
+    """Return the milliseconds until the first picture of an episode without recorded frames."""
+    _record(recordings, "cartpole", _cartpole, 60)
+    _record(recordings, "pong", _pong, 1 + len(repetitions))
+    found, memory = [], 0.0
+    with serving(recordings, environment=environment) as service:
+        for name, target in (("cartpole", CARTPOLE), ("pong", PONG)):
+            addresses = [f"{service.url}/runs/{name}/replay/train/{1 + i}" for i in repetitions]
+            _pictured(f"{service.url}/runs/{name}/replay/train/0")  # once to warm up
+            memory = memory_of(service.process)
+            times = [_pictured(address) for address in addresses]
+            title = f"first picture of an episode, {name}"
+            detail = "no frames recorded: the environment is made again in a new process; empty cache"
+            found.append(figure(title, times, "ms", target, higher_is_better=False, detail=detail))
+            time.sleep(IDLE_SECONDS + 1)  # until the processes of these pages have ended
+    detail = "the service while a page shows pictures of Pong, with the process that draws them"
+    used = figure("memory with pictures", [memory], "MB", MEMORY, higher_is_better=False, detail=detail)
+    return [*found, used]
+
+
+def _record(recordings: Path, name: str, make: Callable[[], Any], episodes: int) -> None:
+    import runner
+
+    with runner.record(make(), recordings, name=name, seed=1) as env:
+        env.action_space.seed(1)
+        for episode in range(episodes):
+            env.reset(seed=1 if episode == 0 else None)
+            over = False
+            while not over:
+                *_, terminated, truncated, _ = env.step(env.action_space.sample())
+                over = terminated or truncated
+
+
+def _cartpole() -> Any:
+    import gymnasium
+
+    return gymnasium.make("CartPole-v1")
+
+
+def _pong() -> Any:
+    import ale_py
+    import gymnasium
+    from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
+
+    gymnasium.register_envs(ale_py)
+    return FrameStackObservation(AtariPreprocessing(gymnasium.make("ALE/Pong-v5", frameskip=1)), 4)
 
 
 def _loaded(address: str) -> float:
+    with _browser() as driver:
+        driver.get(address)
+        return _waited(driver, LOADED)
+
+
+def _pictured(address: str) -> float:
+    with _browser() as driver:
+        driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": PICTURED})
+        driver.get(address)
+        return _waited(driver, "return window.pictured")
+
+
+def _waited(driver: Any, script: str) -> float:
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    return float(WebDriverWait(driver, 60).until(lambda d: d.execute_script(script)))
+
+
+@contextlib.contextmanager
+def _browser() -> Iterator[Any]:
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service
-    from selenium.webdriver.support.ui import WebDriverWait
 
     options = webdriver.ChromeOptions()
     options.binary_location = shutil.which("chromium") or shutil.which("chromium-browser") or ""
@@ -40,8 +122,6 @@ def _loaded(address: str) -> float:
         options.add_argument(argument)
     driver = webdriver.Chrome(options=options, service=Service(shutil.which("chromedriver") or ""))
     try:
-        driver.get(address)
-        whole = WebDriverWait(driver, 60).until(lambda d: d.execute_script(LOADED))
-        return float(whole)
+        yield driver
     finally:
         driver.quit()

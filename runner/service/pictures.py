@@ -22,10 +22,12 @@ from runner.service.logs import LOG
 
 MAX_STREAMS: Final = 4
 """Episodes whose pictures are made at the same time, or kept; each may have a process."""
-IDLE_SECONDS: Final = 20.0
+IDLE_SECONDS: Final = 8.0
 """How long a stream is kept after a response."""
 AHEAD: Final = 32
 """Pictures that are made before they are requested."""
+_JOIN_SECONDS: Final = 1.0
+"""How long the end of the service waits for a stream: an environment may hang."""
 _LENGTH: Final = struct.Struct(">I")
 _FAILED: Final = _LENGTH.pack(2**32 - 1)
 """In place of a length: what follows is the reason why there are no further pictures."""
@@ -74,6 +76,10 @@ class PictureStream:
         """End the thread, and the process of an environment, as soon as possible."""
         self.is_closed = True
         self._places.release()
+
+    def join(self, seconds: float) -> None:
+        """Wait for the thread to end, at most some seconds."""
+        self._thread.join(seconds)
 
     async def records(self, start: int, stop: int) -> AsyncIterator[bytes]:
         """Yield the pictures from step `start` up to `stop`, as far as there are any, each after its length.
@@ -127,9 +133,11 @@ class PictureStreams:
         self._streams: list[PictureStream] = []
 
     def close(self) -> None:
-        """Close all streams."""
+        """Close all streams, and wait a little for those that can end."""
         for stream in self._streams:
             stream.close()
+        for stream in self._streams:
+            stream.join(_JOIN_SECONDS)
 
     def open(self, key: Hashable, make: Make, start: int) -> PictureStream:
         """Return a stream that has the picture at step `start` before it: one that was kept, or a new one.
