@@ -115,7 +115,7 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
         actions=[words(agent, "action", texts) for agent, texts in steps.actions.items()],
         texts=texts,
         time=time,
-        series=series,
+        series=[*series, *_extras(recording, place.phase, span[first : first + limit], notes)],
         notes=notes,
         logged=logged_near(recording, place.phase, time),
     )
@@ -221,6 +221,25 @@ def _joined(found: Sequence[_Steps]) -> _Steps:
         {agent: [text for steps in found for text in steps.actions[agent]] for agent in found[0].actions},
         [join(columns) for columns in zip(*(steps.observations for steps in found), strict=True)],
     )
+
+
+def _extras(recording: Recording, phase: str, part: range, notes: list[str]) -> list[Series]:
+    """Return the values that the loop recorded with these steps, each at the frame before its step."""
+    series = []
+    extras = recording.extras(phase)
+    found = extras.at(np.arange(part.start, part.stop, part.step)) if extras else {}
+    for name, values in found.items():
+        agent = next((one for one in recording.agents if name.startswith(f"{one}/")), "")
+        shape = values.shape[1:]
+        columns = values.reshape(len(part), -1)
+        if columns.shape[1] > MAX_SERIES:
+            notes.append(f"{name}: {_sizes(shape)} numbers with each step")
+            continue
+        for k in range(columns.shape[1]):
+            own = f"{name.removeprefix(f'{agent}/')}{_index(k, shape)}"
+            numbers = [None if value is None else short(value) for value in columns[:, k].tolist()]
+            series.append(Series(agent, "extras", own, [*numbers, None]))
+    return series
 
 
 def _shown_parts(recording: Recording, space: str, limit: int) -> tuple[list[_ShownPart], list[str]]:

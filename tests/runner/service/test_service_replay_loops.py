@@ -171,6 +171,26 @@ def test_agents_are_shown_by_name(client, folder):
     assert (len(found), problem) == (13, "")
 
 
+def test_extras_are_shown_before_the_step_that_they_were_recorded_with(tmp_path):
+    env, rng = gymnasium.make("CartPole-v1"), np.random.default_rng(0)
+    logits = rng.normal(size=(200, 2))
+    with runner.record(env, tmp_path / "r", name="mind") as rec:
+        rec.reset(seed=1)
+        for t in range(200):
+            extras = {"logits": logits[t], "value": 2.0} if t != 3 else {"logits": logits[t]}
+            *_, over, _, _ = rec.step(t % 2, extras=extras)
+            if over:
+                break
+    with TestClient(
+        create_app(Settings(recordings=(tmp_path / "r",), tokens=tmp_path / "t.json")),
+        base_url="http://localhost",
+    ) as client:
+        shown = {one["name"]: one for one in part(client, "mind/replay/train/0")["series"]}
+    assert shown["value"]["kind"] == "extras"
+    assert shown["value"]["values"] == [2 if k != 3 else None for k in range(t + 1)] + [None]
+    assert shown["logits[1]"]["values"][:-1] == pytest.approx(logits[: t + 1, 1], rel=1e-4)
+
+
 def test_recorded_frames_are_passed_on_as_they_are(client, folder):
     length = len(steps_of(folder, "framed", "train", 1))
     with open_recording(find_run("framed", folder).recording) as recording:
