@@ -1,0 +1,150 @@
+"""Loops over real environments, and environments of bad habits, for the tests of doing loops again."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+import runner
+from runner.recording.reader import open_recording
+from runner.replay.environment import redo
+from tests.runner.loops.making import Rooms
+
+SEEDING = ("once", "each", "never")
+"""Whether the first reset has a seed, each, or none."""
+
+
+def record(env: Any, folder: Path, steps: int, seeding: str = "once", **options: Any) -> Path:
+    """Record random steps of an environment; return the recording."""
+    with runner.record(env, folder, **options) as recorded:
+        recorded.action_space.seed(1)
+        episode, over = 0, True
+        for _ in range(steps):
+            if over:
+                seed = None if seeding == "never" or (seeding == "once" and episode) else 7 + episode
+                recorded.reset(seed=seed)
+                episode += 1
+            _, _, terminated, truncated, _ = recorded.step(recorded.action_space.sample())
+            over = terminated or truncated
+    return recorded.run.recording
+
+
+def redone(path: Path, *arguments: Any, **options: Any) -> tuple[int, Any]:
+    """Return how many steps were done again, and the first difference."""
+    steps, difference = 0, None
+    with open_recording(path) as recording:
+        for block in redo(recording, *arguments, **options):
+            assert len(block.t) == len(block.got.rewards) == len(block.recorded.observations)
+            steps, difference = steps + len(block), block.difference
+    return steps, difference
+
+
+def rooms() -> Rooms:
+    """Return an environment whose observations and actions are dictionaries."""
+    return Rooms()
+
+
+def rooms_with_text() -> Rooms:
+    """Return one whose observations vary in size."""
+    return Rooms(with_text=True)
+
+
+class Counter(gymnasium.Env[Any, Any]):
+    """Counts its steps from a random number up, and ends at 10 more."""
+
+    observation_space = spaces.Box(0, 1e6, (1,), np.float64)
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        self.t, self.start = 0, float(self.np_random.integers(1000)) + (options or {}).get("add", 0)
+        return np.array([self.start]), {}
+
+    def step(self, action: Any) -> Any:
+        self.t += 1
+        return np.array([self.start + self.t]), self.reward(), self.t == 10, False, {}
+
+    def reward(self) -> float:
+        return 1.0
+
+
+def counter() -> Counter:
+    return Counter()
+
+
+class Hanging(Counter):
+    """Hangs in its 25th step if the variable HANGS is set."""
+
+    steps = 0
+
+    def reward(self) -> float:
+        self.steps += 1
+        if self.steps == 25 and "HANGS" in os.environ:
+            time.sleep(60)
+        return 1.0
+
+
+def hanging() -> Hanging:
+    return Hanging()
+
+
+class Crashing(Counter):
+    """Ends the process in its 25th step if the variable CRASHES is set."""
+
+    steps = 0
+
+    def reward(self) -> float:
+        self.steps += 1
+        if self.steps == 25 and "CRASHES" in os.environ:
+            os._exit(3)
+        return 1.0
+
+
+def crashing() -> Crashing:
+    return Crashing()
+
+
+class Hungry(Counter):
+    """Allocates 3 GB in its first step if the variable HUNGRY is set."""
+
+    def reward(self) -> float:
+        if "HUNGRY" in os.environ:
+            self.food = np.ones(400_000_000)
+        return 1.0
+
+
+def hungry() -> Hungry:
+    return Hungry()
+
+
+class Noisy(Counter):
+    """Draws its rewards from the global generator."""
+
+    def reward(self) -> float:
+        return float(np.random.random())
+
+
+def noisy() -> Noisy:
+    return Noisy()
+
+
+class Blind(Counter):
+    """Needs a display to draw."""
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - as Gymnasium has it
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode = render_mode
+
+    def render(self) -> Any:
+        raise RuntimeError("cannot open display :0")
+
+
+def blind(render_mode: str | None = None) -> Blind:
+    return Blind(render_mode)

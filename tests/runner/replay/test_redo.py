@@ -1,0 +1,189 @@
+"""Loops over real environments come out again, step for step, whatever their resets have for seeds."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import ale_py
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import wrappers
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import NormalizeObservation as NormalizeVector
+
+import runner
+from runner.recording.reader import open_recording
+from runner.replay.capabilities import capabilities
+from runner.replay.environment import redo, redo_in_child
+from tests.runner.loops.making import drive, parallel
+from tests.runner.replay import loops
+from tests.runner.replay.loops import SEEDING, record, redone
+
+gymnasium.register_envs(ale_py)
+
+pytestmark = [
+    # Of MuJoCo and of environments' own makers, not of what is tested.
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+    pytest.mark.filterwarnings("ignore::UserWarning"),
+]
+
+
+def atari(**kwargs):
+    env = wrappers.AtariPreprocessing(gymnasium.make("ALE/Pong-v5", frameskip=1, **kwargs), frame_skip=4)
+    return wrappers.FrameStackObservation(env, 4)
+
+
+ENVIRONMENTS = {
+    "Taxi": (partial(gymnasium.make, "Taxi-v4"), 700),
+    "FrozenLake": (partial(gymnasium.make, "FrozenLake-v1", is_slippery=True), 700),
+    "Blackjack": (partial(gymnasium.make, "Blackjack-v1"), 700),
+    "CartPole": (partial(gymnasium.make, "CartPole-v1"), 700),
+    "Acrobot": (partial(gymnasium.make, "Acrobot-v1", max_episode_steps=100), 700),
+    "LunarLander": (partial(gymnasium.make, "LunarLander-v3", enable_wind=True), 700),
+    "HalfCheetah": (partial(gymnasium.make, "HalfCheetah-v5", max_episode_steps=100), 700),
+    "Pong": (atari, 1100),
+    "BipedalWalker": (partial(gymnasium.make, "BipedalWalker-v3", max_episode_steps=60), 700),
+    "sticky actions": (lambda: wrappers.StickyAction(gymnasium.make("FrozenLake-v1"), 0.3), 700),
+    "running means": (lambda: wrappers.NormalizeObservation(gymnasium.make("CartPole-v1")), 700),
+    "Dict": (loops.rooms, 700),
+    "texts": (loops.rooms_with_text, 300),
+}
+"""Name -> what makes the environment, and steps: more than between two recorded states."""
+
+
+@pytest.mark.parametrize("seeding", SEEDING)
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_an_environment_comes_out_again(name, seeding, tmp_path):
+    make, steps = ENVIRONMENTS[name]
+    own = make if name in ("Dict", "texts") else None
+    path = record(make(), tmp_path, steps, seeding, make=own)
+    assert redone(path, trust=own is not None) == (steps, None)
+    with open_recording(path) as recording:
+        last = recording.count(recording.topic("/train/episode")) - 1
+        length = len(recording.episode_span("train", max(last, 0)))
+    for episode in {max(last, 0), 0}:
+        found = redone(path, "train", [episode], trust=own is not None)
+        assert found[1] is None
+        assert found[0] == length or episode != last
+
+
+@pytest.mark.parametrize("seeding", ["once", "never"])
+@pytest.mark.parametrize("mode", AutoresetMode)
+@pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv])
+def test_a_vector_comes_out_again(kind, mode, seeding, tmp_path):
+    envs = kind([partial(gymnasium.make, "CartPole-v1")] * 3, autoreset_mode=mode)
+    check_vector(envs, seeding, tmp_path)
+
+
+@pytest.mark.parametrize("seeding", ["once", "never"])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: gymnasium.make_vec("CartPole-v1", 3),
+        lambda: NormalizeVector(gymnasium.make_vec("CartPole-v1", 3, vectorization_mode="sync")),
+    ],
+    ids=["of its own class", "with a wrapper around it"],
+)
+def test_a_vector_that_cannot_be_taken_apart_comes_out_again(make, seeding, tmp_path):
+    check_vector(make(), seeding, tmp_path)
+
+
+def check_vector(envs, seeding, folder):
+    """Record 250 steps of three environments, and check that all steps and single episodes come out again."""
+    with runner.record_vector(envs, folder) as recorded:
+        if seeding == "once":
+            drive(recorded, 250)
+        else:
+            recorded.action_space.seed(2)
+            recorded.reset()
+            for _ in range(250):
+                _, _, terminated, truncated, _ = recorded.step(recorded.action_space.sample())
+                over = terminated | truncated
+                if recorded.metadata["autoreset_mode"] == AutoresetMode.DISABLED and over.any():
+                    recorded.reset(options={"reset_mask": over})
+    path = recorded.run.recording
+    with open_recording(path) as recording:
+        steps = [block["t"] for block in recording.blocks(recording.topic("/train/step"))]
+        resets_alone = int(np.count_nonzero(np.concatenate(steps) == 2**32 - 1))
+        spans = [recording.episode_span("train", k) for k in (0, 5, 12)]
+    assert redone(path) == (750 - resets_alone, None)
+    for number, span in zip((0, 5, 12), spans, strict=True):
+        assert redone(path, "train", [number]) == (len(span), None)
+
+
+@pytest.mark.parametrize("seeding", ["each", "never"])
+def test_a_game_of_several_agents_comes_out_again(seeding, tmp_path):
+    from mpe2 import simple_tag_v3
+
+    env = simple_tag_v3.parallel_env(max_cycles=10, num_good=1, num_adversaries=2)
+    with runner.record_parallel(env, tmp_path) as recorded:
+        if seeding == "each":
+            parallel(recorded, 4)
+        else:
+            generator = np.random.default_rng(3)
+            for _ in range(4):
+                recorded.reset()
+                while recorded.agents:
+                    recorded.step({agent: int(generator.integers(5)) for agent in recorded.agents})
+    assert redone(recorded.run.recording) == (40, None)
+    assert redone(recorded.run.recording, "train", [2]) == (10, None)
+
+
+def test_options_of_resets_are_given_again(tmp_path):
+    with runner.record(loops.counter(), tmp_path, make=loops.counter) as env:
+        for seed, options in ((3, {"add": 500}), (None, None), (2**80, {"add": 7})):
+            env.reset(seed=seed, options=options)
+            for _ in range(10):
+                env.step(0)
+    assert redone(env.run.recording, trust=True) == (30, None)
+
+
+@pytest.mark.parametrize("is_shared", [True, False])
+def test_evaluations_between_training_episodes_come_out_again(is_shared, tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path) as env:
+        other = env if is_shared else runner.record(gymnasium.make("CartPole-v1"), into=env, phase="eval")
+        env.reset(seed=1)
+        if not is_shared:
+            other.reset(seed=5)
+        over, ended = False, 0
+        for step in range(400):
+            if over:
+                env.reset()
+            over = env.step(step % 2)[2]
+            ended += over
+            if step % 100 == 50 and not is_shared:  # in the middle of an episode of training
+                other.reset()
+                while not other.step(1)[2]:
+                    pass
+            if over and is_shared and ended % 2 == 0:
+                with env.phase("eval"):
+                    env.reset()
+                    while not env.step(1)[2]:
+                        pass
+    path = env.run.recording
+    with open_recording(path) as recording:
+        evaluated = recording.count(recording.topic("/eval/step"))
+    assert evaluated > 20
+    assert redone(path) == (400 + evaluated, None)
+    assert redone(path, "eval", [1])[1] is None
+    assert redone(path, "train", [7])[1] is None
+
+
+def test_a_child_process_draws_the_pictures_of_an_episode(tmp_path):
+    path = record(gymnasium.make("CartPole-v1"), tmp_path, 200)
+    blocks = list(redo_in_child(path, "train", [3], render=True))
+    with open_recording(path) as recording:
+        steps = recording.episode_steps("train", 3)
+        assert capabilities(recording).picture == "redrawn"
+        (in_process,) = (b for b in redo(recording, "train", [3], render=True) if b.starts)
+    frames = [frame for block in blocks for frame in block.frames]
+    assert len(frames) == sum(map(len, blocks)) == len(steps)
+    assert frames[0].shape == (400, 600, 3)
+    assert frames[0].dtype == np.uint8
+    assert (frames[0] != frames[-1]).any()
+    assert (blocks[0].starts[0].frame == in_process.starts[0].frame).all()
+    assert (blocks[0].frames[0] == in_process.frames[0]).all()
+    assert [t for block in blocks for t in block.t] == list(range(len(steps)))
+    assert {int(episode) for block in blocks for episode in block.episode} == {3}
+    assert (np.concatenate([b.got.rewards for b in blocks]) == steps["rewards"]).all()
