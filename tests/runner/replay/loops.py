@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import time
 from pathlib import Path
@@ -79,13 +80,13 @@ def counter() -> Counter:
 
 
 class Hanging(Counter):
-    """Hangs in its 25th step if the variable HANGS is set."""
+    """Hangs in its 25th step in a child process."""
 
     steps = 0
 
     def reward(self) -> float:
         self.steps += 1
-        if self.steps == 25 and "HANGS" in os.environ:
+        if self.steps == 25 and multiprocessing.parent_process():
             time.sleep(60)
         return 1.0
 
@@ -95,13 +96,13 @@ def hanging() -> Hanging:
 
 
 class Crashing(Counter):
-    """Ends the process in its 25th step if the variable CRASHES is set."""
+    """Ends a child process in its 25th step."""
 
     steps = 0
 
     def reward(self) -> float:
         self.steps += 1
-        if self.steps == 25 and "CRASHES" in os.environ:
+        if self.steps == 25 and multiprocessing.parent_process():
             os._exit(3)
         return 1.0
 
@@ -111,10 +112,10 @@ def crashing() -> Crashing:
 
 
 class Hungry(Counter):
-    """Allocates 3 GB in its first step if the variable HUNGRY is set."""
+    """Allocates 3 GB in a child process."""
 
     def reward(self) -> float:
-        if "HUNGRY" in os.environ:
+        if multiprocessing.parent_process():
             self.food = np.ones(400_000_000)
         return 1.0
 

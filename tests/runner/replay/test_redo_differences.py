@@ -1,0 +1,283 @@
+"""An environment that is not the recorded one is found out at the right step, or the reason is named."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+
+import runner
+from runner.errors import CannotRedo
+from runner.execution.redo import verify_by_redoing
+from runner.recording.maker import EnvironmentMaker
+from runner.recording.reader import open_recording
+from runner.replay.capabilities import capabilities
+from runner.replay.environment import redo, redo_in_child
+from runner.replay.makers import make_environment, why_not_made
+from tests.runner.replay import loops
+from tests.runner.replay.loops import record, redone
+
+
+def cart_pole(**attributes):
+    """Return CartPole with other constants."""
+    env = gymnasium.make("CartPole-v1")
+    for name, value in attributes.items():
+        setattr(env.unwrapped, name, value)
+    return env
+
+
+@pytest.fixture(scope="module")
+def pole(tmp_path_factory):
+    """Return the recording of a loop over CartPole."""
+    return record(gymnasium.make("CartPole-v1"), tmp_path_factory.mktemp("pole"), 600)
+
+
+# --- differences --------------------------------------------------------------------------------------
+
+
+def test_another_constant_is_found_in_the_first_step(pole):
+    steps, difference = redone(pole, make=lambda: cart_pole(gravity=9.81))
+    assert steps == 1
+    assert (difference.phase, difference.episode, difference.t, difference.step) == ("train", 0, 0, 0)
+    assert difference.field == "observation[1]"  # gravity acts on both velocities, and not yet on places
+    with open_recording(pole) as recording:
+        first = recording.episode_steps("train", 0)[0]["next_observation"]
+    assert np.float32(difference.recorded) == first[1] != np.float32(difference.got)
+    assert str(difference).startswith("train episode 0, t 0: observation[1]: recorded ")
+
+
+def test_another_rule_of_the_end_is_found_where_it_first_matters(pole):
+    steps, difference = redone(pole, make=lambda: cart_pole(theta_threshold_radians=math.radians(11)))
+    with open_recording(pole) as recording:
+        rows = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+    beyond = np.abs(rows["next_observation"][:, 2]) > math.radians(11)
+    expected = int(np.argmax(beyond & ~rows["terminated"]))
+    assert (steps, difference.step, difference.field) == (expected + 1, expected, "terminated")
+    assert (difference.episode, difference.t) == (rows["episode"][expected], rows["t"][expected])
+    assert (difference.recorded, difference.got) == (False, True)
+
+
+def test_another_limit_is_found_in_the_first_episode_that_reaches_it(tmp_path):
+    path = record(gymnasium.make("Taxi-v4"), tmp_path, 700)
+    steps, difference = redone(path, make=lambda: gymnasium.make("Taxi-v4", max_episode_steps=150))
+    assert (steps, difference.episode, difference.t, difference.field) == (150, 0, 149, "truncated")
+
+
+def test_another_beginning_is_found_at_the_reset(pole):
+    _, difference = redone(
+        pole, make=lambda: gymnasium.wrappers.TransformObservation(cart_pole(), lambda o: o * 2, None)
+    )
+    assert (difference.t, difference.field) == (0, "first observation[0]")
+
+
+def test_a_difference_in_one_part_of_a_dictionary_is_named(tmp_path):
+    path = record(loops.rooms(), tmp_path, 50)
+
+    class OtherDoors(loops.Rooms):
+        def _observation(self):
+            observation = super()._observation()
+            if self._t == 3:
+                observation["doors"] ^= np.array([0, 1, 0], np.int8)
+            return observation
+
+    _, difference = redone(path, make=OtherDoors)
+    assert (difference.episode, difference.t, difference.field) == (0, 2, "observation['doors'][1]")
+
+
+def test_an_action_that_the_environment_refuses_is_named(tmp_path):
+    class Lenient(gymnasium.Env):
+        observation_space = gymnasium.make("CartPole-v1").observation_space
+        action_space = gymnasium.spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            return gymnasium.make("CartPole-v1").reset(seed=seed)[0], {}
+
+        def step(self, action):
+            return np.zeros(4, np.float32), 1.0, False, False, {}
+
+    with runner.record(Lenient(), tmp_path) as env:
+        env.reset(seed=3)
+        env.step(7)
+    _, difference = redone(env.run.recording, make=cart_pole)
+    assert difference.field == "error"
+    assert "7" in difference.got
+    assert "AssertionError" in difference.got
+
+
+def test_small_differences_are_accepted_within_a_tolerance(pole):
+    def scaled(factor):
+        return lambda: gymnasium.wrappers.TransformObservation(
+            cart_pole(), lambda o: (o * np.float32(factor)).astype(np.float32), None
+        )
+
+    assert redone(pole, make=scaled(1 + 1e-5), tolerance=1e-4) == (600, None)
+    assert redone(pole, make=scaled(1 + 1e-5))[1] is not None
+    assert redone(pole, make=scaled(1 + 1e-2), tolerance=1e-4)[1] is not None
+
+
+def test_a_recording_that_was_cut_by_a_kill_is_done_again_as_far_as_it_goes(pole, tmp_path):
+    data = pole.read_bytes()
+    with open_recording(pole) as recording:
+        spans = [recording.episode_span("train", k) for k in (0, 1)]
+    done = []
+    for share in (0.5, 0.8, 0.97):
+        cut = tmp_path / f"{share}.mcap"
+        cut.write_bytes(data[: int(share * len(data))])
+        with open_recording(cut) as recording:
+            if recording.has_steps:
+                done.append(redone(cut))
+    assert done
+    assert all(difference is None for _, difference in done)
+    assert max(steps for steps, _ in done) > spans[1].stop
+
+
+# --- what cannot be done ------------------------------------------------------------------------------
+
+
+def altered(maker, **spec):
+    """Return a maker whose specification has other values."""
+    return dataclasses.replace(maker, spec=json.dumps(json.loads(maker.spec) | spec))
+
+
+@pytest.fixture(scope="module")
+def maker(pole):
+    with open_recording(pole) as recording:
+        return recording.maker
+
+
+def wrapper(entry_point, **kwargs):
+    return [{"name": "W", "entry_point": entry_point, "kwargs": kwargs}]
+
+
+def test_nothing_is_imported_but_installed_packages_of_environments(maker, tmp_path, monkeypatch):
+    (tmp_path / "trap.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    for hostile in (
+        altered(maker, entry_point="trap:Env"),
+        altered(maker, id="trap:CartPole-v1"),
+        altered(maker, additional_wrappers=wrapper("trap:Wrapper")),
+        dataclasses.replace(maker, registered_by="trap"),
+        dataclasses.replace(maker, make="trap:make", spec=""),
+        EnvironmentMaker("pettingzoo", json.dumps({"entry_point": "trap:parallel_env", "kwargs": {}})),
+    ):
+        with pytest.raises(CannotRedo):
+            make_environment(hostile, trust=False)
+    assert "trap" not in sys.modules
+    with pytest.raises(SystemExit, match="imported"):
+        make_environment(dataclasses.replace(maker, make="trap:make"), trust=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"entry_point": "gymnasium.envs.toy_text.taxi:TaxiEnv"}, "another environment, or another version"),
+        ({"id": "CartPole-v77"}, "not registered with Gymnasium"),
+        ({"additional_wrappers": wrapper("gymnasium.utils.play:play")}, "is not a wrapper"),
+        ({"additional_wrappers": wrapper("gymnasium.wrappers.common:TimeLimit")}, "cannot be made here"),
+        ({"additional_wrappers": "x"}, "does not state its class"),
+        ({"kwargs": {"xml_file": "/etc/passwd"}}, "names a file"),
+        ({"kwargs": {"deep": [{"path": "../secret"}]}}, "names a file"),
+        ({"kwargs": {"x": "y" * 100_000}}, "65,536 at most"),
+        ({"kwargs": {"no_such": 1}}, "no_such"),
+        ({"max_episode_steps": -3}, "not possible"),
+        ({"id": None}, "no id"),
+    ],
+)
+def test_a_hostile_specification_is_refused_with_the_reason(maker, changes, reason):
+    with pytest.raises(CannotRedo, match=reason):
+        make_environment(altered(maker, **changes), trust=False)
+
+
+def test_a_package_that_is_not_installed_is_named(maker):
+    for trust in (False, True):
+        missing = dataclasses.replace(maker, registered_by="miniworld")
+        assert why_not_made(missing, trust) == (
+            "The package miniworld, which the environment needs, is not installed here."
+        )
+
+
+def test_an_environment_of_the_script_itself_cannot_be_made_again(tmp_path):
+    path = record(
+        gymnasium.wrappers.TransformReward(gymnasium.make("CartPole-v1"), lambda r: 2 * r), tmp_path, 20
+    )
+    with open_recording(path) as recording:
+        found = capabilities(recording)
+        assert found.picture == "values"
+        assert not found.can_redo
+        assert "JSON cannot hold" in found.reason
+        with pytest.raises(CannotRedo, match="JSON cannot hold"):
+            next(redo(recording))
+
+
+def test_another_space_is_named(tmp_path):
+    path = record(gymnasium.make("CartPole-v1"), tmp_path, 20)
+    with pytest.raises(CannotRedo, match="another observation space than recorded"):
+        redone(path, make=lambda: gymnasium.make("Pendulum-v1"))
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (loops.hanging, "longer than 2 s"),
+        (loops.crashing, "ended its process"),
+        (loops.hungry, "more than 0.5 GiB"),
+    ],
+)
+def test_an_environment_of_bad_habits_ends_with_the_reason(make, reason, tmp_path):
+    path = record(make(), tmp_path, 60, make=make)
+    with pytest.raises(CannotRedo, match=reason):
+        list(redo_in_child(path, trust=True, seconds=2, memory_bytes=1 << 29))
+    found = verify_by_redoing(path, trust=True, seconds=2, memory_bytes=1 << 29)
+    assert found.verdict == "impossible"
+    assert reason in found.reason
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [(loops.counter, "draw no pictures"), (loops.blind, "cannot open display :0")],
+)
+def test_an_environment_that_cannot_draw_says_so(make, reason, tmp_path):
+    path = record(make(), tmp_path, 30, make=make)
+    with pytest.raises(CannotRedo, match=reason):
+        list(redo_in_child(path, "train", [0], render=True, trust=True))
+    assert redone(path, trust=True) == (30, None)
+
+
+# --- verdicts -----------------------------------------------------------------------------------------
+
+
+def test_a_loop_is_verified_by_doing_it_again(pole):
+    found = verify_by_redoing(pole)
+    with open_recording(pole) as recording:
+        episodes = recording.count(recording.topic("/train/episode"))
+    assert (found.verdict, found.steps, found.difference) == ("reproduced", 600, None)
+    assert found.episodes in (episodes, episodes + 1)
+    sample = verify_by_redoing(pole, sample=4)
+    assert (sample.verdict, sample.episodes, sample.of_episodes) == ("reproduced", 4, episodes)
+    assert 0 < sample.steps < 600
+
+
+def test_state_outside_of_the_seed_is_named(tmp_path):
+    path = record(loops.noisy(), tmp_path, 40, make=loops.noisy)
+    found = verify_by_redoing(path, trust=True)
+    assert found.verdict == "impossible"
+    assert "more than its seed" in found.reason
+    assert (found.difference.episode, found.difference.t, found.difference.field) == (0, 0, "reward")
+
+
+def test_an_environment_of_another_version_differs(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        loops.Counter, "reward", lambda self: 2.0
+    )  # as it was then; the child has it as it is
+    versions = runner.loops.makers.package_versions()
+    monkeypatch.setattr("runner.loops.makers.package_versions", lambda _=(): versions | {"gymnasium": "0.9"})
+    path = record(loops.counter(), tmp_path, 40, make=loops.counter)
+    found = verify_by_redoing(path, trust=True)
+    assert (found.verdict, found.steps) == ("differs", 1)
+    assert (found.difference.field, found.difference.recorded, found.difference.got) == ("reward", 2.0, 1.0)
+    assert found.versions == {"gymnasium": ("0.9", gymnasium.__version__)}
