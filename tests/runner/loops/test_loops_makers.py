@@ -120,13 +120,13 @@ def test_videos_are_not_made_again(tmp_path, monkeypatch):
 def test_environments_of_a_vector_that_differ_are_named(tmp_path):
     envs = SyncVectorEnv(
         [lambda g=g: gymnasium.make("Pendulum-v1", g=g) for g in (9.0, 9.0, 3.0)],
-        autoreset_mode=AutoresetMode.DISABLED,
+        autoreset_mode=AutoresetMode.NEXT_STEP,
     )
     envs = wrappers.vector.NormalizeObservation(wrappers.vector.RecordEpisodeStatistics(envs))
     maker = maker_of(runner.record_vector(envs, tmp_path))
     assert "not all made in the same way" in maker.reason
     assert maker.vector is not None
-    assert (maker.vector.number, maker.vector.mode, maker.vector.autoreset) == (3, "sync", "Disabled")
+    assert (maker.vector.number, maker.vector.mode, maker.vector.autoreset) == (3, "sync", "NextStep")
     specs = json.loads(maker.vector.wrapper_specs)
     assert [spec["name"] for spec in specs] == ["RecordEpisodeStatistics", "NormalizeObservation"]
     assert specs[1]["kwargs"] == {"epsilon": 1e-8}
