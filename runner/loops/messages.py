@@ -30,7 +30,7 @@ from runner.util.values import is_utf8
 MAX_INFO_BYTES: Final = 1 << 20
 """The most bytes of JSON for the info of one step."""
 _MAX_WAITING: Final = 1024
-"""Logged numbers that wait for the recorder; they are handed over twice a second at the latest."""
+"""Logged numbers, or states, that wait for the recorder; it gets them twice a second at the latest."""
 _LONG_NAME: Final = 200
 """Numbers under longer names do not wait, because together they would be large."""
 _JPEG_QUALITY: Final = 90
@@ -237,6 +237,8 @@ class Messages:
         """Record what a reset depended on, of the reset that was just put down. The caller holds the lock."""
         if self._loop.records():
             self._states.append((self._topics[f"/{phase}/reset_state"], state, self._loop.position))
+            if len(self._states) == _MAX_WAITING:
+                self.commit()
 
     def frame(self, phase: str, image: Any) -> None:
         """Record a picture, [height, width, 3] of uint8; another thread encodes it.
