@@ -83,7 +83,6 @@ def _pull_contents(client: Connection, run: Run, report: Report) -> None:
     store = Store(run.folder.parent)
     wanted = {each.digest: each for each in run.checkpoints() if not each.is_here}
     if not wanted:
-        store.refer(run.folder.name, [each.digest for each in run.checkpoints()])
         return
     listed = client.request_object("GET", f"/runs/{quote(run.run_id, safe='')}/checkpoints")
     there = {each["digest"] for each in listed["checkpoints"] if each["here"]}

@@ -23,6 +23,7 @@ from runner.recording.messages import encode, encode_image, encode_log, scalar_e
 from runner.recording.recorder import Recorder
 from runner.recording.reset_states import ResetState
 from runner.recording.schema import STEP_NANOSECONDS, Topic
+from runner.runs.checkpoints import MAX_CHECKPOINTS
 from runner.runs.store import Store
 from runner.util.jsonable import as_json
 from runner.util.values import is_utf8
@@ -178,6 +179,8 @@ class Messages:
         fields = {"name": name, "phase": phase, "step": step, "episode": episode}
         fields |= {"digest": digest, "size": size, "format": kind}
         with self._loop.lock:
+            if self._recorder.counts[schema.CHECKPOINT_TOPIC.name] == MAX_CHECKPOINTS:
+                raise ConfigError(f"checkpoint: found more than {MAX_CHECKPOINTS:,} in a run")
             position = self._loop.position  # other threads may have taken steps while it was stored
             self._recorder.append(schema.CHECKPOINT_TOPIC, encode(schema.CHECKPOINT, fields), position)
             self.has_logged = True

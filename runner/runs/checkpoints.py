@@ -27,6 +27,8 @@ from runner.util.extras import require
 from runner.util.files import hash_of, open_regular
 
 FORMATS: Final = ("bytes", "file", "safetensors", "pickle")
+MAX_CHECKPOINTS: Final = 1 << 17
+"""The most checkpoints that are read of a recording."""
 MAX_LOADED: Final = 16 << 30
 """The largest content that is read into memory."""
 _MAX_MESSAGE: Final = 4096
@@ -147,7 +149,8 @@ def read_checkpoints(recording: Recording, recordings: Path) -> list[Checkpoint]
     """
     if recording.is_job:
         return []
-    store, found = Store(recordings), []
+    store = Store(recordings)
+    found: list[Checkpoint] = []
     for fields in recording.decoded(schema.CHECKPOINT_TOPIC, _MAX_MESSAGE):
         if not (
             DIGEST.fullmatch(fields["digest"])
@@ -157,6 +160,8 @@ def read_checkpoints(recording: Recording, recordings: Path) -> list[Checkpoint]
             and fields["format"] in FORMATS
         ):
             raise RecordingError(f"{recording.path}: found an invalid checkpoint at {fields['log_time']} ns.")
+        if len(found) == MAX_CHECKPOINTS:
+            raise RecordingError(f"{recording.path}: has more than {MAX_CHECKPOINTS:,} checkpoints.")
         values = {key: value for key, value in fields.items() if key != "log_time"}
         found.append(Checkpoint(**values, path=store.path(fields["digest"])))
     return found

@@ -22,9 +22,11 @@ from runner.recording.labels import LABELS_FILE, MAX_TAGS, Labels, as_json, chan
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of, continues, rewrite
 from runner.recording.run_file import parse_run_file
+from runner.runs.checkpoints import read_checkpoints
 from runner.runs.locking import locked
 from runner.runs.resolve import run_with_id
 from runner.runs.run import MADE_BY, RECORDING_FILE, RUN_FILE, Run, new_run_id, run_at
+from runner.runs.store import Store
 from runner.util.files import storage_errors, sync, write_object
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN
 
@@ -90,6 +92,7 @@ def import_recording(
         exported = _export_record(opened)
         facts = _checked_facts(opened, exported if details is None else details)
         finished = opened.finished
+        contents = [checkpoint.digest for checkpoint in read_checkpoints(opened, recordings)]
     if not finished and not is_merely_cut_off(recording):
         raise RecordingError(f"{recording}: is damaged, not merely cut off; `dualtaxi repair` repairs it.")
     if labels is None:
@@ -99,6 +102,9 @@ def import_recording(
     if as_new:
         facts["run_id"] = new_run_id(recordings)
     target = recordings / facts["run_id"]
+    if contents:  # those that are in the store already stay there
+        recordings.mkdir(parents=True, exist_ok=True)
+        Store(recordings).refer(target.name, contents)
     existing = None if as_new else _existing_run(target)
     if existing is not None and _has_content(existing, digest):
         return Imported(_finish(existing, facts), digest, already=True, anonymous=anonymous)

@@ -184,6 +184,19 @@ def test_an_archive_has_the_contents_and_a_restore_brings_them_back(tmp_path):
     assert find_run("one", other).checkpoints()[3].load() == b"made by one"
 
 
+def test_an_imported_recording_keeps_the_contents_that_it_refers_to(tmp_path):
+    folder = tmp_path / "runs"
+    run = record_loop(folder, "one")
+    before = objects(folder)
+    assert dualtaxi(folder, "export", "mcap", "one", "-o", str(tmp_path / "one.mcap")).exit_code == 0
+    done = dualtaxi(folder, "import", str(tmp_path / "one.mcap"), "--as-new")
+    assert done.exit_code == 0, done.output
+    assert dualtaxi(folder, "rm", run.run_id, "--yes").exit_code == 0
+    assert objects(folder) == before
+    (left,) = runner.list_runs(folder)
+    assert left.checkpoints()[3].load() == b"made by one"
+
+
 def test_a_digest_that_is_a_path_leads_nowhere(tmp_path):
     store = Store(tmp_path)
     for digest in ("../../secret", "/etc/passwd", "a" * 63, "A" * 64, "a" * 64 + "\n"):
