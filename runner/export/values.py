@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -36,7 +36,7 @@ class Values:
         leaves = leaves_of(description, f"the {name} space")
         self._leaves = [leaf for leaf in leaves if 0 < _count(leaf) <= MAX_NUMBERS]
         self._texts = [leaf for leaf in leaves if leaf.dtype is None]
-        self.names = [each for leaf in self._leaves for each in _names(leaf, name)]
+        self.names = [each for leaf in self._leaves for each in number_names(leaf, name)]
         self.image = next((leaf for leaf in leaves if is_image(leaf)), None)
 
     def numbers_in(self, value: Any) -> NDArray[np.float64]:
@@ -99,12 +99,17 @@ def _count(leaf: Leaf) -> int:
     return 0 if leaf.dtype is None else math.prod(leaf.dtype.shape)
 
 
-def _names(leaf: Leaf, name: str) -> Iterator[str]:
-    """Yield a name for each number of a leaf: `position[0]`."""
-    own = ".".join(leaf.path) or name
+def number_names(leaf: Leaf, name: str, skip: int = 0) -> list[str]:
+    """Return a name for each number of a leaf: `position[0]`; of one without a path `name`.
+
+    Args:
+        leaf: the leaf.
+        name: of the value.
+        skip: how many keys of the leaf's path are left out.
+    """
+    own = ".".join(leaf.path[skip:]) or name
     shape = leaf.dtype.shape if leaf.dtype is not None else ()
-    for place in np.ndindex(shape):
-        yield f"{own}[{', '.join(map(str, place))}]" if place else own
+    return [f"{own}[{', '.join(map(str, place))}]" if place else own for place in np.ndindex(shape)]
 
 
 def is_image(leaf: Leaf) -> bool:

@@ -1,12 +1,15 @@
-"""A loop recorded with `record` in Rerun: episodes, logged values, frames, arrays, and the selected steps."""
+"""A loop recorded with `record` in Rerun: episodes, logged values, frames, arrays, and the selected steps.
+
+Entities of a vector environment are below `train/env_3`, those of a game's agent below `train/agent_0`.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -16,23 +19,42 @@ from numpy.typing import NDArray
 from runner.export.rerun.columns import MAX_ROWS, Batch, Sender, scalars
 from runner.export.rerun.labels import Labels
 from runner.export.rerun.layout import draw_scene, grid_bounds, whole_axis
-from runner.export.rerun.metrics import phase_colours, series_lines
+from runner.export.rerun.metrics import line_colours, phase_colours, series_lines
 from runner.export.rerun.scene import scene_of
 from runner.export.rerun.selection import Selection, Span
 from runner.export.rerun.steps import StepWriter
+from runner.export.values import number_names
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import leaves_of
 from runner.replay.steps import check_steps
 
-MAX_LINES: Final = 16
+MAX_LINES: Final = 24
 """Observations or actions of more numbers are not drawn as lines."""
+MAX_BARS: Final = 16
+"""Extras of more numbers are drawn as bars."""
+MAX_MEMBERS: Final = 8
+"""Environments or agents that are shown in views; all are sent."""
 MAX_ARRAYS: Final = 2
 MAX_LOGGED: Final = 6
-"""Views of logged arrays and of logged scalars in the blueprint, and of extras; all are sent."""
+"""Views of logged arrays, and of logged scalars, in the blueprint; all are sent."""
+_BATCH_BYTES: Final = 64 << 20
 _FRAMES: Final = {"train": schema.TRAIN_FRAME, "eval": schema.EVAL_FRAME}
-Leaf = tuple[str, tuple[str, ...]]
-"""A name, and the path of fields in the record of a step."""
+_OVERVIEW: Final = "Overview"
+Part = tuple[tuple[str, ...], int, list[str]]
+"""The path of a field in the record of a step, what is added to its numbers, and their names."""
+
+
+class Member(NamedTuple):
+    """An environment of a vector, or an agent of a game."""
+
+    number: int
+    name: str = ""
+    """`env_3`, or the agent; empty if there is only one."""
+    column: int = 0
+    """Its column among the rewards."""
+    parts: Mapping[str, list[Part]] = {}
+    """`observation` and `action`, if they are drawn as lines."""
 
 
 class LoopExporter:
@@ -43,14 +65,17 @@ class LoopExporter:
         self._recording = recording
         self._selection = selection
         self._root = root
-        self._learners = recording.agents
         self._scene = scene_of(recording.mdp) if recording.tabular else None
-        self._drawn: dict[str, None] = {}
-        """The parts of both phases that are drawn as lines; a dictionary keeps them in order."""
+        self._is_game = len(recording.agents) > 1
+        self._members = _members(recording, self._scene is not None)
+        self._plots: dict[str, dict[str, list[str]]] = {_OVERVIEW: {}}
+        """The entities that views show as lines, by tab and title."""
+        self._drawn: set[str] = set()
+        """All entities that are lines."""
         self._logged: dict[str, None] = {}
-        self._extras: dict[tuple[str, str], str] = {}
-        """Phase and name to the entity, of extras that are drawn as lines; `_bars` is entity to name."""
+        """Names of logged scalars; a dictionary keeps them in order."""
         self._bars: dict[str, str] = {}
+        """Titles of extras that are drawn as bars, by entity."""
         self._frames: list[str] = []
         self._arrays: dict[str, None] = {}
         self._has_log = False
@@ -76,26 +101,22 @@ class LoopExporter:
         ]
         if self._has_log:
             left.append((rrb.TextLogView(origin=f"{root}/log", name="Log"), 1))
-        plots = [self._plot(name, [f"{phase}/{name}" for phase in schema.PHASES]) for name in self._drawn]
-        extras = {name: entity for (_, name), entity in self._extras.items()}
-        plots += [
-            self._plot(name, [f"{phase}/{entity}" for phase in schema.PHASES])
-            for name, entity in islice(extras.items(), MAX_LOGGED)
-        ]
-        plots += [
-            rrb.BarChartView(origin=f"{root}/{entity}", name=name)
-            for entity, name in islice(self._bars.items(), MAX_ARRAYS)
-        ]
-        plots += [self._plot(name, [f"logged/{name}"]) for name in islice(self._logged, MAX_LOGGED)]
+        tabs = []
+        for tab, plots in self._plots.items():
+            views = [self._plot(title, entities) for title, entities in plots.items()]
+            if tab == _OVERVIEW:
+                views += [
+                    rrb.BarChartView(origin=f"{root}/{entity}", name=name)
+                    for entity, name in islice(self._bars.items(), MAX_ARRAYS)
+                ]
+                views += [self._plot(name, [f"logged/{name}"]) for name in islice(self._logged, MAX_LOGGED)]
+            tabs.append(rrb.Grid(*views, grid_columns=2, name=tab))
+        right = tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0)
         if not left:
-            return rrb.Grid(*plots, grid_columns=2, name=title)
-        views, shares = zip(*left, strict=True)
-        return rrb.Horizontal(
-            rrb.Vertical(*views, row_shares=shares),
-            rrb.Grid(*plots, grid_columns=2),
-            column_shares=[2, 3],
-            name=title,
-        )
+            return rrb.Vertical(right, name=title)
+        shown, shares = zip(*left, strict=True)
+        column = rrb.Vertical(*shown, row_shares=shares)
+        return rrb.Horizontal(column, right, column_shares=[2, 3], name=title)
 
     def export(self) -> None:
         """Send everything that is selected."""
@@ -107,7 +128,7 @@ class LoopExporter:
         self._send_texts()
         self._send_arrays()
         if self._scene is not None:
-            labels = Labels(recording.mdp, self._scene, self._learners)
+            labels = Labels(recording.mdp, self._scene, recording.agents)
             labels.log(self._stream, self._root)
             draw_scene(self._stream, self._root, self._scene)
         else:
@@ -120,14 +141,18 @@ class LoopExporter:
                 self._send_steps(phase, spans[phase], labels)
 
     def _send_episodes(self, phase: str) -> None:
-        sender = self._sender(phase)
-        for k, block in enumerate(self._recording.blocks(schema.PHASES[phase][1])):
-            if not k:
-                self._draw_lines(sender, "return", self._reward_lines(phase))
-                self._draw_lines(sender, "length", [phase])
-            times = self._times(block["log_time"], block["episode"])
-            sender.send("return", times, scalars(block["returns"]))
-            sender.send("length", times, scalars(block["length"].astype(np.float64)[:, np.newaxis]))
+        """Send returns and lengths: of a game one length, and the return of each agent."""
+        for block in self._recording.blocks(schema.PHASES[phase][1]):
+            for member in self._members:
+                own = block if self._is_game else block[self._is_of(block["last_step"], member)]
+                if not len(own):
+                    continue
+                times = self._times(own["log_time"], own["episode"])
+                self._send_lines(phase, member, "return", times, own["returns"][:, [member.column]])
+                if member.column == 0:
+                    length = own["length"].astype(np.float64)[:, np.newaxis]
+                    one = member._replace(name="") if self._is_game else member
+                    self._send_lines(phase, one, "length", times, length)
 
     def _send_frames(self, phase: str) -> None:
         for frame in self._recording.decoded(_FRAMES[phase]):
@@ -172,25 +197,32 @@ class LoopExporter:
             self._log(time, f"array/{name}", rr.Tensor(np.atleast_1d(array.values)))
 
     def _send_steps(self, phase: str, spans: Sequence[Span], labels: Labels | None) -> None:
-        """Send steps of the first environment, in all their views."""
-        recording, sender, leaves = self._recording, self._sender(phase), self._leaves()
+        """Send steps of every environment and agent, in all their views."""
+        recording = self._recording
         grid: StepWriter | None = None
         training_ends = self._training_ends() if labels is not None and phase == "eval" else None
-        for number, steps in enumerate(self._batches(recording.topic(f"/{phase}/step"), spans)):
-            if number == 0:
-                self._draw_lines(sender, "reward", self._reward_lines(phase))
-                for part, paths in leaves.items():
-                    self._draw_lines(sender, part, list(_line_names(steps, paths)))
-                if labels is not None:
-                    grid = StepWriter(self._stream, self._root, phase, recording.mdp, self._scene, labels)
-            times = self._times(steps["log_time"], steps["episode"])
-            times.append(rr.TimeColumn("t", sequence=steps["t"].astype(np.int64)))
-            sender.send("reward", times, scalars(steps["rewards"]))
-            for part, paths in leaves.items():
-                numbers = np.concatenate([_numbers(steps, path) for _, path in paths], axis=1)
-                sender.send(part, times, scalars(numbers))
-            self._send_extras(phase, steps["step"], steps["log_time"], times)
-            if grid is not None:
+        for steps in self._batches(recording.topic(f"/{phase}/step"), spans):
+            extras = recording.extras(phase).at(steps["step"])
+            for member in self._members:
+                is_own = (
+                    (steps["acted"] >> member.number & 1).astype(np.bool_)
+                    if self._is_game
+                    else self._is_of(steps["step"], member)
+                )
+                if not is_own.any():
+                    continue
+                own = steps[is_own]
+                times = self._times(own["log_time"], own["episode"])
+                times.append(rr.TimeColumn("t", sequence=own["t"].astype(np.int64)))
+                self._send_lines(phase, member, "reward", times, own["rewards"][:, [member.column]])
+                for quantity, parts in member.parts.items():
+                    numbers = [_numbers(own, path) + start for path, start, _ in parts]
+                    names = [name for _, _, each in parts for name in each]
+                    self._send_lines(phase, member, quantity, times, np.concatenate(numbers, axis=1), names)
+                values = {name: each[is_own] for name, each in extras.items()}
+                self._send_extras(phase, member, values, own["log_time"], times)
+            if labels is not None:
+                grid = grid or StepWriter(self._stream, self._root, phase, recording.mdp, self._scene, labels)
                 episode = steps["episode"].astype(np.int64)
                 if training_ends is not None:  # evaluation is shown by the training episodes before it
                     episode = np.searchsorted(training_ends, steps["log_time"])
@@ -199,6 +231,10 @@ class LoopExporter:
         if grid is not None:
             grid.clear_gaps(["grid"], grid.covered[-1][1])
 
+    def _is_of(self, steps: NDArray[Any], member: Member) -> NDArray[np.bool_]:
+        """Return which steps, given by number, were taken in an environment."""
+        return np.asarray(steps % self._recording.environments == member.number)
+
     def _training_ends(self) -> NDArray[np.uint64]:
         """Return the times at which training episodes ended."""
         ends = [block["log_time"] for block in self._recording.blocks(schema.TRAIN_EPISODE)]
@@ -206,82 +242,99 @@ class LoopExporter:
 
     def _send_rewards(self, phase: str, spans: Sequence[Span]) -> None:
         """Send the rewards of a loop whose steps vary in size."""
-        sender = self._sender(phase)
-        if spans:
-            self._draw_lines(sender, "reward", self._reward_lines(phase))
+        (member,) = self._members
         for span in spans:
             steps = islice(self._recording.transitions(phase), span.start, span.stop)
             while batch := list(islice(steps, MAX_ROWS)):
-                times, episodes = (np.array([step[key] for step in batch]) for key in ("log_time", "episode"))
+                times, episodes, numbers = (
+                    np.array([step[key] for step in batch]) for key in ("log_time", "episode", "step")
+                )
                 rewards = np.array([step["rewards"] for step in batch])
                 columns = self._times(times, episodes)
-                sender.send("reward", columns, scalars(rewards))
-                self._send_extras(phase, np.array([step["step"] for step in batch]), times, columns)
+                self._send_lines(phase, member, "reward", columns, rewards)
+                values = self._recording.extras(phase).at(numbers)
+                self._send_extras(phase, member, values, times, columns)
 
     def _send_extras(
-        self, phase: str, steps: NDArray[Any], log_times: NDArray[Any], times: list[rr.TimeColumn]
+        self,
+        phase: str,
+        member: Member,
+        extras: Mapping[str, np.ma.MaskedArray[Any, Any]],
+        log_times: NDArray[Any],
+        times: list[rr.TimeColumn],
     ) -> None:
         """Send the values that the loop recorded with these steps: as lines, or as bars if they are many."""
-        sender = self._sender(phase)
-        for name, values in self._recording.extras(phase).at(steps).items():
-            given = ~np.ma.getmaskarray(values).reshape(len(steps), -1)[:, 0]
-            numbers = values.data.reshape(len(steps), -1).astype(np.float64)
-            entity = f"extra/{_entity(name)}"
-            if numbers.shape[1] > MAX_LINES:
-                self._bars.setdefault(f"{phase}/{entity}", name)
+        for name, values in extras.items():
+            own = name
+            if self._is_game:
+                agent, _, own = name.partition("/")
+                if _entity(agent) != member.name:
+                    continue
+            given = ~np.ma.getmaskarray(values).reshape(len(values), -1)[:, 0]
+            numbers = values.data.reshape(len(values), -1).astype(np.float64)
+            quantity = f"extra/{_entity(own)}"
+            if numbers.shape[1] > MAX_BARS:
+                entity = _join(phase, member.name, quantity)
+                self._bars.setdefault(entity, _spaced(member.name, own))
                 for time, row in zip(log_times[given].tolist(), numbers[given], strict=True):
-                    self._log(time, f"{phase}/{entity}", rr.BarChart(row))
+                    self._log(time, entity, rr.BarChart(row))
                 continue
-            if (phase, name) not in self._extras:
-                count = numbers.shape[1]
-                lines = [f"{phase} {name}"] if count == 1 else [f"{phase} {name}[{i}]" for i in range(count)]
-                sender.send_static(entity, series_lines(lines, phase_colours(phase, count)))
-                self._extras[phase, name] = entity
             # A gap in the line where the value was not recorded
-            sender.send(entity, times, scalars(np.where(given[:, np.newaxis], numbers, np.nan)))
+            numbers = np.where(given[:, np.newaxis], numbers, np.nan)
+            names = [f"{own}[{i}]" for i in range(numbers.shape[1])]
+            self._send_lines(phase, member, quantity, times, numbers, names)
 
     def _batches(self, topic: schema.Topic, spans: Sequence[Span]) -> Iterator[NDArray[np.void]]:
-        """Yield the steps of the first environment, at most a batch at a time."""
+        """Yield the steps of all environments, at most a batch of each at a time."""
         recording = self._recording
+        size = recording.dtypes[topic].itemsize
+        limit = max(1, min(MAX_ROWS * recording.environments, _BATCH_BYTES // size))
         for span in spans:
-            for block in recording.blocks(topic, span.start, span.stop):
-                for start in range(0, len(block), MAX_ROWS):
-                    steps = block[start : start + MAX_ROWS]
-                    is_shown = (steps["step"] % recording.environments == 0) & (
-                        steps["t"] != schema.RESET_ONLY
-                    )
-                    steps = steps[is_shown]
-                    if not len(steps):
-                        continue
-                    if self._scene is not None:
-                        check_steps(steps, recording.mdp, str(recording.path), "recorded")
-                    yield steps
+            for start in range(span.start, span.stop, limit):
+                steps = np.concatenate(
+                    [
+                        np.empty(0, recording.dtypes[topic]),
+                        *recording.blocks(topic, start, min(start + limit, span.stop)),
+                    ]
+                )
+                steps = steps[steps["t"] != schema.RESET_ONLY]
+                if not len(steps):
+                    continue
+                if self._scene is not None:
+                    check_steps(steps, recording.mdp, str(recording.path), "recorded")
+                yield steps
 
-    def _leaves(self) -> dict[str, list[Leaf]]:
-        """Return the numbers of a step that are drawn as lines, if there are not too many."""
-        kind, spaces = self._recording.kind, self._recording.spaces
-        if kind == "step" and self._scene is None:
-            return {"observation": [("state", ("state",))], "action": [("action", ("action",))]}
-        leaves: dict[str, list[Leaf]] = {}
-        if kind in ("step", "variable"):
-            return leaves
-        for part, field in (("observation", "next_observation"), ("action", "action")):
-            found = leaves_of(spaces[part], f"the {part} space")
-            sizes = [math.prod(leaf.dtype.shape) for leaf in found if leaf.dtype is not None]
-            if 0 < sum(sizes) <= MAX_LINES:
-                leaves[part] = [(".".join(leaf.path) or part, (field, *leaf.path)) for leaf in found]
-        return leaves
+    def _send_lines(
+        self,
+        phase: str,
+        member: Member,
+        quantity: str,
+        times: list[rr.TimeColumn],
+        values: NDArray[np.float64],
+        names: Sequence[str] = ("",),
+    ) -> None:
+        """Send series, [rows, names]; at first also how they are drawn, and in which view.
+
+        A view shows a quantity of all environments; one of several numbers those of one environment.
+        """
+        entity = _join(phase, member.name, quantity)
+        if entity not in self._drawn:
+            self._drawn.add(entity)
+            colours = phase_colours(phase, len(names))
+            if member.name and len(names) == 1:
+                shown = line_colours(min(len(self._members), MAX_MEMBERS))
+                colours = [shown[member.number % len(shown)]]
+            lines = names if len(names) > 1 else [_spaced(phase, member.name)]
+            self._sender("").send_static(entity, series_lines(lines, colours))
+            tab, title = _OVERVIEW, quantity.removeprefix("extra/")
+            if member.name and len(names) > 1:
+                tab, title = title.capitalize(), _spaced(member.name, title)
+            if member.number < MAX_MEMBERS:
+                self._plots.setdefault(tab, {}).setdefault(title, []).append(entity)
+        self._sender("").send(entity, times, scalars(values))
 
     def _sender(self, part: str) -> Sender:
-        return Sender(self._stream, f"{self._root}/{part}")
-
-    def _draw_lines(self, sender: Sender, part: str, names: Sequence[str]) -> None:
-        phase = sender.path.rpartition("/")[2]
-        self._drawn[part] = None
-        sender.send_static(part, series_lines(names, phase_colours(phase, len(names))))
-
-    def _reward_lines(self, phase: str) -> list[str]:
-        return [f"{phase} {agent}" for agent in self._learners] if len(self._learners) > 1 else [phase]
+        return Sender(self._stream, f"{self._root}/{part}" if part else self._root)
 
     def _plot(self, name: str, entities: Sequence[str]) -> Any:
         contents = [f"{self._root}/{entity}" for entity in entities]
@@ -307,21 +360,55 @@ class LoopExporter:
         ]
 
 
+def _members(recording: Recording, has_scene: bool) -> list[Member]:
+    """Return the environments of a vector, or the agents of a game, or the only environment."""
+    agents, n = recording.agents, recording.environments
+    if len(agents) > 1:
+        return [Member(i, _entity(agent), i, _parts(recording, agent)) for i, agent in enumerate(agents)]
+    parts = {} if has_scene else _parts(recording)
+    return [Member(i, f"env_{i}" if n > 1 else "", 0, parts) for i in range(n)]
+
+
+def _parts(recording: Recording, agent: str = "") -> dict[str, list[Part]]:
+    """Return the numbers of a step, of one agent or of all, that are drawn as lines."""
+    spaces = recording.spaces
+    if recording.kind == "step":
+        fields = {"observation": "state", "action": "action"}
+        starts = {part: spaces[part].get("start") for part in fields}
+        return {
+            part: [((field,), start if isinstance(start := starts[part], int) else 0, [field])]
+            for part, field in fields.items()
+        }
+    found: dict[str, list[Part]] = {}
+    for part, field in (("observation", "next_observation"), ("action", "action")):
+        leaves = [
+            leaf
+            for leaf in leaves_of(spaces[part], f"the {part} space")
+            if leaf.dtype is not None and (not agent or leaf.path[0] == agent)
+        ]
+        count = sum(math.prod(leaf.dtype.shape) for leaf in leaves if leaf.dtype is not None)
+        if recording.kind != "variable" and 0 < count <= MAX_LINES:
+            names = [number_names(leaf, part, skip=1 if agent else 0) for leaf in leaves]
+            found[part] = [((field, *leaf.path), 0, own) for leaf, own in zip(leaves, names, strict=True)]
+    return found
+
+
 def _numbers(steps: NDArray[np.void], path: tuple[str, ...]) -> NDArray[np.float64]:
-    """Return the numbers of a leaf, [n, numbers]."""
+    """Return the numbers of a field, [n, numbers]."""
     column: NDArray[Any] = steps
     for name in path:
         column = column[name]
     return column.reshape(len(steps), -1).astype(np.float64)
 
 
-def _line_names(steps: NDArray[np.void], leaves: Sequence[Leaf]) -> Iterator[str]:
-    """Yield a name for each number of the leaves."""
-    for name, path in leaves:
-        count = _numbers(steps[:1], path).shape[1]
-        yield from (f"{name}[{i}]" for i in range(count)) if count > 1 else (name,)
-
-
 def _entity(name: str) -> str:
     """Return a user's name as a part of an entity's path."""
     return re.sub(r"[^\w.-]+", "_", name)[:80] or "_"
+
+
+def _join(*parts: str) -> str:
+    return "/".join(filter(None, parts))
+
+
+def _spaced(*parts: str) -> str:
+    return " ".join(filter(None, parts))

@@ -122,7 +122,7 @@ def select(recording: Recording, request: Request) -> Selection:
         return selection
     train, evals = episodes_of(recording, "train"), episodes_of(recording, "eval")
     available = _evaluations_with_steps(recording, train, evals)
-    numbers = _training_episodes(recording, request, train)
+    numbers = _training_episodes(recording, request, np.diff(train.first_step))
     selection.train = train.spans(numbers)
     where = str(recording.path)
     chosen = {evaluation_after(available, after, where) for after in request.evaluations}
@@ -161,7 +161,7 @@ def locate(run: Run, request: Request, step: StepRef | None) -> Location:
         episodes, t = episodes_of(recording, phase), step.t
         if step.after is None:
             number, more = step.episode, Request(episodes=((step.episode, step.episode + 1),))
-            if number >= episodes.count:
+            if recording.environments == 1 and number >= episodes.count:
                 raise RecordingError(
                     f"{recording.path}: found no training episode {number}; there are {episodes.count:,}, "
                     "from 0."
@@ -175,12 +175,15 @@ def locate(run: Run, request: Request, step: StepRef | None) -> Location:
             more = Request(
                 evaluations=(step.after,) if recording.is_job else ()
             )  # a loop's are always exported
-        first, stop = episodes.first_step[number : number + 2].tolist()
-        if first + t >= stop:
+        if recording.environments > 1:
+            steps = recording.episode_span(phase, number)
+        else:
+            steps = range(*episodes.first_step[number : number + 2].tolist())
+        if t >= len(steps):
             raise RecordingError(
-                f"{recording.path}: found no t = {t} there; the episode has {stop - first} steps, from 0."
+                f"{recording.path}: found no t = {t} there; the episode has {len(steps)} steps, from 0."
             )
-        time = _time(recording, phase, first + t)
+        time = _time(recording, phase, steps[t])
     if request.everything:
         return Location(time, request)
     added = dataclasses.replace(
@@ -248,16 +251,19 @@ def _evaluations_with_steps(recording: Recording, train: Episodes, evals: Episod
     return evaluations
 
 
-def _training_episodes(recording: Recording, request: Request, train: Episodes) -> NDArray[np.int64]:
-    """Return the numbers of the training episodes of a request, ascending."""
+def _training_episodes(
+    recording: Recording, request: Request, lengths: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return the numbers of the training episodes of a request, ascending, given their lengths."""
+    count = len(lengths)
     if request.everything:
-        return np.arange(train.count)
-    ranges = whole_ranges(request.episodes, train.count, "train", str(recording.path))
+        return np.arange(count)
+    ranges = whole_ranges(request.episodes, count, "train", str(recording.path))
     numbers = [np.empty(0, np.int64), *(np.arange(start, stop) for start, stop in ranges)]
     if request.every:
-        numbers.append(np.arange(0, train.count, request.every))
-    if request.is_default and train.count:
-        numbers.append(_default_episodes(np.diff(train.first_step)))
+        numbers.append(np.arange(0, count, request.every))
+    if request.is_default and count:
+        numbers.append(_default_episodes(lengths))
     return np.unique(np.concatenate(numbers))
 
 
@@ -317,7 +323,7 @@ def _describe_evaluations(
 
 
 def _select_loop(recording: Recording, request: Request, selection: Selection) -> Selection:
-    """Return the steps of a loop in a request: all of them unless there are too many.
+    """Return the steps of a loop in a request; by default all of them unless there are too many.
 
     Raises:
         RecordingError: an episode does not exist, or an evaluation is requested, of which a loop has none.
@@ -329,26 +335,43 @@ def _select_loop(recording: Recording, request: Request, selection: Selection) -
     if recording.kind == "variable":
         selection.warnings.append("Observations and actions vary in size (texts): they are not drawn.")
     total, tested = recording.count(schema.TRAIN_STEP), recording.count(schema.EVAL_STEP)
-    if recording.environments > 1 or recording.kind == "variable" or total <= DEFAULT_STEPS:
+    n = recording.environments
+    is_short = total <= DEFAULT_STEPS or recording.kind == "variable"
+    if request.everything or (request.is_default and is_short):
         stop = total if request.everything else min(total, DEFAULT_STEPS)
         selection.train = [Span(0, stop, 0)] if stop else []
+    elif n > 1:
+        lengths = recording.episodes("train")["length"].astype(np.int64) * n
+        numbers = _training_episodes(recording, request, lengths)
+        selection.train = _joined([recording.episode_span("train", int(number)) for number in numbers])
     else:
         train = episodes_of(recording, "train")
-        selection.train = train.spans(_training_episodes(recording, request, train))
+        selection.train = train.spans(_training_episodes(recording, request, np.diff(train.first_step)))
     first = 0 if request.everything else max(0, tested - DEFAULT_STEPS)
     if tested:
         selection.evaluations = [(Evaluation(0, 0, 0, 0), Span(first, tested, 0))]
     shown = _count(selection.train)
     evaluated = f", {tested - first:,} of {tested:,} of evaluation" if tested else ""
-    environment = (
-        f"of {recording.environments} environments the first, in " if recording.environments > 1 else ""
-    )
-    selection.exported.append(f"{environment}{shown:,} of {total:,} training steps{evaluated}")
+    environments = f" in {n} environments" if n > 1 else ""
+    selection.exported.append(f"{shown:,} of {total:,} training steps{evaluated}{environments}")
     if shown < total or first:
         selection.left_out.append(
             f"{total - shown + first:,} steps (--episodes START:STOP selects; --all: everything)"
         )
     return selection
+
+
+def _joined(episodes: Sequence[range]) -> list[Span]:
+    """Return the steps of episodes of a vector, and of its other environments meanwhile, as few spans."""
+    spans: list[Span] = []
+    for steps in sorted(episodes, key=lambda steps: steps.start):
+        start = steps.start // steps.step * steps.step
+        stop = steps.stop + -steps.stop % steps.step
+        if spans and start <= spans[-1].stop:
+            spans[-1] = dataclasses.replace(spans[-1], stop=max(stop, spans[-1].stop))
+        else:
+            spans.append(Span(start, stop, 0))
+    return spans
 
 
 def _default_time(recording: Recording, request: Request) -> int:
