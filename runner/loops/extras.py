@@ -184,7 +184,7 @@ class Extras:
             layout = ExtraLayout(0, np.dtype(list(self._dtypes.items())))
             payload = encode(schema.EXTRA_COLUMNS, {"json": layout.json})
             recorder.append(schema.EXTRA_COLUMNS_TOPIC, payload, first + self._steps[0])
-            recorder.flush()
+            recorder.flush_messages()
             recorder.resize(dict.fromkeys(_TOPICS.values(), layout.sizes))
             self._is_described = True
         given = self._given(n)

@@ -229,8 +229,12 @@ class Recorder:
         self.counts[topic.name] += 1
         self._pipeline.submit(topic, make, position * STEP_NANOSECONDS)
 
+    def flush_messages(self) -> None:
+        """Write the messages of variable size now; what the caller put into open blocks stays there."""
+        self._batches.flush()
+
     def flush(self) -> None:
-        """Write every open block and batch now."""
+        """Write every open block and batch now; records that were not taken must be put down again."""
         self._batches.flush()
         for lane in self._lanes.values():
             if lane.open is not None and lane.open.filled:

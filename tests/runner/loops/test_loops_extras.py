@@ -145,7 +145,7 @@ def test_the_same_loop_gives_the_same_digest_and_one_without_extras_keeps_its_ow
     plain = []
     for with_extras in (False, True):
         with runner.record(make("CartPole-v1"), tmp_path) as rec:
-            for k, entry in enumerate(play(rec, 50)):
+            for k, entry in enumerate(play(rec, 5000)):
                 if with_extras and entry[0] == "step":
                     rec.note_step(k=k)
         plain.append(dict(rec.run.summary.topic_digests))
