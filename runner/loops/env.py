@@ -146,6 +146,7 @@ class Recorded(Generic[R]):
     def _enter(self, phase: str) -> None:
         self._phase = phase
         self._rows = self._loop.rows(phase)
+        self._take_extras = self._loop.extras.taker(phase, self._rows)
 
     def _record_into(self, loop: Loop[R], is_owner: bool = True) -> None:
         """Record into a loop; its owner closes it when the process ends, if not before."""
@@ -207,7 +208,7 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
     def _enter(self, phase: str) -> None:
         super()._enter(phase)
         self._watch.due = 0
-        self._take, self._take_extras = self._rows.take, self._loop.extras.take
+        self._take = self._rows.take
         self._lock = self._loop.lock
 
     def step(
@@ -224,7 +225,7 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
                 self._loop.activate(self._rows)
             self._take(action, observation, reward, terminated, truncated)
             if extras is not None:
-                self._take_extras(self._phase, self._rows, extras)
+                self._take_extras(extras)
         if self._has_messages:
             self._record_messages(info, terminated or truncated)
         return result

@@ -60,30 +60,36 @@ class Extras:
         self._final = dict.fromkeys(schema.PHASES, -1)
         """The last step of each phase that cannot be extended any more."""
 
-    def take(self, phase: str, rows: PhaseRows, values: Mapping[str, Any]) -> None:
-        """Put down values of a step that was just taken.
+    def taker(self, phase: str, rows: PhaseRows) -> Callable[[Mapping[str, Any]], None]:
+        """Return a function that puts down the values of a step that was just taken, by name.
+
+        It is called with each step, so it has what it needs at hand.
 
         Args:
             phase: `train` or `eval`.
             rows: its steps.
-            values: by name.
 
         Raises:
-            ConfigError: a name or a value cannot be recorded.
+            ConfigError: (from the returned function) a name or a value cannot be recorded.
         """
-        row = len(self._steps)
-        if row >= self._room:
-            self._write(row)
-            row = 0
-        self._phase, put = phase, self._put
-        try:
-            for name, value in values.items():
-                put[name](row, value)
-        except (KeyError, AttributeError):
-            row = self._put_new(row, values)
-        self._steps.append(self._taken[phase] + rows.filled - self._n)
-        if len(values) != len(put):
-            self._partial[row] = set(values)
+        steps, put, partial, taken, n = self._steps, self._put, self._partial, self._taken, self._n
+
+        def take(values: Mapping[str, Any]) -> None:
+            if not values:
+                return
+            row = len(steps)
+            try:
+                for name, value in values.items():
+                    put[name](row, value)
+            except (AttributeError, IndexError, KeyError):  # no mapping, no room, or a new name
+                row = self._put_new(row, values)
+            if not row:
+                self._phase = phase
+            steps.append(taken[phase] + rows.filled - n)
+            if len(values) != len(put):
+                partial[row] = set(values)
+
+        return take
 
     def extend(self, phase: str, rows: PhaseRows, values: Mapping[str, Any]) -> None:
         """Put down further values of the last step of the phase that is recorded now.
@@ -104,7 +110,7 @@ class Extras:
                 "after the last step of the other phase."
             )
         if not self._steps or self._steps[-1] != step:
-            self.take(phase, rows, values)
+            self.taker(phase, rows)(values)
             return
         row = self._put_new(len(self._steps) - 1, values)
         if row in self._partial:
@@ -114,6 +120,9 @@ class Extras:
         """Put down values of which some may have new names; return the row that they have then."""
         if not isinstance(values, Mapping):
             raise ConfigError(f"extras: found {type(values).__name__}, expected values by name")
+        if row == self._room:
+            self._write(row)
+            row = 0
         fresh = {name: self._dtype_of(name, value) for name, value in values.items() if name not in self._put}
         if fresh:
             row = self._grow(row, fresh)
@@ -218,7 +227,9 @@ class Extras:
         if self._steps:
             for column in self._columns.values():
                 column[0] = column[n]
-        self._partial = {row - n: names for row, names in self._partial.items() if row >= n}
+        left = {row - n: names for row, names in self._partial.items() if row >= n}
+        self._partial.clear()
+        self._partial.update(left)
 
 
 def _filler(name: str, column: NDArray[Any]) -> Put:
@@ -233,11 +244,10 @@ def _filler(name: str, column: NDArray[Any]) -> Put:
     scalars = frozenset(() if shape else exact)
 
     def put(row: int, value: Any) -> None:
-        kind = value.__class__
-        if kind is array:  # the usual case costs two comparisons
-            if value.dtype is not base or value.shape != shape:
-                value = _fitting(name, value, base, shape)
-        elif kind not in scalars:
+        if value.__class__ is array and value.dtype is base and value.shape == shape:
+            column[row] = value
+            return
+        if value.__class__ not in scalars:
             value = _fitting(name, value, base, shape)
         try:
             column[row] = value

@@ -51,6 +51,10 @@ class _IgnoredRows:
     def ignore(self, *_: object) -> None:
         """Do nothing."""
 
+    def taker(self, *_: object) -> Callable[..., None]:
+        """Return a function that does nothing."""
+        return self.ignore
+
     open = commit = finish = extend = reshape = take = take_game = reset = ignore
 
 

@@ -39,7 +39,7 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
         self._has_finals = mode == AutoresetMode.SAME_STEP
         self._watch = watch
         self._record_into(loop)
-        self._phase, self._rows = "train", loop.rows("train")
+        Recorded._enter(self, "train")
 
     def _enter(self, phase: str) -> None:
         with self._loop.lock:
@@ -65,7 +65,7 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
                 self._loop.activate(self._rows)
             self._rows.take(actions, observations, rewards, terminated, truncated, final, states)
             if extras is not None:
-                self._loop.extras.take(self._phase, self._rows, extras)
+                self._take_extras(extras)
         if self._options.info:
             self._messages.info(self._phase, _by_environment(infos))
         return result
@@ -250,7 +250,7 @@ class RecordedParallel(Recorded[AgentRows]):
             over = not self.env.agents
             self._rows.take_game(actions, observations, rewards, terminated, truncated, over)
             if extras is not None:
-                self._loop.extras.take(self._phase, self._rows, self._extras_by_name(extras))
+                self._take_extras(self._extras_by_name(extras))
         if self._options.info:
             self._messages.info(self._phase, _by_field(infos))
         return result  # type: ignore[no-any-return]

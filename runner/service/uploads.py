@@ -219,13 +219,9 @@ class Uploads:
             )
             run = run_of_id(announced.run_id, self._recordings) if announced.content_digest else None
             is_there = run is not None and run.summary.content_digest == announced.content_digest
-            if (
-                content_of is not None
-                and announced.digest
-                and store.has(announced.digest, announced.size or 0)
-            ):
-                store.refer(content_of.folder.name, [announced.digest])
-                is_there = True
+            if content_of is not None and announced.digest:
+                store.refer(content_of.folder.name, [announced.digest])  # from now on it stays
+                is_there = store.has(announced.digest, announced.size or 0)
             if is_there:
                 upload = upload.replace(state="stored", offset=announced.size or 0, already=True)
             else:

@@ -62,7 +62,10 @@ def list_uploads(
 @router.post(
     "/uploads",
     status_code=HTTPStatus.CREATED,
-    responses={200: {"model": UploadStatus, "description": "It had begun, or the run is there already."}},
+    responses={
+        200: {"model": UploadStatus, "description": "It had begun, or the run is there already."},
+        **_IN_ORDER,
+    },
     summary="Begin an upload, or find the one of the same bytes.",
 )
 def begin(
