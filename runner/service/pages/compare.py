@@ -12,9 +12,7 @@ from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.groups import flat_config
 from runner.analysis.step_reference import StepRef
-from runner.drawing import svg
 from runner.errors import RunnerError
-from runner.export.encoded import why_no_pictures
 from runner.export.reports.rendering import View
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
@@ -25,7 +23,7 @@ from runner.service.api.comparing import found_runs
 from runner.service.api.replay import LONG
 from runner.service.dependencies import CacheOf, CatalogueOf, ProcessesOf, timed_recording_state
 from runner.service.pages.frame import RunHead, head_of, is_loop, last_evaluation
-from runner.service.pages.panels import Panel
+from runner.service.pages.panels import Panel, panel_of
 from runner.service.pages.rendering import page
 from runner.util import humanize
 
@@ -272,7 +270,4 @@ def _panel(compared: ComparedRun, step: StepRef) -> Panel:
     """Return the replay of an episode of a run."""
     source = f"/api/v1/runs/{compared.head.id}/replay/{step.episode_path}"
     with open_recording(compared.recording) as recording:
-        drawing = svg.drawing_of(recording.mdp) if recording.tabular else None
-        why = "" if drawing else why_no_pictures(recording)
-    scene = "" if drawing is None else drawing.frame(None, f"The grid of {compared.head.name}", style="")
-    return Panel(compared.label, compared.number, source, f"{source}/pictures", scene, why)
+        return panel_of(recording, source, compared.label, compared.number)

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+from runner.drawing import svg
+from runner.export.encoded import why_no_pictures
+from runner.recording.reader import Recording
 
 
 @dataclass(frozen=True)
@@ -19,6 +24,10 @@ class Panel:
     scene: str
     """The grid, as SVG, whose things the script moves; empty without a scene."""
     why_no_pictures: str = ""
+    offset: int = 0
+    """The common step at which the episode begins."""
+    address: str = ""
+    """Address of the page of its replay alone."""
 
     @property
     def has_pictures(self) -> bool:
@@ -29,3 +38,11 @@ class Panel:
     def note(self) -> str:
         """Why there is no picture, as a sentence."""
         return f"There is no picture: {self.why_no_pictures}" if self.why_no_pictures else ""
+
+
+def panel_of(recording: Recording, source: str, label: str, number: int | None = None, **more: Any) -> Panel:
+    """Return the replay of an episode, whose data has the address `source`."""
+    drawing = svg.drawing_of(recording.mdp) if recording.tabular else None
+    why = "" if drawing else why_no_pictures(recording)
+    scene = "" if drawing is None else drawing.frame(None, f"The grid of {label}", style="")
+    return Panel(label, number, source, f"{source}/pictures", scene, why, **more)

@@ -18,16 +18,20 @@ from runner.analysis.evaluations import evaluations_of
 from runner.analysis.step_reference import StepRef
 from runner.drawing import svg
 from runner.errors import RunnerError
-from runner.recording.reader import open_recording
+from runner.export.reports.episode import EpisodePlace, place_of
+from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.api.replay import part_of, prepare_pictures
 from runner.service.dependencies import CacheOf, PicturesOf, ProcessesOf, RecordedRun, recording_state
 from runner.service.pages.frame import RunView, head_of
+from runner.service.pages.panels import Panel, panel_of
 from runner.service.pages.rendering import message_of, page
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
 
+MAX_PANELS: Final = 8
+"""Environments of a vector that a page shows side by side."""
 BEFORE: Final = 250
 """Steps before the requested one in the part that a page shows first, as in `parts.js`."""
 
@@ -81,6 +85,24 @@ class _ReplayView(RunView):
     """Address of the episode's data."""
     reference: str
     """Reference of the episode, without its step."""
+    episode_path: str
+    """Path of the episode below the replays."""
+    environments: int
+    """How many environments take turns."""
+
+
+@dataclass(frozen=True)
+class _EnvironmentsView(RunView):
+    TEMPLATE: ClassVar = "run_environments.html"
+    title: str
+    alone: str
+    """Address of the replay of the episode alone."""
+    shown: list[Panel]
+    length: int
+    """Steps of the episode."""
+    t: int
+    left_out: int
+    """Environments that are not shown."""
 
 
 @router.get("")
@@ -134,6 +156,71 @@ async def trial_replay(
     return await _replay(request, run, cache, processes, streams, (after, trial), t)
 
 
+@router.get("/train/{episode}/environments")
+def training_environments(request: Request, run: RecordedRun, episode: Number, t: T = 0) -> Response:
+    """Show all environments of a vector during a training episode of one of them."""
+    return page(request, _environments(run, StepRef(episode, t)))
+
+
+@router.get("/eval/{after}/{trial}/environments")
+def trial_environments(
+    request: Request, run: RecordedRun, after: Number, trial: Number, t: T = 0
+) -> Response:
+    """Show all environments of a vector during a trial of one of them."""
+    return page(request, _environments(run, StepRef(trial, t, after)))
+
+
+def _environments(run: Run, at: StepRef) -> _EnvironmentsView:
+    """Return the page of an episode and those of the other environments at its first step.
+
+    Raises:
+        RecordingError: there is no such episode.
+    """
+    base = f"/runs/{run.run_id}/replay"
+    with open_recording(run.recording) as recording:
+        place = place_of(recording, (at.episode,) if at.after is None else (at.after, at.episode))
+        span = recording.episode_span(place.phase, place.number)
+        # Trials are numbered within their evaluation, whose first one this is.
+        first = place.number - at.episode
+        panels = []
+        for environment, number in _episodes_at(recording, place, span)[:MAX_PANELS]:
+            own = recording.episode_span(place.phase, number)
+            path = replace(at, episode=number - first, t=0).episode_path
+            name = "trial" if at.after is not None else "episode"
+            panel = panel_of(
+                recording,
+                f"/api/v1{base}/{path}",
+                f"Environment {environment}: {name} {number - first:,}",
+                offset=own.start // own.step - span.start // span.step,
+                address=f"{base}/{path}",
+            )
+            panels.append(panel)
+        return _EnvironmentsView(
+            run=head_of(run),
+            here="replay",
+            title=place.title[0].upper() + place.title[1:],
+            alone=f"{base}/{at.episode_path}",
+            shown=panels,
+            length=len(span),
+            t=min(at.t, len(span)),
+            left_out=max(0, recording.environments - len(panels)),
+        )
+
+
+def _episodes_at(recording: Recording, place: EpisodePlace, span: range) -> list[tuple[int, int]]:
+    """Return each environment and the number of its episode at the first step of another one, if it ended."""
+    topic, n = recording.topic(f"/{place.phase}/episode"), span.step
+    begin = span.start // n * n
+    found = {span.start % n: place.number}
+    for block in recording.blocks(topic, recording.first_from(topic, "last_step", begin)):
+        for last, number in zip(block["last_step"].tolist(), block["episode"].tolist(), strict=True):
+            if last >= begin:
+                found.setdefault(last % n, number)
+        if len(found) == n:
+            break
+    return sorted(found.items())
+
+
 async def _replay(
     request: Request,
     run: Run,
@@ -163,6 +250,7 @@ async def _replay(
 def _view(run: Run, which: tuple[int, ...], step: ShownStep | None, problem: str = "") -> _ReplayView:
     with open_recording(run.recording) as recording:
         episodes = recording.count(recording.topic("/train/episode"))
+        environments = recording.environments
         evaluations = [Evaluation(one.after, one.stop - one.start) for one in evaluations_of(recording)]
     if len(which) == 1:
         count = episodes
@@ -187,6 +275,8 @@ def _view(run: Run, which: tuple[int, ...], step: ShownStep | None, problem: str
         after=neighbour(number + 1),
         source=f"/api/v1/runs/{run.run_id}/replay/{at.episode_path}",
         reference=at.episode_text,
+        episode_path=at.episode_path,
+        environments=environments,
     )
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import io
+import re
 import shutil
 import struct
 import sys
-import threading
 import time
 
 import gymnasium
@@ -158,6 +158,24 @@ def test_the_episode_of_a_vector_is_that_of_its_environment(client, folder):
     assert shown["series"][2]["values"][1:] == pytest.approx(steps["next_observation"][:, 2], rel=1e-4)
     found, problem = pictures(client, "poles/replay/train/4", steps=1000)
     assert (len(found), problem) == (len(steps) + 1, "")
+
+
+def test_the_environments_of_a_vector_are_shown_side_by_side_from_the_same_step(client, folder):
+    own = steps_of(folder, "poles", "train", 4)
+    text = page(client, "/runs/poles/replay/train/4/environments?t=2")
+    panels = re.findall(
+        r'data-source="/api/v1/runs/\w+/replay/train/(\d+)" data-offset="(-?\d+)".*?Environment (\d)',
+        text,
+        re.DOTALL,
+    )
+    assert [environment for *_, environment in panels] == ["0", "1", "2"]
+    for episode, offset, environment in panels:
+        steps = steps_of(folder, "poles", "train", int(episode))
+        assert set(steps["step"] % 3) == {int(environment)}
+        first, last = (int(steps["step"][i]) // 3 for i in (0, -1))
+        assert first == own["step"][0] // 3 + int(offset)
+        assert last >= own["step"][0] // 3
+    assert "4" in [episode for episode, *_ in panels]
 
 
 def test_agents_are_shown_by_name(client, folder):
@@ -332,7 +350,6 @@ def test_streams_are_limited_kept_ones_give_way_and_are_closed_when_nobody_comes
         await until(lambda: len(closed) == MAX_STREAMS + 1)
 
     asyncio.run(run())
-    assert "pictures" not in [thread.name for thread in threading.enumerate()]
 
 
 async def until(holds):
@@ -406,6 +423,18 @@ def test_two_loops_are_played_in_step(opened):
     slider.send_keys(Keys.ARROW_RIGHT * 3)
     wait(browser, lambda: not set(before) & set(shown_pictures(browser)))
     assert browser.find_element(By.CSS_SELECTOR, ".both-count").text.startswith("step 4 of")
+
+
+def test_the_environments_of_a_vector_are_played_in_step(opened):
+    browser = opened("/runs/poles/replay/train/1")
+    browser.find_element(By.PARTIAL_LINK_TEXT, "side by side").click()
+    wait(browser, lambda: len(shown_pictures(browser)) == 3)
+    slider = browser.find_element(By.CSS_SELECTOR, ".both")
+    before = shown_pictures(browser)
+    slider.send_keys(Keys.ARROW_RIGHT)
+    wait(browser, lambda: before != shown_pictures(browser))
+    assert browser.find_element(By.CSS_SELECTOR, ".both-count").text.startswith("step 1 of")
+    wait(browser, lambda: browser.current_url.endswith("/environments?t=1"))
 
 
 def test_the_report_contains_pictures(browser, folder, tmp_path):

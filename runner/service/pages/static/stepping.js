@@ -8,7 +8,7 @@ let timer = null, writing = null;
 
 async function start(root) {
   const { source } = root.dataset, { episode } = await partAt(source, 0);
-  const k = Math.min(Number(bar.dataset.at), episode.length);
+  const k = Math.min(Math.max(0, Number(bar.dataset.at) - Number(root.dataset.offset ?? 0)), episode.length);
   const replay = new Replay(root, { load: async (k) => (await partAt(source, k)).episode, pictures: picturesOf(root, k) });
   await replay.begin(episode, k);
   return replay;
@@ -16,20 +16,21 @@ async function start(root) {
 
 const roots = [...document.querySelectorAll("[data-source]")];
 for (const root of roots) root.querySelector(".description").textContent = "Loading …";
+const offset = (replay) => Number(replay.root.dataset.offset ?? 0);
 const replays = (await Promise.all(roots.map((root) => start(root).catch((error) => {
   root.querySelector(".description").textContent = error.message;
   return null;
 })))).filter(Boolean);
-const length = Math.max(0, ...replays.map((replay) => replay.length));
+const length = Number(bar.dataset.length) || Math.max(0, ...replays.map((replay) => replay.length));
 
 function show(k) {
   k = Math.min(length, Math.max(0, k));
   slider.value = k;
   count.textContent = `step ${k} of ${length}`;
   slider.setAttribute("aria-valuetext", count.textContent);
-  for (const replay of replays) replay.show(Math.min(k, replay.length));
+  for (const replay of replays) replay.show(Math.min(Math.max(0, k - offset(replay)), replay.length));
   clearTimeout(writing);
-  writing = setTimeout(() => history.replaceState(null, "", `${bar.dataset.base}&at=${bar.dataset.prefix}:${k}`), 150);
+  writing = setTimeout(() => history.replaceState(null, "", `${bar.dataset.address}${k}`), 150);
 }
 
 function pause() {
