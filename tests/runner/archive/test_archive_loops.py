@@ -177,7 +177,7 @@ def test_states_before_resets_are_restored(tmp_path):
                 rec.reset()
     restore(archived(rec.run.recording, tmp_path / "archive"), tmp_path / "back.mcap")
     with open_recording(rec.run.recording) as recording, open_recording(tmp_path / "back.mcap") as restored:
-        assert len(list(recording.reset_states("train"))) == 3
+        assert len(list(recording.reset_states("train"))) == 2
         assert list(restored.reset_states("train")) == list(recording.reset_states("train"))
         assert restored.maker == recording.maker
 
