@@ -13,6 +13,7 @@ from runner.recording.spaces import decode
 from runner.util.jsonable import as_json
 
 _MAX_TEXT: Final = 200
+_COMPARED_BYTES: Final = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ class Difference:
         )
 
 
-def differing_rows(recorded: NDArray[Any], got: NDArray[Any], tolerance: float) -> NDArray[np.bool_] | None:
-    """Return which rows differ; None if none does.
+def first_differing_row(recorded: NDArray[Any], got: NDArray[Any], tolerance: float) -> int | None:
+    """Return the number of the first row that differs; None if none does.
 
     Args:
         recorded: a column of records, [rows, ...].
@@ -54,15 +55,24 @@ def differing_rows(recorded: NDArray[Any], got: NDArray[Any], tolerance: float) 
     """
     n = len(recorded)
     if recorded.dtype == object:
-        different = np.fromiter((a != b for a, b in zip(recorded, got, strict=True)), np.bool_, n)
-        return different if different.any() else None
-    if recorded.tobytes() == got.tobytes():
-        return None
-    if not tolerance:
-        left, right = (np.ascontiguousarray(each).view(np.uint8).reshape(n, -1) for each in (recorded, got))
-        return np.asarray((left != right).any(axis=1))
-    different = _beyond(recorded, got, tolerance)
-    return different if different.any() else None
+        different = (k for k in range(n) if recorded[k] != got[k])
+        return next(different, None)
+    # Bytes are copied to be compared: few at a time stay in the processor's caches.
+    rows = max(_COMPARED_BYTES * n // max(got.nbytes, 1), 1)
+    for start in range(0, n, rows):
+        left, right = recorded[start : start + rows], got[start : start + rows]
+        if left.tobytes() == right.tobytes():
+            continue
+        differs = _beyond(left, right, tolerance) if tolerance else _other_bytes(left, right)
+        if differs.any():
+            return start + int(np.argmax(differs))
+    return None
+
+
+def _other_bytes(recorded: NDArray[Any], got: NDArray[Any]) -> NDArray[np.bool_]:
+    n = len(recorded)
+    left, right = (np.ascontiguousarray(each).view(np.uint8).reshape(n, -1) for each in (recorded, got))
+    return np.asarray((left != right).any(axis=1))
 
 
 def _beyond(recorded: NDArray[Any], got: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:
@@ -85,16 +95,16 @@ def differing_value(
         recorded: a NumPy value of a space, or its bytes.
         got: the same.
         description: of the space.
-        tolerance: as for `differing_rows`.
+        tolerance: as for `first_differing_row`.
     """
     if isinstance(recorded, bytes):
         recorded, got = (decode(description, each, "an observation") for each in (recorded, got))
     for place, left, right in _leaves("", recorded, got):
         if left.shape != right.shape or left.dtype != right.dtype:
             return place, _plain(left), _plain(right)
-        rows = differing_rows(left.reshape(-1), right.reshape(-1), tolerance) if left.size else None
-        if rows is not None:
-            at = np.unravel_index(int(np.argmax(rows)), left.shape)
+        first = first_differing_row(left.reshape(-1), right.reshape(-1), tolerance)
+        if first is not None:
+            at = np.unravel_index(first, left.shape)
             index = f"[{', '.join(map(str, at))}]" if at else ""
             return place + index, _plain(left[at]), _plain(right[at])
     return "", _plain(recorded), _plain(got)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from runner.errors import CannotRedo
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.replay.comparing import Difference, differing_rows, differing_value
+from runner.replay.comparing import Difference, differing_value, first_differing_row
 from runner.replay.makers import is_whole_vector, make_environment, make_vector
 from runner.replay.recorded import Piece, RecordedReset, pieces
 from runner.replay.redone import RedoneStart, RedoneSteps, Values
@@ -247,11 +247,9 @@ class Replay:
         """Return the first row that differs, and the first field of it that does; None if none does."""
         done, found = results.done, []
         for name in ("observations", "rewards", "terminated", "truncated"):
-            different = differing_rows(
-                getattr(recorded, name)[:done], getattr(results, name)[:done], self._tolerance
-            )
-            if different is not None:
-                found.append((int(np.argmax(different)), name))
+            was, got = getattr(recorded, name)[:done], getattr(results, name)[:done]
+            if (row := first_differing_row(was, got, self._tolerance)) is not None:
+                found.append((row, name))
         for name in ("agents_terminated", "agents_truncated"):
             got = getattr(results, name)[:done]
             if len(got) and (rows[name][:done] != got).any():
@@ -264,8 +262,7 @@ class Replay:
         recorded = np.empty_like(results.first_observations[:done])
         for k, (_, reset) in enumerate(resets[:done]):
             recorded[k] = reset.observation
-        different = differing_rows(recorded, results.first_observations[:done], self._tolerance)
-        return None if different is None else int(np.argmax(different))
+        return first_differing_row(recorded, results.first_observations[:done], self._tolerance)
 
     def _row_difference(
         self,
