@@ -12,25 +12,25 @@ from __future__ import annotations
 import io
 from collections.abc import Generator, Iterator
 from contextlib import closing
-from itertools import islice
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.drawing import svg
 from runner.errors import CannotRedo
-from runner.export.values import Values
+from runner.export.painting import (
+    EnvironmentDiffers,
+    Painted,
+    frames_every,
+    paint_observation,
+    paint_redrawn,
+)
+from runner.export.pictures import Source, source_of, source_of_recorded
 from runner.recording.reader import Recording, open_recording
-from runner.replay.capabilities import capabilities
-from runner.replay.environment import redo_in_child
-from runner.replay.redone import RedoneSteps
 from runner.replay.steps import reset_of
 from runner.util.extras import require
 
-SECONDS: Final = 20.0
-"""How long an environment may take for a block of steps, or to be made, before it is given up."""
 _END_OF_TIME: Final = 2**62
 """Later than any message, in nanoseconds."""
 _SMALL: Final = 256 * 256
@@ -38,25 +38,23 @@ _SMALL: Final = 256 * 256
 _JPEG_QUALITY: Final = 88
 
 
-def why_no_pictures(recording: Recording) -> str:
-    """Return why an episode has no pictures, as a sentence; empty if there are some, or a scene is drawn."""
-    if recording.is_job:
-        return "" if recording.tabular and svg.drawing_of(recording.mdp) else "The environment has no scene."
-    found = capabilities(recording)
-    if found.picture != "values" or has_images(recording):
-        return ""
-    return found.reason
+def picture_note(recording: Recording, phase: str) -> tuple[bool, str]:
+    """Return whether an episode has pictures besides those of a scene, and why not, or why no better ones."""
+    source, reason = source_of(recording, phase)
+    if source is Source.VALUES:
+        return False, f"There is no picture. {reason}"
+    if source is Source.OBSERVATION:
+        return True, f"These are the observations. {reason}"
+    return source is not Source.SCENE, ""
 
 
-def has_images(recording: Recording) -> bool:
-    """Return whether observations are images."""
-    if recording.kind not in ("transition", "variable"):
-        return False
-    return Values(recording.spaces["observation"], "observation").image is not None
+def encoded_pictures(
+    path: Path, phase: str, episode: int, start: int = 0
+) -> Generator[bytes | str, None, None]:
+    """Yield the pictures of an episode from the frame after `start` steps on; none of a scene, or of values.
 
-
-def encoded_pictures(path: Path, phase: str, episode: int, start: int = 0) -> Generator[bytes, None, None]:
-    """Yield the pictures of an episode from the frame after `start` steps on.
+    Before the first one there may be a note, a text: why they are not drawn by the environment, although it
+    could be made again.
 
     Args:
         path: the recording.
@@ -69,18 +67,35 @@ def encoded_pictures(path: Path, phase: str, episode: int, start: int = 0) -> Ge
         CannotRedo: the environment cannot be made again, or is another one than was recorded.
     """
     with open_recording(path) as recording:
-        source = capabilities(recording).picture
-        if source == "recorded":
+        source, _ = source_of(recording, phase)
+        if source is Source.REDRAWN:
+            has_begun = False
+            try:
+                for data in _painted(paint_redrawn(recording, phase, episode), start):
+                    has_begun = True
+                    yield data
+            except (CannotRedo, EnvironmentDiffers) as error:
+                source = source_of_recorded(recording, phase)
+                if has_begun or source is Source.VALUES:
+                    raise CannotRedo(str(error)) from error
+                yield f"These are the {source}. {error}"
+        if source is Source.RECORDED:
             yield from _recorded(recording, phase, episode, start)
-        elif source == "values" and has_images(recording):
-            yield from _observed(recording, phase, episode, start)
-    if source == "redrawn":
-        yield from _redrawn(path, phase, episode, start)
+        elif source is Source.OBSERVATION:
+            yield from _painted(paint_observation(recording, phase, episode), start)
+
+
+def _painted(painted: Painted, start: int) -> Iterator[bytes]:
+    """Yield pictures as files, from number `start` on."""
+    with closing(painted):
+        for k, pixels in enumerate(painted):
+            if k >= start:
+                yield _encoded(pixels)
 
 
 def _recorded(recording: Recording, phase: str, episode: int, start: int) -> Iterator[bytes]:
     """Yield the last frame at each step; a reset's is the last one before the first step."""
-    every = _frames_every(recording)
+    every = frames_every(recording)
     span = recording.episode_span(phase, episode)
     first = max(0, start - every)
     times = _times(recording, phase, span[max(0, first - 1) :])
@@ -111,51 +126,6 @@ def _times(recording: Recording, phase: str, span: range) -> list[int]:
         return [step["log_time"] for step in steps if span.start <= step["step"] < span.stop]
     blocks = recording.blocks(topic, span.start, span.stop)
     return [time for block in blocks for time in block["log_time"].tolist()][:: span.step]
-
-
-def _frames_every(recording: Recording) -> int:
-    frames = recording.config.get("frames")
-    every = frames.get("every") if isinstance(frames, dict) else None
-    return every if isinstance(every, int) and every > 0 else 1
-
-
-def _observed(recording: Recording, phase: str, episode: int, start: int) -> Iterator[bytes]:
-    """Yield the image in each observation."""
-    values = Values(recording.spaces["observation"], "observation")
-    span = recording.episode_span(phase, episode)
-    if start == 0:
-        reset = reset_of(recording, phase, episode)
-        if reset is None:
-            raise CannotRedo(f"The first observation of {phase} episode {episode} was lost.")
-        yield _encoded(values.pixels_in(reset["observation"]))
-    for step in _steps(recording, phase, span[max(0, start - 1) :]):
-        yield _encoded(values.pixels_in(step["next_observation"]))
-
-
-def _steps(recording: Recording, phase: str, span: range) -> Iterator[Any]:
-    topic = recording.topic(f"/{phase}/step")
-    if topic not in recording.dtypes:
-        yield from islice(recording.transitions(phase), span.start, span.stop)
-        return
-    for block in recording.blocks(topic, span.start, span.stop):
-        yield from block[(span.start - int(block["step"][0])) % span.step :: span.step]
-
-
-def _redrawn(path: Path, phase: str, episode: int, start: int) -> Iterator[bytes]:
-    """Yield pictures that the environment draws when it does the recorded episode again."""
-    k = 0
-    redone = redo_in_child(path, phase, [episode], render=True, seconds=SECONDS)
-    with closing(cast(Generator[RedoneSteps, None, None], redone)) as found:
-        for steps in found:
-            first = [begin.frame for begin in steps.starts if k == 0 and begin.frame is not None][:1]
-            for frame in (*first, *steps.frames):
-                if k >= start:
-                    yield _encoded(frame)
-                k += 1
-            if steps.difference is not None:
-                raise CannotRedo(
-                    f"The environment here is not the recorded one, they differ at {steps.difference}"
-                )
 
 
 def _encoded(pixels: NDArray[np.uint8]) -> bytes:

@@ -117,7 +117,7 @@ class Pictures:
             return _resumed(next(painted), painted)
         except (CannotRedo, EnvironmentDiffers) as error:
             painted.close()
-            self.source, self.reason = _source_of_recorded(self._recording, self._phase), str(error)
+            self.source, self.reason = source_of_recorded(self._recording, self._phase), str(error)
         return _PAINTERS[self.source](*where)
 
     def _generate(self) -> Generator[Picture, None, None]:
@@ -164,7 +164,7 @@ def source_of(recording: Recording, phase: str, trust: bool = False) -> tuple[So
 
     Nothing is imported or made: it may turn out that an environment cannot be made again.
     """
-    recorded = _source_of_recorded(recording, phase)
+    recorded = source_of_recorded(recording, phase)
     is_complete = recorded is Source.RECORDED and frames_every(recording) == 1
     if recorded is Source.SCENE or is_complete:
         return recorded, ""
@@ -174,7 +174,7 @@ def source_of(recording: Recording, phase: str, trust: bool = False) -> tuple[So
     return (recorded, reason) if reason else (Source.REDRAWN, "")
 
 
-def _source_of_recorded(recording: Recording, phase: str) -> Source:
+def source_of_recorded(recording: Recording, phase: str) -> Source:
     """Return the best of what the recording itself has."""
     if recording.tabular and svg.drawing_of(recording.mdp) is not None:
         return Source.SCENE

@@ -22,7 +22,7 @@ from runner.analysis.step_reference import StepRef
 from runner.analysis.summary import random_policy_sentence
 from runner.drawing import svg
 from runner.errors import RecordingError, RunnerError
-from runner.export.encoded import why_no_pictures
+from runner.export.encoded import picture_note
 from runner.export.plots.curves import footnote, panel_plots
 from runner.export.reports.diff import ShownDivergence, difference_view
 from runner.export.reports.episode import last_episode, last_whole_evaluation, trial, typical_trial
@@ -58,8 +58,9 @@ def episode_part(path: Path, which: tuple[int, ...], start: int, steps: int) -> 
     with open_recording(path) as recording:
         episode = playback_of(recording, which, steps, max(0, start - _STEPS_BEFORE))
         scene = recording.environment["scene"] if episode.grid else None
-        reason = "" if episode.grid else why_no_pictures(recording)
-        data = {"episode": asdict(episode), "scene": scene, "why_no_pictures": reason}
+        has_pictures, note = picture_note(recording, "train" if len(which) == 1 else "eval")
+        data = {"episode": asdict(episode), "scene": scene}
+        data |= {"has_pictures": has_pictures, "picture_note": note}
         return json.dumps(data, separators=(",", ":"), ensure_ascii=False).encode(errors="replace")
 
 

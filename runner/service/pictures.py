@@ -32,9 +32,11 @@ _LENGTH: Final = struct.Struct(">I")
 _FAILED: Final = _LENGTH.pack(2**32 - 1)
 """In place of a length: what follows is the reason why there are no further pictures."""
 
+_NOTE: Final = _LENGTH.pack(2**32 - 2)
+"""In place of a length: what follows is a note on all further pictures, after its length."""
 _BUSY: Final = "the pictures of too many episodes are being made at the moment; try again."
 
-Make = Callable[[int], Generator[bytes, None, None]]
+Make = Callable[[int], Generator[bytes | str, None, None]]
 """Returns the pictures of an episode from a step on, as `encoded_pictures` does."""
 
 
@@ -57,7 +59,7 @@ class PictureStream:
         self._end: RunnerError | None = None
         self._has_ended = self.is_closed = False
         self._loop = asyncio.get_running_loop()
-        self._made: asyncio.Queue[bytes | RunnerError | None] = asyncio.Queue()
+        self._made: asyncio.Queue[bytes | str | RunnerError | None] = asyncio.Queue()
         self._places = threading.Semaphore(AHEAD)
         self._thread = threading.Thread(target=self._work, args=(make, start), name="pictures", daemon=True)
         self._thread.start()
@@ -96,6 +98,10 @@ class PictureStream:
                 if number >= start:
                     data = self._last if number == start else made
                     yield _LENGTH.pack(len(data)) + data
+            elif isinstance(made, str):
+                self._places.release()
+                note = made.encode(errors="replace")
+                yield _NOTE + _LENGTH.pack(len(note)) + note
             else:
                 self._has_ended, self._end = True, made
         if self._end is not None:
@@ -121,7 +127,7 @@ class PictureStream:
             )
         self._put(end)
 
-    def _put(self, made: bytes | RunnerError | None) -> None:
+    def _put(self, made: bytes | str | RunnerError | None) -> None:
         if not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._made.put_nowait, made)
 

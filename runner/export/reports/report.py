@@ -20,7 +20,7 @@ from runner.drawing import svg
 from runner.environments.naming import spoken
 from runner.errors import RecordingError
 from runner.export.contents import flat_text, shortcomings, why_no_steps
-from runner.export.encoded import why_no_pictures
+from runner.export.encoded import picture_note
 from runner.export.plots.curves import Plot, footnote, plots_of
 from runner.export.reports.episode import (
     episode_at,
@@ -306,8 +306,7 @@ def _replay(
             progress(f"pictures of episode {number} of {len(shown)}")
             place = place_of(recording, which)
             own = thumbnails(recording.path, place.phase, place.number, len(episode.reward) + 1)
-            if not own.pictures and not own.picture_note:
-                own.picture_note = why_no_pictures(recording)
+            own.picture_note = own.picture_note or picture_note(recording, place.phase)[1]
         has_frames = has_frames or bool(own.pictures)
         data.append(asdict(episode) | asdict(own))
     return Replay([episode.title for _, episode in shown], picture, key, embedded(data), has_frames)

@@ -49,7 +49,13 @@ def thumbnails(path: Path, phase: str, episode: int, frames: int) -> Thumbnails:
     latest = b""
     try:
         with closing(encoded_pictures(path, phase, episode)) as pictures:
-            for k, data in zip(range(frames), pictures, strict=False):
+            for data in pictures:
+                if isinstance(data, str):
+                    found.picture_note = data
+                    continue
+                k = len(found.picture)
+                if k == frames:
+                    break
                 latest = data or latest
                 if k % every == 0 and latest:
                     found.pictures.append(_small(latest))

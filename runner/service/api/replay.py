@@ -64,8 +64,10 @@ class Part(BaseModel):
 
     episode: Playback
     scene: dict[str, Any] | None
-    why_no_pictures: str
-    """Why no pictures of it can be had; empty if the scene is drawn or `/pictures` has them."""
+    has_pictures: bool
+    """Whether `/pictures` has some; of a scene the page draws them itself."""
+    picture_note: str
+    """Why there are none, or no better ones; may be empty."""
 
 
 @router.get("/train/{episode}", response_model=Part, summary="A part of a training episode, to be replayed.")
@@ -107,7 +109,8 @@ async def training_pictures(
     """Return the pictures from a step on: frames that were recorded, or drawn by the environment made again.
 
     Each is preceded by its length in bytes, 32 bits, big-endian; length 0 stands for the same as before. The
-    length 2^32 - 1 is followed by the reason, as text, why there are no further pictures.
+    length 2^32 - 1 is followed by the reason, as text, why there are no further pictures; 2^32 - 2 by the
+    length and the text of a note on the pictures.
     """
     return await _pictures(run, streams, (episode,), start, steps)
 

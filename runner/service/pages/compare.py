@@ -270,4 +270,5 @@ def _panel(compared: ComparedRun, step: StepRef) -> Panel:
     """Return the replay of an episode of a run."""
     source = f"/api/v1/runs/{compared.head.id}/replay/{step.episode_path}"
     with open_recording(compared.recording) as recording:
-        return panel_of(recording, source, compared.label, compared.number)
+        phase = "train" if step.after is None else "eval"
+        return panel_of(recording, phase, source, compared.label, compared.number)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from runner.drawing import svg
-from runner.export.encoded import why_no_pictures
+from runner.export.encoded import picture_note
 from runner.recording.reader import Recording
 
 
@@ -23,26 +23,21 @@ class Panel:
     """Address of its pictures."""
     scene: str
     """The grid, as SVG, whose things the script moves; empty without a scene."""
-    why_no_pictures: str = ""
+    has_pictures: bool = False
+    """Whether pictures are fetched."""
+    note: str = ""
+    """Why there is no picture, or no better one."""
     offset: int = 0
     """The common step at which the episode begins."""
     address: str = ""
     """Address of the page of its replay alone."""
 
-    @property
-    def has_pictures(self) -> bool:
-        """Whether pictures are fetched."""
-        return not (self.scene or self.why_no_pictures)
 
-    @property
-    def note(self) -> str:
-        """Why there is no picture, as a sentence."""
-        return f"There is no picture: {self.why_no_pictures}" if self.why_no_pictures else ""
-
-
-def panel_of(recording: Recording, source: str, label: str, number: int | None = None, **more: Any) -> Panel:
-    """Return the replay of an episode, whose data has the address `source`."""
+def panel_of(
+    recording: Recording, phase: str, source: str, label: str, number: int | None = None, **more: Any
+) -> Panel:
+    """Return the replay of an episode of a phase, whose data has the address `source`."""
     drawing = svg.drawing_of(recording.mdp) if recording.tabular else None
-    why = "" if drawing else why_no_pictures(recording)
+    has_pictures, note = picture_note(recording, phase)
     scene = "" if drawing is None else drawing.frame(None, f"The grid of {label}", style="")
-    return Panel(label, number, source, f"{source}/pictures", scene, why, **more)
+    return Panel(label, number, source, f"{source}/pictures", scene, has_pictures, note, **more)

@@ -189,6 +189,7 @@ def _environments(run: Run, at: StepRef) -> _EnvironmentsView:
             name = "trial" if at.after is not None else "episode"
             panel = panel_of(
                 recording,
+                place.phase,
                 f"/api/v1{base}/{path}",
                 f"Environment {environment}: {name} {number - first:,}",
                 offset=own.start // own.step - span.start // span.step,
@@ -301,8 +302,8 @@ def _step(part: Mapping[str, Any], t: int) -> ShownStep:
         key=key,
         broad=broad,
         facts=_facts(episode, i),
-        note=f"There is no picture: {part['why_no_pictures']}" if part["why_no_pictures"] else "",
-        has_pictures=not (picture or part["why_no_pictures"]),
+        note="" if picture else part["picture_note"],
+        has_pictures=part["has_pictures"] and not picture,
     )
 
 

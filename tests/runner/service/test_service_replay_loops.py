@@ -9,6 +9,7 @@ import shutil
 import struct
 import sys
 import time
+from functools import partial
 
 import gymnasium
 import numpy as np
@@ -23,6 +24,7 @@ from starlette.testclient import TestClient
 
 import runner
 from runner.recording.reader import open_recording
+from runner.replay.environment import redo_in_child
 from runner.runs.resolve import find_run
 from runner.service.app import create_app
 from runner.service.errors import Busy
@@ -91,8 +93,9 @@ def part(client, address, **query):
     return answer.json()["episode"]
 
 
-def pictures(client, address, **query):
-    """Return the pictures of a stream, and the reason why there are no more."""
+def pictures(client, address, notes=None, **query):
+    """Return the pictures of a stream, and the reason why there are no more; collect its notes."""
+    notes = [] if notes is None else notes
     answer = client.get(f"/api/v1/runs/{address}/pictures", params=query)
     assert answer.status_code == 200, answer.text
     data, found = answer.content, []
@@ -100,6 +103,11 @@ def pictures(client, address, **query):
         (length,) = struct.unpack_from(">I", data)
         if length == 2**32 - 1:
             return found, data[4:].decode()
+        if length == 2**32 - 2:
+            (length,) = struct.unpack_from(">I", data, 4)
+            notes.append(data[8 : 8 + length].decode())
+            data = data[8 + length :]
+            continue
         found.append(data[4 : 4 + length])
         data = data[4 + length :]
     return found, ""
@@ -209,7 +217,8 @@ def test_extras_are_shown_before_the_step_that_they_were_recorded_with(tmp_path)
     assert shown["logits[1]"]["values"][:-1] == pytest.approx(logits[: t + 1, 1], rel=1e-4)
 
 
-def test_recorded_frames_are_passed_on_as_they_are(client, folder):
+def test_recorded_frames_are_passed_on_as_they_are(client, folder, monkeypatch):
+    monkeypatch.setattr("runner.export.pictures.why_not_redone", lambda *_: "It is not installed.")
     length = len(steps_of(folder, "framed", "train", 1))
     with open_recording(find_run("framed", folder).recording) as recording:
         recorded = [frame["data"] for frame in recording.decoded(recording.topic("/train/frame"))]
@@ -244,7 +253,7 @@ def test_without_a_picture_the_page_gives_the_reason_and_the_values(client):
     """An environment of the user's own is not imported."""
     known = set(sys.modules)
     text = page(client, "/runs/rooms/replay/train/0?t=2")
-    assert "There is no picture:" in text
+    assert "There is no picture." in text
     assert "data-pictures" not in text
     assert "<dt>Mission</dt>" in text
     assert "<dt>Position[1]</dt>" in text
@@ -274,13 +283,24 @@ def test_pictures_after_the_end_are_none(client):
 
 
 def test_an_environment_that_takes_too_long_is_given_up_with_a_reason(client, monkeypatch):
-    monkeypatch.setattr("runner.export.encoded.SECONDS", 1e-3)
+    monkeypatch.setattr("runner.export.painting.redo_in_child", partial(redo_in_child, seconds=1e-3))
     found, problem = pictures(client, "pole/replay/train/2")
     assert found == []
     assert "took longer than 0.001 s" in problem
 
 
-def test_a_damaged_recording_ends_the_pictures_with_a_reason(folder, tmp_path):
+def test_where_an_environment_cannot_draw_the_recorded_frames_are_shown_with_the_reason(client, monkeypatch):
+    monkeypatch.setattr("runner.export.painting.redo_in_child", partial(redo_in_child, seconds=1e-3))
+    notes = []
+    found, problem = pictures(client, "framed/replay/train/2", notes, steps=1000)
+    assert found[0].startswith(b"\x89PNG")
+    assert found[1:4] == [b"", b"", found[3]]
+    assert "took longer than 0.001 s" in notes[0]
+    assert problem == ""
+
+
+def test_a_damaged_recording_ends_the_pictures_with_a_reason(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("runner.export.pictures.why_not_redone", lambda *_: "It is not installed.")
     data = bytearray(find_run("framed", folder).recording.read_bytes())
     place = data.rindex(b"\x89PNG")  # frames are stored as they are, in chunks with a checksum
     data[place + 100] ^= 255

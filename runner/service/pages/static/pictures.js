@@ -4,12 +4,13 @@ const PIECE = 64, KEPT = 1500, AHEAD = 256;
 // Return the function that `Replay` requests pictures with, or null where a replay has none.
 //
 // A piece is a stream of pictures: for each its length (32 bits, big-endian) and its bytes. Without bytes it is the
-// same as the one before it. The length 2^32 - 1 begins a message in place of the pictures that cannot be had.
+// same as the one before it. The length 2^32 - 1 begins a message in place of the pictures that cannot be had;
+// 2^32 - 2 a note on all of them, after its length.
 export function picturesOf(root, at = 0) {
   const source = root.dataset.pictures;
   if (!source) return null;
   const image = root.querySelector(".frame"), kept = new Map(), messages = new Map();
-  let wanted = at, show = () => {}, reading = null, waiting = null, retry = null, last = Infinity;
+  let note = root.querySelector(".frame-note").textContent, wanted = at, show = () => {}, reading = null, waiting = null, retry = null, last = Infinity;
 
   const known = (k) => kept.has(k) || messages.has(k) || k > last;
 
@@ -23,7 +24,7 @@ export function picturesOf(root, at = 0) {
   }
 
   function tell() {
-    if (kept.has(wanted)) show(kept.get(wanted), messages.get(wanted) ?? "");
+    if (kept.has(wanted)) show(kept.get(wanted), note);
     else if (messages.has(wanted)) show("", messages.get(wanted));
     else show("", "This picture is being made …");
   }
@@ -42,7 +43,7 @@ export function picturesOf(root, at = 0) {
       const response = await fetch(`${source}?start=${start}&steps=${PIECE}`, { signal: own.control.signal });
       if (response.status === 503) retry = setTimeout(() => { messages.clear(); more(); }, 2500);  // others are looking
       if (!response.ok) throw new Error((await response.json().catch(() => null))?.error.message ?? `The service responded with status ${response.status}.`);
-      const failed = await records(response.body.getReader(), (bytes, number) => take(start + number, bytes));
+      const failed = await records(response.body.getReader(), (bytes, number) => take(start + number, bytes), (text) => { note = text; });
       if (failed !== null) throw new Error(failed);
       if (own.next < own.stop) last = Math.min(last, own.next - 1);
     } catch (error) {
@@ -81,8 +82,9 @@ export function picturesOf(root, at = 0) {
   };
 }
 
-// Call `take` with the bytes and the number of each record; return the message that ends the stream, or null.
-async function records(reader, take) {
+// Call `take` with the bytes and the number of each picture, and `noted` with a note; return the message that ends
+// the stream, or null.
+async function records(reader, take, noted) {
   let bytes = new Uint8Array(0), number = 0;
   for (;;) {
     const { value, done } = await reader.read();
@@ -92,7 +94,14 @@ async function records(reader, take) {
     joined.set(value, bytes.length);
     bytes = joined;
     while (bytes.length >= 4) {
-      const length = new DataView(bytes.buffer, bytes.byteOffset).getUint32(0);
+      const view = new DataView(bytes.buffer, bytes.byteOffset), length = view.getUint32(0);
+      if (length === 0xfffffffe) {
+        if (bytes.length < 8 || bytes.length < 8 + view.getUint32(4)) break;
+        const end = 8 + view.getUint32(4);
+        noted(new TextDecoder().decode(bytes.subarray(8, end)));
+        bytes = bytes.subarray(end);
+        continue;
+      }
       if (length === 0xffffffff) {
         const rest = [bytes.slice(4)];
         for (let part = await reader.read(); !part.done; part = await reader.read()) rest.push(part.value);
