@@ -8,61 +8,30 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from fractions import Fraction
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from runner.drawing import palette, raster
+from runner.drawing import palette
 from runner.drawing.raster import Pixels, font, shortened, wrapped
 from runner.environments.naming import spoken
-from runner.errors import RunnerError
+from runner.export.encoder import LOSSLESS, Encoder, format_of, frames_of
 from runner.export.pictures import Picture, Pictures
-from runner.util.extras import require
 
 if TYPE_CHECKING:
-    import av
     from PIL import Image
 
 USUAL_WIDTH: Final = 480
 """Smaller pictures are enlarged to about this width, in pixels."""
 MAX_WIDTH: Final = 1280
 """Larger pictures, and grids, are reduced to this width."""
-LAST_SECONDS: Final = 2.5
-"""Duration of the last frame of a film that starts again by itself."""
 _MARGIN: Final = 12
 _LINES: Final = 3
 """Lines of text below a picture that change."""
-
-
-@dataclass(frozen=True)
-class Format:
-    """How films with one ending are encoded."""
-
-    container: str
-    codec: str
-    pixels: str
-    options: Mapping[str, str]
-    container_options: Mapping[str, str] = field(default_factory=dict)
-
-
-FORMATS: Final = {
-    ".mp4": Format("mp4", "h264", "yuv420p", {"preset": "veryfast", "crf": "18"}, {"movflags": "+faststart"}),
-    ".webm": Format(
-        "webm", "libvpx-vp9", "yuv420p", {"crf": "28", "b": "0", "deadline": "good", "cpu-used": "5"}
-    ),
-    ".gif": Format("gif", "gif", "pal8", {}, {"final_delay": str(round(100 * LAST_SECONDS))}),
-    ".webp": Format(
-        "webp", "libwebp_anim", "yuv420p", {"quality": "90", "compression_level": "2"}, {"loop": "0"}
-    ),
-}
-"""By the ending of the file."""
-_LOSSLESS: Final = Format("matroska", "libx264rgb", "rgb24", {"preset": "ultrafast", "qp": "0"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,23 +51,6 @@ class Film:
     height: int
     notes: tuple[str, ...]
     """Why episodes are not shown to their end, one text for each such episode."""
-
-
-def format_of(path: Path) -> Format:
-    """Return how a film is encoded in a file of this name.
-
-    Raises:
-        RunnerError: its ending stands for no format of films.
-        MissingExtra: PyAV is not installed.
-    """
-    if path.suffix.lower() not in FORMATS:
-        raise RunnerError(
-            f"{path}: found the ending {path.suffix!r}, expected one of {', '.join(FORMATS)}: "
-            "it chooses the format of the film."
-        )
-    require("av", extra="film", purpose="a film")
-    raster.require_packages()
-    return FORMATS[path.suffix.lower()]
 
 
 def write_film(
@@ -158,7 +110,7 @@ def write_grid(
         films: list[Encoder] = []
         done = 0
         for number, shot in enumerate(shots):
-            with contextlib.closing(shot.pictures), Encoder(Path(folder, f"{number}"), _LOSSLESS, fps) as one:
+            with contextlib.closing(shot.pictures), Encoder(Path(folder, f"{number}"), LOSSLESS, fps) as one:
                 for frame in captioned(shot, (width or MAX_WIDTH) // columns, notes):
                     one.add(frame)
                     done += 1
@@ -167,7 +119,7 @@ def write_grid(
         height, each_width = max(one.size[1] for one in films), max(one.size[0] for one in films)
         rows = -(-len(films) // columns)
         canvas = np.full((rows * height, columns * each_width, 3), 255, np.uint8)
-        decoded = [stack.enter_context(contextlib.closing(_frames_of(one.path))) for one in films]
+        decoded = [stack.enter_context(contextlib.closing(frames_of(one.path))) for one in films]
         film = stack.enter_context(Encoder(path, form, fps))
         for _ in range(max(one.frames for one in films)):
             for place, frames in enumerate(decoded):
@@ -176,14 +128,6 @@ def write_grid(
                     canvas[top : top + frame.shape[0], left : left + frame.shape[1]] = frame
             film.add(canvas)
     return Film(film.frames, *film.size, tuple(notes))
-
-
-def _frames_of(path: Path) -> Generator[Pixels, None, None]:
-    import av
-
-    with av.open(path) as container:
-        for frame in container.decode(video=0):
-            yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
 
 
 # --- captions ---------------------------------------------------------------------------------------------
@@ -264,107 +208,3 @@ def _lines(shown: Pictures, picture: Picture) -> list[str]:
         rewards,
         ", ".join(filter(None, [picture.events, picture.ended])),
     ]
-
-
-# --- encoding ---------------------------------------------------------------------------------------------
-
-
-class Encoder:
-    """Encodes frames of one size into a file; a context manager.
-
-    Args:
-        path: the file to write.
-        form: how.
-        fps: frames per second.
-
-    Raises:
-        RunnerError: there is no encoder for it.
-    """
-
-    def __init__(self, path: Path, form: Format, fps: float) -> None:
-        import av
-
-        self.path = path
-        self.frames = 0
-        """Frames that were added."""
-        self.size = 0, 0
-        """Width and height in pixels, known after the first frame."""
-        self._form, self._rate = form, Fraction(fps).limit_denominator(1000)
-        try:
-            av.codec.Codec(form.codec, "w")
-        except av.codec.codec.UnknownCodecError as error:
-            raise RunnerError(
-                f"{path.suffix}: PyAV has no encoder {form.codec} here; choose another ending, or install "
-                "PyAV from its wheel."
-            ) from error
-        self._container = av.open(path, "w", format=form.container, options=dict(form.container_options))
-        self._stream: Any = None
-        self._palettes: av.filter.Graph | None = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        try:
-            if kind is None and self._stream is not None:
-                if self._palettes is not None:
-                    self._encode_indexed(None)
-                self._container.mux(self._stream.encode(None))
-        finally:
-            self._container.close()
-
-    def add(self, pixels: Pixels) -> None:
-        """Add a frame, uint8 [height, width, 3]; sides of odd length get a white line more."""
-        import av
-
-        height, width, _ = pixels.shape
-        if height % 2 or width % 2:
-            pixels = np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), constant_values=255)
-        if self._stream is None:
-            self._open(pixels.shape[1], pixels.shape[0])
-        frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
-        frame.pts, frame.time_base = self.frames, 1 / self._rate
-        self.frames += 1
-        if self._palettes is not None:
-            self._encode_indexed(frame)
-        else:
-            self._container.mux(self._stream.encode(frame))
-
-    def _open(self, width: int, height: int) -> None:
-        self.size = width, height
-        self._stream = self._container.add_stream(self._form.codec, rate=self._rate)
-        self._stream.width, self._stream.height = width, height
-        self._stream.pix_fmt = self._form.pixels
-        self._stream.options = dict(self._form.options)
-        if self._form.pixels == "pal8":
-            self._palettes = _palette_graph(width, height, 1 / self._rate)
-
-    def _encode_indexed(self, frame: av.VideoFrame | None) -> None:
-        """Encode what the graph makes of a frame, or of its end."""
-        import av
-
-        assert self._palettes is not None
-        self._palettes.vpush(frame)
-        with contextlib.suppress(BlockingIOError, av.error.EOFError):
-            while True:
-                self._container.mux(self._stream.encode(self._palettes.vpull()))
-
-
-def _palette_graph(width: int, height: int, time_base: Fraction) -> av.filter.Graph:
-    """Return a graph that gives each frame the palette of its own 256 best colours."""
-    import av.filter
-
-    graph = av.filter.Graph()
-    source = graph.add_buffer(width=width, height=height, format=av.VideoFormat("rgb24"), time_base=time_base)
-    split = graph.add("split")
-    generate = graph.add("palettegen", "stats_mode=single")
-    use = graph.add("paletteuse", "new=1:dither=none")
-    source.link_to(split)
-    split.link_to(generate, 0, 0)
-    split.link_to(use, 1, 0)
-    generate.link_to(use, 0, 1)
-    use.link_to(graph.add("buffersink"))
-    graph.configure()
-    return graph

@@ -98,13 +98,14 @@ def command(
     if len(given) > 1:
         raise click.UsageError(f"{' and '.join(given[:2])} exclude each other: choose one.")
     from runner.export import film
+    from runner.export.encoder import format_of
     from runner.export.episodes import chosen_episode
     from runner.export.pictures import Source, pictures, source_of
     from runner.export.places import require_new, write_new
 
     with opened_run(run_name, recordings, needs_steps=True) as (run, recording):
         path = output or EXPORTS / f"{run.file_stem}.mp4"
-        film.format_of(path)
+        format_of(path)
         require_new(path, force)
         if grid or best or worst:
             shown = _ranked(recording, grid, best)

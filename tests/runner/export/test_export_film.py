@@ -13,7 +13,7 @@ from PIL import Image
 
 import runner
 from runner.cli import cli
-from runner.export import film as films
+from runner.export.encoder import FORMATS, Encoder
 from runner.export.episodes import ranked_episodes
 from runner.export.pictures import pictures
 from runner.export.reports.episode import typical_trial
@@ -21,7 +21,7 @@ from runner.recording.reader import open_recording
 from tests.runner.export.making import made_otherwise
 from tests.runner.loops.making import Rooms, play
 
-ENDINGS = tuple(films.FORMATS)
+ENDINGS = tuple(FORMATS)
 
 
 def film(*words):
@@ -256,7 +256,7 @@ def test_a_file_is_replaced_by_force_only(pictured, tmp_path):
 
 def test_a_film_that_fails_leaves_no_file(pole, tmp_path, monkeypatch):
     run, _ = pole
-    monkeypatch.setattr(films.Encoder, "add", lambda self, pixels: (_ for _ in ()).throw(OSError(28, "full")))
+    monkeypatch.setattr(Encoder, "add", lambda self, pixels: (_ for _ in ()).throw(OSError(28, "full")))
     result = film(run.recording, "--episode", 1, "-o", tmp_path / "film.mp4")
     assert result.exit_code == 1
     assert "cannot be written (full)" in result.stderr
