@@ -66,6 +66,8 @@ CHECKPOINTS: Final = "checkpoints.parquet"
 CONTENTS: Final = "checkpoints/"
 """The folder of the contents of checkpoints, named by their digests."""
 LOG: Final = "log.parquet"
+FRAME_ID: Final = "frame_id"
+"""A column that archives of earlier versions do not have."""
 RUN: Final = "run.parquet"
 TRANSITIONS: Final = "transitions.parquet"
 STATES: Final = "states.parquet"
@@ -125,7 +127,12 @@ SCHEMAS: Final = {
             *((name, pa.binary()) for name in ("np_random_seed", "bit_generator", "ale_state")),
         ]
     ),
-    FRAMES: pa.schema([*PLACED_IN_PHASE, ("format", pa.string()), ("data", pa.binary())]),
+    FRAMES: pa.schema(
+        [
+            *(*PLACED_IN_PHASE, ("format", pa.string()), ("data", pa.binary())),
+            (FRAME_ID, pa.string()),
+        ]
+    ),
 }
 """The columns of the tables that are the same in every archive."""
 

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from blake3 import blake3
 
+from runner.archive import layout
 from runner.archive.columns import Shape
 from runner.recording import schema
 from runner.recording.messages import QTable, decode, encode, encode_image, encode_log
@@ -42,7 +43,7 @@ def message_row(topic: Topic, payload: bytes, shape: Shape) -> dict[str, Any]:
         number = values["level"] if values["level"] in range(len(schema.LOG_LEVELS)) else 0
         return {"name": values["name"], "level": schema.LOG_LEVELS[number], "message": values["message"]}
     if topic.message is schema.IMAGE:
-        return {"phase": topic.phase, "format": values["format"], "data": values["data"]}
+        return {"phase": topic.phase, **{name: values[name] for name in ("format", "data", layout.FRAME_ID)}}
     if topic.message in _WITH_SPACES:
         for field in values.keys() & shape.spaces.keys():
             values |= shape.spaces[field].row(values.pop(field))
@@ -62,7 +63,7 @@ def message_payload(topic: Topic, position: int, row: Mapping[str, Any], shape: 
     if topic.message is schema.LOG:
         return encode_log(row["message"], position * STEP_NANOSECONDS / 1e9, row["level"], row["name"])
     if topic.message is schema.IMAGE:
-        return encode_image(row["data"], row["format"], position, topic.phase)
+        return encode_image(row["data"], row["format"], position, row.get(layout.FRAME_ID, topic.phase))
     of_message = topic.message.fields
     fields = {field.name: row[field.stored_name] for field in of_message if field.stored_name in row}
     if topic.message in _WITH_SPACES:

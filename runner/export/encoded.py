@@ -22,17 +22,14 @@ from runner.errors import CannotRedo
 from runner.export.painting import (
     EnvironmentDiffers,
     Painted,
-    frames_every,
     paint_observation,
     paint_redrawn,
 )
 from runner.export.pictures import Source, source_of, source_of_recorded
 from runner.recording.reader import Recording, open_recording
-from runner.replay.steps import reset_of
+from runner.replay.steps import recorded_frames
 from runner.util.extras import require
 
-_END_OF_TIME: Final = 2**62
-"""Later than any message, in nanoseconds."""
 _SMALL: Final = 256 * 256
 """Pictures of at most this number of pixels are encoded as PNG, which is exact; larger ones as JPEG."""
 _JPEG_QUALITY: Final = 88
@@ -67,7 +64,7 @@ def encoded_pictures(
         CannotRedo: the environment cannot be made again, or is another one than was recorded.
     """
     with open_recording(path) as recording:
-        source, _ = source_of(recording, phase)
+        source, _ = source_of(recording, phase, episode=episode)
         if source is Source.REDRAWN:
             has_begun = False
             try:
@@ -75,7 +72,7 @@ def encoded_pictures(
                     has_begun = True
                     yield data
             except (CannotRedo, EnvironmentDiffers) as error:
-                source = source_of_recorded(recording, phase)
+                source = source_of_recorded(recording, phase, episode)
                 if has_begun or source is Source.VALUES:
                     raise CannotRedo(str(error)) from error
                 yield f"These are the {source}. {error}"
@@ -94,38 +91,11 @@ def _painted(painted: Painted, start: int) -> Iterator[bytes]:
 
 
 def _recorded(recording: Recording, phase: str, episode: int, start: int) -> Iterator[bytes]:
-    """Yield the last frame at each step; a reset's is the last one before the first step."""
-    every = frames_every(recording)
-    span = recording.episode_span(phase, episode)
-    first = max(0, start - every)
-    times = _times(recording, phase, span[max(0, first - 1) :])
-    reset = reset_of(recording, phase, episode) if first == 0 else None
-    time = times[0] if first else times[0] - 1 if reset is None else int(reset["log_time"])
-    frames = recording.decoded(recording.topic(f"/{phase}/frame"), times=range(time, _END_OF_TIME))
-    current, following = None, next(frames, None)
-    for k in range(first, len(span) + 1):
-        time, taken = (times[k - max(1, first)] if k else times[0]), current
-        # A frame at the time of the episode's last step may be that of the next reset.
-        own = k > 0 and (k % every == 0 or k == len(span))
-        while following is not None and (
-            following["log_time"] < time or (own and following["log_time"] == time and current is taken)
-        ):
-            current, following = following, next(frames, None)
-        if k < start:
-            continue
-        if current is None:
-            raise CannotRedo(f"No frame was recorded at the beginning of {phase} episode {episode}.")
-        yield current["data"] if k == start or current is not taken else b""
-
-
-def _times(recording: Recording, phase: str, span: range) -> list[int]:
-    """Return the log times of steps in nanoseconds."""
-    topic = recording.topic(f"/{phase}/step")
-    if topic not in recording.dtypes:
-        steps = recording.decoded(topic)
-        return [step["log_time"] for step in steps if span.start <= step["step"] < span.stop]
-    blocks = recording.blocks(topic, span.start, span.stop)
-    return [time for block in blocks for time in block["log_time"].tolist()][:: span.step]
+    """Yield the last frame at each step."""
+    shown = None
+    for frame in recorded_frames(recording, phase, episode, start):
+        yield b"" if frame is shown else frame["data"]
+        shown = frame
 
 
 def _encoded(pixels: NDArray[np.uint8]) -> bytes:

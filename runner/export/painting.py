@@ -9,7 +9,6 @@ import io
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import closing
-from itertools import chain
 from typing import Any, Final
 
 import numpy as np
@@ -23,14 +22,12 @@ from runner.export.values import Values
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.environment import redo_in_child
-from runner.replay.steps import check_steps, reset_of, transitions_of
+from runner.replay.steps import check_steps, recorded_frames, reset_of, transitions_of
 
 SCENE_SIZE: Final = 480
 """The largest width and height of the picture of a scene."""
 MAX_PIXELS: Final = 4096 * 4096
 """The most pixels of a recorded frame."""
-_END_OF_TIME: Final = 2**62
-"""Later than any message, in nanoseconds."""
 
 Painted = Generator[Pixels, None, None]
 
@@ -55,32 +52,12 @@ def paint_scene(recording: Recording, phase: str, episode: int) -> Painted:
 
 def paint_recorded(recording: Recording, phase: str, episode: int) -> Painted:
     """Show the last frame that was recorded up to each step."""
-    every, reset = frames_every(recording), reset_of(recording, phase, episode)
-    steps = transitions_of(recording, phase, episode)
-    first_step = next(steps)
-    start = int((first_step if reset is None else reset)["log_time"])
-    frames = recording.decoded(recording.topic(f"/{phase}/frame"), times=range(start, _END_OF_TIME))
-    following = next(frames, None)
+    last: Mapping[str, Any] = {}
     shown: Pixels | None = None
-    for t, row in enumerate(chain([first_step, first_step], steps)):
-        time = int(row["log_time"])
-        while following is not None and following["log_time"] < time:
-            shown, following = _pixels(recording, following, shown), next(frames, None)
-        # The frame of the reset is the last one before the first step. One at the time of the last step may
-        # be that of the next reset.
-        is_recorded = t > 0 and (row["terminated"] or row["truncated"] or t % every == 0)
-        if is_recorded and following is not None and following["log_time"] == time:
-            shown, following = _pixels(recording, following, shown), next(frames, None)
-        if shown is None:
-            raise RecordingError(f"{recording.path}: the first frame of {phase} episode {episode} is lost.")
+    for frame in recorded_frames(recording, phase, episode):
+        if shown is None or frame is not last:
+            last, shown = frame, _pixels(recording, frame, shown)
         yield shown
-
-
-def frames_every(recording: Recording) -> int:
-    """Return after how many steps of an episode a frame was recorded, as its configuration says."""
-    frames = recording.config.get("frames")
-    every = frames.get("every") if isinstance(frames, Mapping) else None
-    return every if isinstance(every, int) and every > 0 else 1
 
 
 def _pixels(recording: Recording, frame: Mapping[str, Any], before: Pixels | None) -> Pixels:

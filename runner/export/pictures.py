@@ -27,7 +27,6 @@ from runner.export.contents import ENDINGS, ending_of, require_steps
 from runner.export.painting import (
     EnvironmentDiffers,
     Painted,
-    frames_every,
     paint_observation,
     paint_recorded,
     paint_redrawn,
@@ -36,8 +35,8 @@ from runner.export.painting import (
 )
 from runner.export.values import Values, value_in_words
 from runner.recording.reader import Recording
-from runner.replay.capabilities import why_not_redone
-from runner.replay.steps import check_steps, transitions_of
+from runner.replay.capabilities import environments_with_frames, why_not_redone
+from runner.replay.steps import check_steps, environment_of, frames_every, transitions_of
 
 
 class Source(StrEnum):
@@ -92,7 +91,7 @@ class Pictures:
         self._recording, self._phase, self._episode = recording, phase, episode
         self.learners = recording.agents
         self.steps = len(recording.episode_span(phase, episode))
-        self.source, self.reason = source_of(recording, phase, trust)
+        self.source, self.reason = source_of(recording, phase, trust, episode)
         self._painted = self._begin(trust)
         self._pictures = self._generate()
 
@@ -117,7 +116,7 @@ class Pictures:
             return _resumed(next(painted), painted)
         except (CannotRedo, EnvironmentDiffers) as error:
             painted.close()
-            self.source, self.reason = source_of_recorded(self._recording, self._phase), str(error)
+            self.source, self.reason = source_of_recorded(*where), str(error)
         return _PAINTERS[self.source](*where)
 
     def _generate(self) -> Generator[Picture, None, None]:
@@ -159,12 +158,15 @@ def pictures(recording: Recording, phase: str, episode: int, trust: bool = False
     return Pictures(recording, phase, episode, trust)
 
 
-def source_of(recording: Recording, phase: str, trust: bool = False) -> tuple[Source, str]:
-    """Return what the pictures of a phase are made from, and why it is not anything better.
+def source_of(
+    recording: Recording, phase: str, trust: bool = False, episode: int | None = None
+) -> tuple[Source, str]:
+    """Return what the pictures of an episode are made from, and why it is not anything better.
 
-    Nothing is imported or made: it may turn out that an environment cannot be made again.
+    Nothing is imported or made: it may turn out that an environment cannot be made again. Without a number of
+    the episode, frames that were recorded of some environments count for all.
     """
-    recorded = source_of_recorded(recording, phase)
+    recorded = source_of_recorded(recording, phase, episode)
     is_complete = recorded is Source.RECORDED and frames_every(recording) == 1
     if recorded is Source.SCENE or is_complete:
         return recorded, ""
@@ -174,11 +176,12 @@ def source_of(recording: Recording, phase: str, trust: bool = False) -> tuple[So
     return (recorded, reason) if reason else (Source.REDRAWN, "")
 
 
-def source_of_recorded(recording: Recording, phase: str) -> Source:
+def source_of_recorded(recording: Recording, phase: str, episode: int | None) -> Source:
     """Return the best of what the recording itself has."""
     if recording.tabular and svg.drawing_of(recording.mdp) is not None:
         return Source.SCENE
-    if not recording.is_job and recording.environments == 1 and recording.has_messages(f"/{phase}/frame"):
+    framed = environments_with_frames(recording, phase)
+    if framed and (episode is None or environment_of(recording, phase, episode) in framed):
         return Source.RECORDED
     if recording.kind in ("transition", "variable"):
         with_image = Values(recording.spaces["observation"], "observation").image is not None

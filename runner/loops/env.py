@@ -31,6 +31,8 @@ class Recorded(Generic[R]):
     _loop: Loop[R]
     _messages: Messages
     _options: Options
+    _until_frame = 0
+    """Steps up to the next frame."""
     _owner: Recorded[R] | None = None
     """The recorded environment that closes the recording, if it is another; this one keeps it alive."""
     _phase: str
@@ -148,6 +150,14 @@ class Recorded(Generic[R]):
         self._rows = self._loop.rows(phase)
         self._take_extras = self._loop.extras.taker(phase, self._rows)
 
+    def _record_frame(self, is_reset: bool = False, is_over: bool = False) -> None:
+        """Record a picture of the last step or reset, if the options include it."""
+        self._until_frame -= 1
+        every = self._options.frames_every
+        if every and (is_reset or is_over or self._until_frame <= 0):
+            self._until_frame = every
+            self._messages.frame(self._phase, self.env.render(), is_reset)
+
     def _record_into(self, loop: Loop[R], is_owner: bool = True) -> None:
         """Record into a loop; its owner closes it when the process ends, if not before."""
         self._loop, self._messages, self._options = loop, loop.messages, loop.options
@@ -200,7 +210,6 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
         self._owner = owner
         self._env_step = env.step
         self._has_messages = bool(loop.options.info or loop.options.frames_every)
-        self._until_frame = 0
         self._watch = GeneratorWatch(env)
         self._record_into(loop, is_owner=owner is None)
         self._enter(phase)
@@ -245,20 +254,14 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
             if state is not None:
                 self._messages.reset_state(self._phase, state._replace(reset=self._rows.resets - 1))
         self._messages.reset_info(self._phase, info, before, seed)
-        if self._options.frames_every:
-            self._until_frame = self._options.frames_every
-            self._messages.frame(self._phase, self.env.render())
+        self._record_frame(is_reset=True)
         return result
 
     def _record_messages(self, info: Mapping[str, Any], over: bool) -> None:
         """Record info and frame of the step that was just put down, where the options include them."""
         if self._options.info:
             self._messages.info(self._phase, info)
-        if self._options.frames_every:
-            self._until_frame -= 1
-            if over or self._until_frame <= 0:
-                self._until_frame = self._options.frames_every
-                self._messages.frame(self._phase, self.env.render())
+        self._record_frame(is_over=over)
 
 
 def record(
@@ -325,7 +328,7 @@ def record(
     described = describe(env, env.observation_space, env.action_space)
     options = options_of(recordings, name, seed, config, info, packing, frames_every, frame_format)
     if frames_every:
-        _require_pictures(env)
+        require_pictures(env)
     maker = maker_of(env, checked_make(make))
     loop: Loop[Rows] = Loop(described, options, maker, ROWS[described.kind])
     return RecordedEnv(env, loop, phase)
@@ -342,15 +345,20 @@ def _record_into_run(env: gymnasium.Env[Any, Any], into: RecordedEnv, phase: str
     if phase == into._phase:
         raise ConfigError(f"phase: found {phase!r} for both environments of a run, expected one each")
     if loop.options.frames_every:
-        _require_pictures(env)
+        require_pictures(env)
     loop.add_maker(phase, maker_of(env, make))
     return RecordedEnv(env, loop, phase, into)
 
 
-def _require_pictures(env: gymnasium.Env[Any, Any]) -> None:
-    """Refuse an environment that renders no pictures, in a run with frames."""
-    if env.render_mode != "rgb_array":
+def require_pictures(env: Any) -> None:
+    """Refuse an environment that renders no pictures, in a run with frames.
+
+    Raises:
+        ConfigError: it is made with another `render_mode` than "rgb_array".
+    """
+    mode = getattr(env, "render_mode", None)
+    if mode != "rgb_array":
         raise ConfigError(
-            f"frames_every: found an environment with render_mode={env.render_mode!r}, expected "
+            f"frames_every: found an environment with render_mode={mode!r}, expected "
             "'rgb_array': make it with render_mode=\"rgb_array\"."
         )

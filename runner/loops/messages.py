@@ -19,7 +19,7 @@ from runner.loops.outcomes import Outcomes
 from runner.loops.rows import MAX_SEED, PhaseRows
 from runner.loops.values import MAX_ARRAY_BYTES, arrays_of, check_log_name, logged_number
 from runner.recording import schema
-from runner.recording.messages import encode, encode_image, encode_log, scalar_encoder
+from runner.recording.messages import encode, encode_image, encode_log, frame_id, scalar_encoder
 from runner.recording.recorder import Recorder
 from runner.recording.reset_states import ResetState
 from runner.recording.schema import STEP_NANOSECONDS, Topic
@@ -243,8 +243,14 @@ class Messages:
             if len(self._states) == _MAX_WAITING:
                 self.commit()
 
-    def frame(self, phase: str, image: Any) -> None:
+    def frame(self, phase: str, image: Any, is_reset: bool, environment: int | None = None) -> None:
         """Record a picture, [height, width, 3] of uint8; another thread encodes it.
+
+        Args:
+            phase: `train` or `eval`.
+            image: the picture after the last step or reset.
+            is_reset: whether that was a reset.
+            environment: its number among those of a vector; None for a single one.
 
         Raises:
             ConfigError: it is something else.
@@ -259,9 +265,10 @@ class Messages:
                     "uint8 of [height, width, 3]."
                 )
             kind, position = self._options.frame_format, self._loop.position
+            place = frame_id(phase, environment, is_reset)
 
             def make() -> bytes:
-                return encode_image(_image_bytes(pixels, kind), kind, position, phase)
+                return encode_image(_image_bytes(pixels, kind), kind, position, place)
 
             self._recorder.submit(self._topics[f"/{phase}/frame"], make, position)
 

@@ -40,6 +40,8 @@ class Options:
     info: tuple[str, ...]
     frames_every: int
     frame_format: str
+    frames_of: tuple[int, ...] | None = None
+    """The environments of a vector of which frames are recorded; None for all."""
     packing: Recording = field(default_factory=Recording)
 
     def __post_init__(self) -> None:
@@ -68,7 +70,8 @@ class Options:
             "seeds": [] if self.seed is None else [self.seed],
             "config": self.settings,
             "info": list(self.info),
-            "frames": {"every": self.frames_every, "format": self.frame_format},
+            "frames": {"every": self.frames_every, "format": self.frame_format}
+            | ({} if self.frames_of is None else {"environments": list(self.frames_of)}),
             "recording": self.packing.model_dump(mode="json"),
         }
 
@@ -82,6 +85,7 @@ def options_of(
     packing: Mapping[str, Any],
     frames_every: int = 0,
     frame_format: str = "png",
+    frames_of: tuple[int, ...] | None = None,
 ) -> Options:
     """Return the options for the arguments of `record`.
 
@@ -115,6 +119,7 @@ def options_of(
         info=tuple(info),
         frames_every=frames_every,
         frame_format=frame_format,
+        frames_of=frames_of,
         packing=packing_from(packing),
     )
 

@@ -18,7 +18,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWra
 from runner.environments.mdp import MAX_AGENTS
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, describe, kind_of
-from runner.loops.env import Recorded, given
+from runner.loops.env import Recorded, given, require_pictures
 from runner.loops.generators import GeneratorWatch, VectorWatch
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, game_maker_of, vector_maker_of
@@ -36,7 +36,7 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
         self, env: VectorEnv[Any, Any, Any], loop: Loop[VectorRows], mode: AutoresetMode, watch: VectorWatch
     ) -> None:
         VectorWrapper.__init__(self, env)
-        self._has_finals = mode == AutoresetMode.SAME_STEP
+        self._mode = mode
         self._watch = watch
         self._record_into(loop)
         Recorded._enter(self, "train")
@@ -52,14 +52,15 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
         self, actions: Any, extras: Mapping[str, Any] | None = None
     ) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Take a step in every environment, and record it, with arrays [N, ...] of your own by name."""
-        watch = self._watch
+        watch, frames_every = self._watch, self._options.frames_every
         watch.steps += 1
+        over = self._rows.over if frames_every else None
         states = None
         if watch.steps > watch.due and self._rows.is_any_over:
             states = watch.before_step(self._rows.over)
         result = self.env.step(actions)
         observations, rewards, terminated, truncated, infos = result
-        final = _final_observations(infos) if self._has_finals else None
+        final = _final_observations(infos) if self._mode == AutoresetMode.SAME_STEP else None
         with self._loop.lock:
             if self._loop.active is not self._rows:
                 self._loop.activate(self._rows)
@@ -68,7 +69,33 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
                 self._take_extras(extras)
         if self._options.info:
             self._messages.info(self._phase, _by_environment(infos))
+        if over is not None:
+            ended = np.logical_or(terminated, truncated)
+            self._until_frame -= 1
+            if self._mode == AutoresetMode.SAME_STEP:
+                self._record_frames(resets=ended)
+            elif self._mode == AutoresetMode.NEXT_STEP:
+                self._record_frames(resets=over, ends=ended)
+            else:
+                self._record_frames(ends=ended)
         return result
+
+    def _record_frames(self, resets: Any = False, ends: Any = False) -> None:
+        """Record pictures of the environments that were reset or whose episode ended, now and then of all."""
+        n, every = self.env.num_envs, self._options.frames_every
+        resets, is_due = np.broadcast_to(resets, n), np.broadcast_to(resets | np.asarray(ends), n)
+        if self._until_frame <= 0 or resets.all():
+            self._until_frame, is_due = every, np.ones(n, np.bool_)
+        chosen = range(n) if self._options.frames_of is None else self._options.frames_of
+        which = [i for i in chosen if is_due[i]]
+        if not which:
+            return
+        inside = getattr(self.env.unwrapped, "envs", None)
+        images = {i: inside[i].render() for i in which} if inside else self.env.render()
+        if images is None or len(images) < len(which):
+            raise ConfigError(f"frames: found {type(images).__name__} from render(), expected {n} pictures.")
+        for i in which:
+            self._messages.frame(self._phase, images[i], bool(resets[i]), i)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -85,6 +112,8 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
             self._loop.activate(self._rows)
             self._rows.reset(result[0], seeds, which, states)
         self._messages.reset_info(self._phase, _by_environment(result[1]), others, None)
+        if self._options.frames_every:
+            self._record_frames(resets=which)
         return result
 
 
@@ -96,6 +125,9 @@ def record_vector(
     seed: int | None = None,
     config: object = None,
     info: Sequence[str] = (),
+    frames_every: int = 0,
+    frame_format: str = "png",
+    frames_of: int | Sequence[int] | None = None,
     autoreset_mode: AutoresetMode | str | None = None,
     make: str | Callable[[], Any] | None = None,
     **packing: Any,
@@ -115,6 +147,11 @@ def record_vector(
         seed: as for `record`.
         config: as for `record`.
         info: names of fields of the vector's infos to record.
+        frames_every: render a frame of each environment after this many steps, at its resets, and at the ends
+            of its episodes; "SameStep" environments show the next episode there. The environments must be
+            made with render_mode="rgb_array".
+        frame_format: as for `record`.
+        frames_of: the number of the environment to render, or several; all unless given.
         autoreset_mode: how the environments reset themselves, if their metadata does not state it:
             "NextStep", "SameStep" or "Disabled"; "SameStep" for SuperSuit.
         make: as for `record`; the function makes the vector environment.
@@ -135,7 +172,15 @@ def record_vector(
         _require_fixed(described)
         maker = vector_maker_of(envs, first, mode, checked_make(make))
         watch = VectorWatch(envs, first, mode)
-    options = options_of(recordings, name, seed, config, info, packing)
+    if frames_every:
+        require_pictures(envs)
+    chosen = None if frames_of is None else tuple(sorted(set(np.atleast_1d(frames_of).tolist())))
+    if chosen is not None and not (frames_every and set(chosen) <= set(range(envs.num_envs))):
+        raise ConfigError(
+            f"frames_of: found {frames_of!r} with frames_every={frames_every}, expected numbers from 0 to "
+            f"{envs.num_envs - 1}, and frames_every"
+        )
+    options = options_of(recordings, name, seed, config, info, packing, frames_every, frame_format, chosen)
     rows = partial(VectorRows, next_step=mode == AutoresetMode.NEXT_STEP)
     loop = Loop(described, options, maker, rows, (described.environments,))
     return RecordedVector(envs, loop, mode, watch)
@@ -253,6 +298,8 @@ class RecordedParallel(Recorded[AgentRows]):
                 self._take_extras(self._extras_by_name(extras))
         if self._options.info:
             self._messages.info(self._phase, _by_field(infos))
+        if self._options.frames_every:
+            self._record_frame(is_over=over)
         return result  # type: ignore[no-any-return]
 
     def _extras_by_name(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -277,6 +324,7 @@ class RecordedParallel(Recorded[AgentRows]):
             if state is not None:
                 self._messages.reset_state(self._phase, state._replace(reset=self._rows.resets - 1))
         self._messages.reset_info(self._phase, _by_field(result[1]), options, seed)
+        self._record_frame(is_reset=True)
         return result  # type: ignore[no-any-return]
 
 
@@ -288,6 +336,8 @@ def record_parallel(
     seed: int | None = None,
     config: object = None,
     info: Sequence[str] = (),
+    frames_every: int = 0,
+    frame_format: str = "png",
     make: str | Callable[[], Any] | None = None,
     **packing: Any,
 ) -> RecordedParallel:
@@ -303,6 +353,8 @@ def record_parallel(
         seed: as for `record`.
         config: as for `record`.
         info: names of fields of the agents' infos to record, where they occur.
+        frames_every: as for `record`; a frame shows the whole game.
+        frame_format: as for `record`.
         make: as for `record`.
         packing: as for `record`.
 
@@ -322,7 +374,9 @@ def record_parallel(
         )
     described = _game(env)
     _require_fixed(described)
-    options = options_of(recordings, name, seed, config, info, packing)
+    if frames_every:
+        require_pictures(env)
+    options = options_of(recordings, name, seed, config, info, packing, frames_every, frame_format)
     maker = game_maker_of(env, checked_make(make))
     return RecordedParallel(env, Loop(described, options, maker, AgentRows))
 

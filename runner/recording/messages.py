@@ -222,8 +222,24 @@ def encode_log(text: str, seconds: float, level: str = "INFO", name: str = "dual
     )
 
 
-def encode_image(data: bytes, kind: str, position: int, phase: str) -> bytes:
+def encode_image(data: bytes, kind: str, position: int, frame_id: str) -> bytes:
     """Return a `foxglove.CompressedImage` logged after `position` steps; `kind` is `png` or `jpeg`."""
     seconds, nanos = divmod(position * STEP_NANOSECONDS, 10**9)
     stamp = {"seconds": seconds, "nanos": nanos}
-    return encode(schema.IMAGE, {"timestamp": stamp, "data": data, "format": kind, "frame_id": phase})
+    return encode(schema.IMAGE, {"timestamp": stamp, "data": data, "format": kind, "frame_id": frame_id})
+
+
+def frame_id(phase: str, environment: int | None, is_reset: bool) -> str:
+    """Return the place of a frame: `train`, `train/reset`, or of a vector environment `train/3/reset`."""
+    place = [phase, *([] if environment is None else [str(environment)]), *(["reset"] if is_reset else [])]
+    return "/".join(place)
+
+
+def frame_place(frame: Mapping[str, Any]) -> tuple[int, bool]:
+    """Return the environment of a decoded frame, and whether it shows the state after a reset.
+
+    Recordings of earlier versions do not mark resets.
+    """
+    _, *place = frame["frame_id"].split("/", 2)
+    environment = int(place[0]) if place and place[0].isdecimal() and len(place[0]) < 10 else 0
+    return environment, place[-1:] == ["reset"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,9 +20,10 @@ class Capabilities:
     picture: Picture
     """Where the picture of a step comes from.
 
-    `scene`: the recorded scene of a tabular environment. `recorded`: frames that were recorded. `redrawn`:
-    the environment is made again and draws them (`runner.replay.environment.redo`); it may turn out that it
-    cannot draw, which raises `CannotRedo`. `values`: there is none, only the values of the step.
+    `scene`: the recorded scene of a tabular environment. `recorded`: frames that were recorded, of all
+    environments or of some (`environments_with_frames`). `redrawn`: the environment is made again and draws
+    them (`runner.replay.environment.redo`); it may turn out that it cannot draw, which raises `CannotRedo`.
+    `values`: there is none, only the values of the step.
     """
     has_tables: bool
     """Whether the Q-tables at any step are known (`runner.replay.tables`)."""
@@ -46,11 +48,20 @@ def capabilities(recording: Recording, trust: bool = False) -> Capabilities:
     picture: Picture = "values"
     if recording.tabular and recording.environment.get("scene") is not None:
         picture = "scene"
-    elif not recording.is_job and any(recording.has_messages(f"/{phase}/frame") for phase in PHASES):
+    elif any(environments_with_frames(recording, phase) for phase in PHASES):
         picture = "recorded"
     elif has_steps and not reason:
         picture = "redrawn"
     return Capabilities(picture, has_tables=recording.is_job, can_redo=not reason, reason=reason)
+
+
+def environments_with_frames(recording: Recording, phase: str) -> Sequence[int]:
+    """Return the environments of which frames were recorded in a phase; of a job none."""
+    if recording.is_job or not recording.has_messages(f"/{phase}/frame"):
+        return ()
+    frames = recording.config.get("frames")
+    chosen = frames.get("environments") if isinstance(frames, Mapping) else None
+    return chosen if isinstance(chosen, list) else range(recording.environments)
 
 
 def why_not_redone(recording: Recording, trust: bool = False) -> str:

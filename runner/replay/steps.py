@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import islice
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,11 @@ from numpy.typing import NDArray
 from runner.environments.mdp import Mdp
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.messages import frame_place
 from runner.recording.reader import Recording
+
+_END_OF_TIME: Final = 2**62
+"""Later than any message, in nanoseconds."""
 
 
 def step_of_episode(recording: Recording, episode: int) -> int:
@@ -81,6 +85,64 @@ def reset_of(recording: Recording, phase: str, episode: int) -> Any | None:
         own = block[block["environment"] == numbers.start % numbers.step]
         found = own[-1] if len(own) else found
     return found
+
+
+def recorded_frames(
+    recording: Recording, phase: str, episode: int, start: int = 0
+) -> Iterator[dict[str, Any]]:
+    """Yield the last frame that was recorded up to each step of an episode, as a decoded message.
+
+    Args:
+        recording: of a loop with frames.
+        phase: `train` or `eval`.
+        episode: counted over the phase.
+        start: steps before the first one; 0 for the frame after the reset.
+
+    Raises:
+        RecordingError: the recording has no such episode, steps of it were lost, or its first frame.
+    """
+    span, n = recording.episode_span(phase, episode), recording.environments
+    first = max(0, start - frames_every(recording))
+    steps = transitions_of(recording, phase, episode)
+    times = [int(step["log_time"]) for step in islice(steps, max(0, first - 1), None)]
+    # The frames of a vector come after the step of its last environment.
+    later = (n - 1 - span.start % n) * schema.STEP_NANOSECONDS
+    reset = reset_of(recording, phase, episode) if first == 0 else None
+    begin = times[0] - n * schema.STEP_NANOSECONDS if reset is None else int(reset["log_time"])
+    topic = recording.topic(f"/{phase}/frame")
+    frames = (
+        (int(frame["log_time"]), frame_place(frame)[1], frame)
+        for frame in recording.decoded(topic, times=range(max(0, begin), _END_OF_TIME))
+        if frame_place(frame)[0] == span.start % n
+    )
+    shown, following = None, next(frames, None)
+    for t in range(first, len(span) + 1):
+        # After the reset there may be several, of which the last one shows the state; after a step one.
+        time = times[t - max(1, first)] + later if t else times[0]
+        while following is not None and following[0] < time:
+            shown, following = following[2], next(frames, None)
+        if t and following is not None and following[0] == time and not following[1]:
+            shown, following = following[2], next(frames, None)
+        if shown is None:
+            raise RecordingError(f"{recording.path}: the first frame of {phase} episode {episode} is lost.")
+        if t >= start:
+            yield shown
+
+
+def frames_every(recording: Recording) -> int:
+    """Return after how many steps a frame was recorded, as its configuration says."""
+    frames = recording.config.get("frames")
+    every = frames.get("every") if isinstance(frames, Mapping) else None
+    return every if isinstance(every, int) and every > 0 else 1
+
+
+def environment_of(recording: Recording, phase: str, episode: int) -> int:
+    """Return the environment of an episode, among those of a vector.
+
+    Raises:
+        RecordingError: the recording has no such episode.
+    """
+    return recording.episode_span(phase, episode).start % recording.environments
 
 
 def last_step(recording: Recording) -> int:

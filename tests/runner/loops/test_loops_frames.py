@@ -1,0 +1,176 @@
+"""Frames that are recorded of vector environments and games: each belongs to its environment and its step."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from mpe2 import simple_spread_v3
+from PIL import Image
+
+import runner
+from runner.archive.restoring import restore
+from runner.errors import ConfigError
+from runner.export.encoded import encoded_pictures
+from runner.export.pictures import Source, pictures
+from runner.recording.integrity import check_integrity
+from runner.recording.reader import open_recording
+from tests.runner.archive.whole import archived, contents
+
+N = 3
+
+
+class Counting(gymnasium.Env):
+    """Draws its own number, its episode and the steps of the episode, which has 4 to 8 of them."""
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - as Gymnasium has it
+    render_mode = "rgb_array"
+    observation_space = gymnasium.spaces.Box(0, 255, (3,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, number):
+        self._state = [number, -1, 0]
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._state[1:] = self._state[1] + 1, 0
+        return self._observation(), {}
+
+    def step(self, action):
+        self._state[2] += 1
+        number, episode, t = self._state
+        return self._observation(), 1.0, t == 4 + (number + episode) % 5, False, {}
+
+    def _observation(self):
+        return np.array(self._state, np.float32)
+
+    def render(self):
+        return np.tile(np.array(self._state, np.uint8), (2, 4, 1))
+
+
+def counting(number):
+    return lambda: Counting(number)
+
+
+def record_counting(folder, mode, kind=SyncVectorEnv, steps=60, **options):
+    envs = kind([counting(i) for i in range(N)], autoreset_mode=mode)
+    options = {"frames_every": 1} | options
+    with runner.record_vector(envs, folder, name="counting", index="chunk", **options) as rec:
+        rec.reset(seed=0)
+        for k in range(steps):
+            over = np.logical_or(*rec.step(np.zeros(N, int))[2:4])
+            if mode == AutoresetMode.DISABLED and over.any():
+                rec.reset(options={"reset_mask": over})
+            if k == steps // 2:
+                with rec.phase("eval"):
+                    rec.reset(seed=1)
+                    rec.step(np.zeros(N, int))
+                rec.reset(seed=2)
+    check_integrity(rec.run.recording)
+    return rec.run.recording
+
+
+def shown_states(recording, phase, episode):
+    """Return the state that each picture of an episode shows."""
+    with contextlib.closing(pictures(recording, phase, episode)) as shown:
+        assert shown.source is Source.RECORDED
+        return [picture.pixels[0, 0].tolist() for picture in shown]
+
+
+def encoded_states(path, phase, episode, start=0):
+    """Return the state that each picture of an episode shows on the replay page."""
+    states = []
+    for data in encoded_pictures(path, phase, episode, start):
+        pixels = np.asarray(Image.open(io.BytesIO(data)).convert("RGB")) if data else None
+        states.append(states[-1] if pixels is None else pixels[0, 0].tolist())
+    return states
+
+
+@pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv])
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_each_picture_of_a_vector_shows_its_environment_at_its_step(tmp_path, mode, kind):
+    path = record_counting(tmp_path, mode, kind)
+    with open_recording(path) as recording:
+        episodes = recording.episodes("train")
+        assert len(episodes) > 2 * N
+        for number, episode in enumerate(episodes):
+            i, length = int(episode["last_step"]) % N, int(episode["length"])
+            shown = shown_states(recording, "train", number)
+            assert len(shown) == length + 1
+            own = shown[0][1]
+            expected = [[i, own, t] for t in range(length + 1)]
+            if mode == AutoresetMode.SAME_STEP and (episode["terminated"] or episode["truncated"]):
+                expected[-1] = expected[-2]  # the environment was reset before it could be rendered
+            assert shown == expected
+            assert encoded_states(path, "train", number) == expected
+            assert encoded_states(path, "train", number, 2) == expected[2:]
+
+
+def test_frames_now_and_then_are_the_last_ones_up_to_each_step(tmp_path):
+    path = record_counting(tmp_path, AutoresetMode.NEXT_STEP, frames_every=3, frame_format="png")
+    with open_recording(path) as recording:
+        count = recording.count(recording.topic("/train/frame"))
+        assert count < recording.count(recording.topic("/train/step"))
+        for number, episode in enumerate(recording.episodes("train")):
+            # Rendered again where the environment can be made again; here it cannot.
+            shown = shown_states(recording, "train", number)
+            over = bool(episode["terminated"])
+            assert shown[0][2] == 0
+            assert not over or shown[-1][2] == episode["length"]
+            assert all(0 <= t - state[2] < 3 for t, state in enumerate(shown))
+            assert encoded_states(path, "train", number, 3) == shown[3:]
+
+
+def test_frames_of_chosen_environments(tmp_path):
+    path = record_counting(tmp_path, AutoresetMode.NEXT_STEP, frames_of=[2])
+    with open_recording(path) as recording:
+        ids = {frame["frame_id"] for frame in recording.decoded(recording.topic("/train/frame"))}
+        assert ids == {"train/2", "train/2/reset"}
+        for number, episode in enumerate(recording.episodes("train")):
+            with contextlib.closing(pictures(recording, "train", number)) as shown:
+                is_chosen = int(episode["last_step"]) % N == 2
+                assert shown.source is (Source.RECORDED if is_chosen else Source.VALUES)
+
+
+def test_a_game_has_a_frame_each_step(tmp_path):
+    env = simple_spread_v3.parallel_env(max_cycles=5, render_mode="rgb_array")
+    seen = []
+    with runner.record_parallel(env, tmp_path, frames_every=1) as rec:
+        for seed in range(2):
+            rec.reset(seed=seed)
+            seen.append([env.render()])
+            while rec.agents:
+                rec.step(dict.fromkeys(rec.agents, 1))
+                seen[-1].append(env.render())
+    with open_recording(rec.run.recording) as recording:
+        for number, frames in enumerate(seen):
+            with contextlib.closing(pictures(recording, "train", number)) as shown:
+                assert shown.source is Source.RECORDED
+                found = [picture.pixels for picture in shown]
+            assert len(found) == len(frames) == 6
+            assert all(map(np.array_equal, found, frames))
+
+
+def test_frames_keep_their_places_in_archives(tmp_path):
+    path = record_counting(tmp_path, AutoresetMode.SAME_STEP)
+    folder = archived(path, tmp_path / "archive")
+    restore(folder, tmp_path / "back.mcap")
+    assert contents(tmp_path / "back.mcap") == contents(path)
+
+
+def test_frames_that_cannot_be_rendered_are_refused(tmp_path):
+    envs = SyncVectorEnv([counting(0)] * 2)
+    for wrong in ([2], -1, "0", [0.5]):
+        with pytest.raises(ConfigError, match="frames_of: found"):
+            runner.record_vector(envs, tmp_path, frames_every=1, frames_of=wrong)
+    with pytest.raises(ConfigError, match="frames_of: found 0 with frames_every=0"):
+        runner.record_vector(envs, tmp_path, frames_of=0)
+    with pytest.raises(ConfigError, match="frames_every: found an environment with render_mode=None"):
+        runner.record_vector(gymnasium.make_vec("CartPole-v1", 2), tmp_path, frames_every=1)
+    with pytest.raises(ConfigError, match="frames_every: found an environment with render_mode=None"):
+        runner.record_parallel(simple_spread_v3.parallel_env(), tmp_path, frames_every=1)
+    assert not list(tmp_path.iterdir())
