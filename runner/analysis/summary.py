@@ -17,6 +17,7 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import Summary
+from runner.runs.checkpoints import Checkpoint, read_checkpoints
 from runner.runs.run import Run
 
 
@@ -73,6 +74,9 @@ class RunDetails:
     extras: Mapping[str, RecordedExtras] = field(default_factory=dict)
     """The values that a loop recorded with the steps of each phase, where there are some."""
 
+    checkpoints: tuple[Checkpoint, ...] = ()
+    """What a loop kept of its agent."""
+
     def facts(self) -> dict[str, Any]:
         """Return everything but the series, as JSON can hold it."""
         run, summary = self.run, self.run.summary
@@ -103,6 +107,7 @@ class RunDetails:
             "eval": [record.as_json() for record in self.evaluations],
             "optimality": [dict(measures) for measures in self.optimality],
             "train": [record.as_json() for record in self.training],
+            "checkpoints": [checkpoint.as_json() for checkpoint in self.checkpoints],
         }
 
 
@@ -134,6 +139,7 @@ def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> Ru
                     training=tuple(training_records(recording)),
                     loop=None if recording.is_job else loop_summary(recording),
                     extras=_extras(recording),
+                    checkpoints=tuple(read_checkpoints(recording, run.folder.parent)),
                 )
         except RecordingError as error:
             report(f"Only what run.json says: {error}")

@@ -13,7 +13,7 @@ from runner.cli import Command
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import console, draw, facts, print_json, say, title
 from runner.cli.progress import stage_line
-from runner.cli.runs import find, restored
+from runner.cli.runs import command_for, find, restored
 from runner.util.humanize import UNKNOWN, age, duration, number, size
 
 if TYPE_CHECKING:
@@ -38,7 +38,8 @@ def show_command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     before it, success_percent, mean_length, mean_penalties and the count of every event; under `optimality`
     its exact measures, if the run takes them; under `train` one for each report of training; under `loop` the
     last results of a loop: its last evaluation, the means of its last 100 training episodes and the last
-    values it logged; under `extras` the names of the values that it recorded with its steps.
+    values it logged; under `extras` the names of the values that it recorded with its steps; under
+    `checkpoints` what it kept of its agent.
 
     Examples:
       dualtaxi show @latest
@@ -71,6 +72,10 @@ def _parts(details: RunDetails) -> list[RenderableType]:
         parts += [title("Last results"), facts(_loop_results(details.loop))]
     if details.extras:
         parts += [title("Values recorded with steps"), facts(_extras(details.extras))]
+    if details.checkpoints:
+        last = details.checkpoints[-1]
+        kept = f"{len(details.checkpoints):,}, the last {last.reference}; `{command_for(run, 'checkpoints')}`"
+        parts += [title("Checkpoints"), kept]
     if details.optimality:
         with open_recording(run.recording) as recording:
             measures = _optimality(recording, details.optimality[-1])

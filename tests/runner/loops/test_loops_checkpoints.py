@@ -110,6 +110,8 @@ def test_commands_list_and_get_checkpoints(tmp_path):
         ("notes", 100, True),
     ]
     assert "policy@81" in dualtaxi(tmp_path, "checkpoints", "one").output
+    assert "4, the last notes@100" in dualtaxi(tmp_path, "show", "one").output
+    assert json.loads(dualtaxi(tmp_path, "show", "one", "--json").stdout)["checkpoints"] == listed
     for reference, step in (
         ("@50", 41),
         ("policy@latest", 81),
