@@ -22,6 +22,8 @@ from runner.replay.stepping_vector import VectorStepper
 BLOCK_SECONDS: Final = 0.2
 """Blocks of steps take about this long, so that progress and a hanging environment can be seen."""
 _MAX_ROWS: Final = 16_384
+_PHASE_CHANGES: Final = 100
+"""How many changes of the phase are looked at to find out whether both are of one environment."""
 _MAX_PICTURES: Final = 32
 """The most steps in a block with pictures."""
 
@@ -68,7 +70,7 @@ class Replay:
         self._known: set[_Key] = set()
         """The environments whose random generators are in the recorded state."""
         makers = {phase: recording.maker_of(phase) for phase in schema.PHASES}
-        self._is_separate = any(map(recording.has_own_maker, schema.PHASES))
+        self._is_separate = _are_separate(recording)
         """Whether training and evaluation have environments of their own."""
         self.environments: Sequence[int] = range(recording.environments)
         """The environments that can be stepped alone; `ALL` where the vector must be stepped as a whole."""
@@ -309,6 +311,25 @@ class Replay:
         if self._recording.environments > 1:
             number = _ended_episode(self._recording, phase, environment, step)
         return Difference(phase, number, t, step, environment, field, recorded, got)
+
+
+def _are_separate(recording: Recording) -> bool:
+    """Return whether training and evaluation have environments of their own.
+
+    One that was cut off does not state it: then they have if one continues an episode after the other.
+    """
+    if any(map(recording.has_own_maker, schema.PHASES)) or "content_digest" in recording.result:
+        return any(map(recording.has_own_maker, schema.PHASES))
+    if not all(recording.has_messages(f"/{phase}/step") for phase in schema.PHASES):
+        return False
+    phase, changes = "", 0
+    for piece in pieces(recording, schema.PHASES):
+        if len(piece.rows) and piece.phase != phase:
+            is_continued = piece.rows["t"][0] > 0 and not any(r.step == piece.first for r in piece.resets)
+            if (phase and is_continued) or changes == _PHASE_CHANGES:
+                return bool(is_continued)
+            phase, changes = piece.phase, changes + 1
+    return False
 
 
 def _own(

@@ -13,6 +13,7 @@ import numpy as np
 from runner.errors import CannotRedo, RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
+from runner.recording.schema import STEP_NANOSECONDS
 from runner.replay.engine import ALL, Replay
 from runner.replay.recorded import Piece, RecordedReset, pieces, resets_of
 from runner.replay.redone import RedoneSteps
@@ -72,31 +73,28 @@ def _target(recording: Recording, phase: str, number: int) -> _Target:
     Raises:
         RecordingError: there is no such episode, or it has no reset.
     """
-    span = recording.episode_span(phase, number)
-    topic, n = recording.topic(f"/{phase}/step"), recording.environments
-    last = span[-1] // n * n + n - 1
-    start_time, stop_time = (_time_of(recording, topic, step) for step in (span[0], last))
-    for reset in _resets_back(recording, phase, start_time):
+    span, n = recording.episode_span(phase, number), recording.environments
+    stop_time = _time_of(recording, phase, number, span[-1])
+    for reset in _resets_back(recording, phase, stop_time):
         if reset.environment == span[0] % n and reset.step <= span[0]:
-            return _Target(phase, number, reset.environment, reset, stop_time)
+            others = n - 1 - reset.environment  # their steps follow at once
+            return _Target(phase, number, reset.environment, reset, stop_time + others * STEP_NANOSECONDS)
     raise RecordingError(f"{recording.path}: {phase} episode {number} has no reset before it.")
 
 
-def _time_of(recording: Recording, topic: schema.Topic, step: int) -> int:
-    """Return the `log_time` of a step."""
+def _time_of(recording: Recording, phase: str, number: int, step: int) -> int:
+    """Return the `log_time` of the last step of an episode, which is that of its end if it ended."""
+    if len(ended := recording.episodes(phase, number, number + 1)):
+        return int(ended["log_time"][0])
+    topic = recording.topic(f"/{phase}/step")
     if topic in recording.dtypes:
-        for block in recording.blocks(topic, step, step + 1):
-            return int(block["log_time"][0])
-    else:
-        for message in recording.decoded(topic):
-            if message["step"] == step:
-                return int(message["log_time"])
-    raise RecordingError(f"{recording.path}: {topic.name}: step {step} was lost.")
+        return int(next(recording.blocks(topic, step, step + 1))["log_time"][0])
+    return max(int(message["log_time"]) for message in recording.decoded(topic))
 
 
 def _resets_back(recording: Recording, phase: str, time: int) -> Iterator[RecordedReset]:
     """Yield the resets up to a time, from the last to the first, reading no more than needed."""
-    width, stop = 1_000 * schema.STEP_NANOSECONDS, time
+    width, stop = 1_000 * STEP_NANOSECONDS, time
     while stop >= 0:
         start = max(stop - width, 0)
         yield from reversed(list(resets_of(recording, phase, start, stop)))
@@ -129,7 +127,7 @@ def _episode(
     for piece, is_target in _approach(recording, target, start):
         for steps in replay.steps(piece, target.environment, draws=is_target and replay.render):
             if is_target:
-                yield replace(steps, episode=np.full(len(steps), target.number))
+                yield _numbered(steps, target.number)
             elif steps.difference is not None and start is not None:
                 raise _Astray
             elif steps.difference is not None:
@@ -150,9 +148,15 @@ def _episode_of_whole(recording: Recording, replay: Replay, target: _Target) -> 
             if piece.phase == target.phase and steps.environment == target.environment:
                 own = steps.since(target.reset.step)
             if len(own) or own.difference is not None:
-                yield replace(own, episode=np.full(len(own), target.number))
+                yield _numbered(own, target.number)
             if own.difference is not None:
                 return
+
+
+def _numbered(steps: RedoneSteps, number: int) -> RedoneSteps:
+    """Return steps with the number of the episode among all environments."""
+    starts = tuple(start._replace(episode=number) for start in steps.starts)
+    return replace(steps, episode=np.full(len(steps), number), starts=starts)
 
 
 def _approach(

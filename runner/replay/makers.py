@@ -52,7 +52,6 @@ class _Spec:
     entry_point: str
     kwargs: dict[str, Any]
     max_episode_steps: int | None
-    order_enforce: bool
     wrappers: tuple[_Wrapper, ...]
     """From the innermost out."""
 
@@ -184,7 +183,7 @@ def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
             registered,
             kwargs=kwargs,
             max_episode_steps=spec.max_episode_steps,
-            order_enforce=spec.order_enforce,
+            order_enforce=False,  # it changes nothing for a loop that was in order
             disable_env_checker=True,
             additional_wrappers=wrappers,
         )
@@ -280,8 +279,7 @@ def _spec_of(text: str) -> _Spec:
         raise CannotRedo("The specification of the recorded environment has no id or entry point.")
     if not isinstance(kwargs, dict) or not (limit is None or is_whole(limit, 1, _MAX_STEPS)):
         raise CannotRedo(f"The specification of {name} has arguments or a step limit that are not possible.")
-    order = values.get("order_enforce") is not False
-    return _Spec(name, entry_point or "", kwargs, limit, order, _wrappers_of(wrappers, name))
+    return _Spec(name, entry_point or "", kwargs, limit, _wrappers_of(wrappers, name))
 
 
 def _wrappers_of(values: Any, owner: str) -> tuple[_Wrapper, ...]:

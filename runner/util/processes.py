@@ -73,7 +73,8 @@ def process_context(preload: Sequence[str] = ()) -> Any:
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(list(preload))
+    if preload:  # or it would forget those of others, if it does not run yet
+        context.set_forkserver_preload(list(preload))
     return context
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import time
 from functools import partial
 
 import ale_py
@@ -187,3 +189,27 @@ def test_a_child_process_draws_the_pictures_of_an_episode(tmp_path):
     assert [t for block in blocks for t in block.t] == list(range(len(steps)))
     assert {int(episode) for block in blocks for episode in block.episode} == {3}
     assert (np.concatenate([b.got.rewards for b in blocks]) == steps["rewards"]).all()
+
+
+def test_a_run_that_was_killed_comes_out_again_with_both_of_its_environments(tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path) as env:
+        other = runner.record(gymnasium.make("CartPole-v1"), into=env, phase="eval")
+        other.reset(seed=3)
+        env.reset(seed=1)
+        for step in range(600):
+            if env.step(step % 2)[2]:
+                env.reset()
+            if step % 100 == 53:
+                other.reset()
+                while not other.step(1)[2]:
+                    pass
+        size = 0
+        while size != (size := env.run.recording.stat().st_size) or not size:
+            time.sleep(1.1)  # the loop is flushed twice a second
+        killed = tmp_path / "killed.mcap"
+        shutil.copy(env.run.recording, killed)
+    with open_recording(killed) as recording:
+        recorded = [recording.count(recording.topic(f"/{phase}/step")) for phase in ("train", "eval")]
+    steps, difference = redone(killed)
+    assert difference is None
+    assert sum(recorded) - 60 < steps <= sum(recorded)
