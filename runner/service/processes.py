@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -26,6 +27,7 @@ Result = TypeVar("Result")
 
 PRELOADED: Final = (
     "gymnasium",
+    "pygame",
     "runner.analysis.diff",
     "runner.analysis.qtable",
     "runner.analysis.series",
@@ -38,7 +40,10 @@ PRELOADED: Final = (
     "runner.service.fragments",
     "runner.service.uploads",
 )
-"""Modules that every process has from its start, where processes can be forked."""
+"""Modules that every process has from its start, where processes can be forked; those that are installed.
+
+Most environments draw by pygame, whose import takes as long as all else until their first picture.
+"""
 
 
 class ProcessPool:
@@ -61,6 +66,7 @@ class ProcessPool:
         max_waiting: int = 32,
     ) -> None:
         self._seconds, self._memory_bytes, self._keep_seconds = seconds, memory_bytes, keep_seconds
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # it would print to the service's stdout
         self._context = process_context(PRELOADED)
         self._threads = ThreadPoolExecutor(processes, "processes")
         self._places = threading.Semaphore(processes + max_waiting)
