@@ -7,7 +7,8 @@
             ...                           # the environment is not the recorded one; nothing follows
 
 `redo` runs the environment, which is foreign code, in this process; `redo_in_child` in a child process with
-limits on memory and time. Whether a recording can be done again is for `runner.replay.capabilities` to say.
+limits on memory and time. `runner.replay.capabilities` says whether a recording can be done again, and
+`runner.export.pictures` what its pictures are made from.
 """
 
 from __future__ import annotations

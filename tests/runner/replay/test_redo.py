@@ -15,8 +15,8 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import NormalizeObservation as NormalizeVector
 
 import runner
+from runner.export.pictures import Source, source_of
 from runner.recording.reader import open_recording
-from runner.replay.capabilities import capabilities
 from runner.replay.environment import redo, redo_in_child
 from tests.runner.loops.making import drive, parallel
 from tests.runner.replay import loops
@@ -177,7 +177,7 @@ def test_a_child_process_draws_the_pictures_of_an_episode(tmp_path):
     blocks = list(redo_in_child(path, "train", [3], render=True))
     with open_recording(path) as recording:
         steps = recording.episode_steps("train", 3)
-        assert capabilities(recording).picture == "redrawn"
+        assert source_of(recording, "train") == (Source.REDRAWN, "")
         (in_process,) = (b for b in redo(recording, "train", [3], render=True) if b.starts)
     frames = [frame for block in blocks for frame in block.frames]
     assert len(frames) == sum(map(len, blocks)) == len(steps)

@@ -14,9 +14,9 @@ import pytest
 import runner
 from runner.errors import CannotRedo
 from runner.execution.redo import verify_by_redoing
+from runner.export.pictures import Source, source_of
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import open_recording
-from runner.replay.capabilities import capabilities
 from runner.replay.environment import redo, redo_in_child
 from runner.replay.makers import make_environment, why_not_made
 from tests.runner.replay import loops
@@ -206,10 +206,9 @@ def test_an_environment_of_the_script_itself_cannot_be_made_again(tmp_path):
         gymnasium.wrappers.TransformReward(gymnasium.make("CartPole-v1"), lambda r: 2 * r), tmp_path, 20
     )
     with open_recording(path) as recording:
-        found = capabilities(recording)
-        assert found.picture == "values"
-        assert not found.can_redo
-        assert "JSON cannot hold" in found.reason
+        source, reason = source_of(recording, "train")
+        assert source is Source.VALUES
+        assert "JSON cannot hold" in reason
         with pytest.raises(CannotRedo, match="JSON cannot hold"):
             next(redo(recording))
 
