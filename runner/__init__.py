@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from runner.execution.rerecord import evaluate, rerecord
     from runner.execution.resume import resume
     from runner.execution.verify import verify
+    from runner.loops.branch import branch
     from runner.loops.env import record
     from runner.loops.vector import record_parallel, record_vector
     from runner.recording.reader import Recording, open_recording
@@ -38,6 +39,7 @@ __all__ = [
     "Run",
     "RunnerError",
     "__version__",
+    "branch",
     "evaluate",
     "find_run",
     "frames",
@@ -59,6 +61,7 @@ _HOME = {
     "Recording": "runner.recording.reader",
     "Run": "runner.runs.run",
     "RunnerError": "runner.errors",
+    "branch": "runner.loops.branch",
     "evaluate": "runner.execution.rerecord",
     "find_run": "runner.runs.resolve",
     "label": "runner.runs.run",

@@ -28,6 +28,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "sweep": ("sweep", "Run an experiment with many values, and rank them."),
         "resume": ("resume", "Resume an interrupted run, to the same content as an undisturbed one."),
         "evaluate": ("resume", "Evaluate a run's Q-table at any step in new episodes."),
+        "branch": ("branch", "Take another action at a recorded step, and play on."),
         "rerecord": ("resume", "Record the steps of a run that was recorded without them."),
     },
     "Inspect": {

@@ -108,7 +108,7 @@ def play_checkpoint(
     settings = {"origin": origin | {"digest": checkpoint.digest}, "policy": policy}
     own = _game_spaces(env) if is_game else (env.observation_space, env.action_space)
     try:
-        with _from_policy(policy):
+        with from_policy(policy):
             act = make(weights, *own)
     except BaseException:
         env.close()
@@ -127,7 +127,7 @@ def _play(rec: Any, act: Policy, seed: int, name: str, is_game: bool) -> None:
     """Play an episode."""
     observation, over = rec.reset(seed=seed)[0], False
     while not over:
-        with _from_policy(name):
+        with from_policy(name):
             action = act(observation)
         observation, _, terminated, truncated, _ = rec.step(action)
         over = not rec.agents if is_game else terminated or truncated
@@ -181,12 +181,12 @@ def values_along(
         )
     own = (restore_space(recording.spaces[name]) for name in ("observation", "action"))
     make, weights = policy_named(policy), checkpoint.load(trust)
-    with _from_policy(policy):
+    with from_policy(policy):
         act = make(weights, *own)
     rows: dict[str, list[NDArray[Any]]] = {}
     steps = len(found.rewards)
     for t in range(steps):
-        with _from_policy(policy):
+        with from_policy(policy):
             thought = act(_element(found.observations, t))
         for name, value in _named(thought).items():
             rows.setdefault(name, []).append(value)
@@ -231,7 +231,7 @@ def _element(values: Any, i: int) -> Any:
 
 
 @contextlib.contextmanager
-def _from_policy(name: str) -> Iterator[None]:
+def from_policy(name: str) -> Iterator[None]:
     """Raise what the user's policy raises as an error with its place."""
     try:
         yield

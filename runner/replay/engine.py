@@ -106,7 +106,7 @@ class Replay:
             draws: whether to draw pictures.
         """
         phase, width = piece.phase, self._recording.environments if environment == ALL else 1
-        rows, resets = _own(piece, environment, self._recording.environments)
+        rows, resets = own_steps(piece, environment, self._recording.environments)
         begin = 0
         if not self.is_known(phase, environment):
             known = next((k for k, (_, reset) in enumerate(resets) if reset.is_known), None)
@@ -116,7 +116,7 @@ class Replay:
             self._known.add(self._key(phase, environment))
             begin, resets = resets[known][0], resets[known:]
             self.skipped += begin * width
-        stepper = self._stepper(phase, environment)
+        stepper = self.stepper(phase, environment)
         stepper.draws = draws
         end, stop = begin, len(rows) // width
         while end < stop or resets:
@@ -150,7 +150,7 @@ class Replay:
         elif seconds > 2 * BLOCK_SECONDS:
             self._max_rows = max(self._max_rows // 2, 1)
 
-    def _stepper(self, phase: str, environment: int) -> Stepper:
+    def stepper(self, phase: str, environment: int) -> Stepper:
         """Return an environment, made when it is first needed.
 
         Raises:
@@ -332,7 +332,7 @@ def _are_separate(recording: Recording) -> bool:
     return False
 
 
-def _own(
+def own_steps(
     piece: Piece, environment: int, environments: int
 ) -> tuple[NDArray[np.void], list[tuple[int, RecordedReset]]]:
     """Return the steps of one environment, and its resets with the row that each comes before.

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -14,13 +14,18 @@ from runner.errors import CannotRedo, RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
-from runner.replay.engine import ALL, Replay
+from runner.replay.engine import ALL, Replay, own_steps
 from runner.replay.recorded import Piece, RecordedReset, pieces, resets_of
 from runner.replay.redone import RedoneSteps
+from runner.replay.stepping import RowStepper
 
 _HELD_STEPS: Final = 64
 _HELD_SECONDS: Final = 0.3
 """An episode counts as begun in the right state if this many steps agree, or those of this time."""
+
+
+OnReset = Callable[[RowStepper, Iterator[Any]], None]
+"""Takes an environment before the reset that begins an episode, and the episode's recorded actions."""
 
 
 class _Astray(Exception):
@@ -67,6 +72,64 @@ def redo_episode(
             continue
 
 
+@contextmanager
+def episode_at(
+    recording: Recording, phase: str, number: int, t: int, make: Callable[[], Replay], on_reset: OnReset
+) -> Iterator[None]:
+    """Bring an environment to a step of an episode, by the recorded resets and actions; close it afterwards.
+
+    Args:
+        recording: of a loop.
+        phase: `train` or `eval`.
+        number: of an episode, as `Recording.episode_span` takes it.
+        t: the number of steps to take.
+        make: returns a new replay.
+        on_reset: called before the reset that begins the episode, with the recorded actions from `t` on; it
+            may wrap `RowStepper.env`.
+
+    Raises:
+        CannotRedo: the environment differs from the recording, or cannot be brought there.
+        RecordingError: there is no such episode or step.
+    """
+    span, n = recording.episode_span(phase, number), recording.environments
+    if not 0 <= t < len(span):
+        raise RecordingError(
+            f"{recording.path}: found no step {t:,} of {schema.PHASE_NAMES[phase]} episode {number}; it has "
+            f"{len(span):,}, from 0."
+        )
+    target = _target(recording, phase, number)
+    time = _step_time(recording, phase, span[t] // n * n) - STEP_NANOSECONDS
+    until = replace(target, stop_time=max(time, target.reset.time) + 1)
+    start = _right_start(recording, target, make)
+    with closing(make()) as replay:
+        if ALL in replay.environments:
+            raise CannotRedo("The environments of this vector cannot be stepped one by one.")
+        stepper = replay.stepper(phase, target.environment)
+        assert isinstance(stepper, RowStepper)  # or the vector is stepped as a whole
+        actions = (
+            action
+            for piece in pieces(recording, [phase], time, target.stop_time)
+            for action in stepper.actions(own_steps(piece, target.environment, n)[0])
+        )
+        for steps in _episode(recording, replay, until, start, lambda: on_reset(stepper, actions)):
+            if steps.difference is not None:
+                raise CannotRedo(f"The environment is not the recorded one: {steps.difference}.")
+        yield
+
+
+def _right_start(recording: Recording, target: _Target, make: Callable[[], Replay]) -> RecordedReset | None:
+    """Return the reset from which to begin, so that the episode's first steps agree."""
+    for start in _starts(recording, target):
+        try:
+            with closing(make()) as replay:
+                if start is not None and ALL not in replay.environments:
+                    next(_held(_episode(recording, replay, target, start), is_last=False), None)
+            return start
+        except _Astray:
+            continue
+    return None
+
+
 def _target(recording: Recording, phase: str, number: int) -> _Target:
     """Return where an episode is, and its reset.
 
@@ -86,10 +149,19 @@ def _time_of(recording: Recording, phase: str, number: int, step: int) -> int:
     """Return the `log_time` of the last step of an episode, which is that of its end if it ended."""
     if len(ended := recording.episodes(phase, number, number + 1)):
         return int(ended["log_time"][0])
+    return _step_time(recording, phase, step)
+
+
+def _step_time(recording: Recording, phase: str, step: int) -> int:
+    """Return the `log_time` of a step of a phase."""
     topic = recording.topic(f"/{phase}/step")
     if topic in recording.dtypes:
-        return int(next(recording.blocks(topic, step, step + 1))["log_time"][0])
-    return max(int(message["log_time"]) for message in recording.decoded(topic))
+        times = (int(block["log_time"][0]) for block in recording.blocks(topic, step, step + 1))
+    else:
+        times = (int(each["log_time"]) for each in recording.decoded(topic) if each["step"] == step)
+    if (time := next(times, None)) is None:
+        raise RecordingError(f"{recording.path}: {topic.name}: step {step:,} was lost.")
+    return time
 
 
 def _resets_back(recording: Recording, phase: str, time: int) -> Iterator[RecordedReset]:
@@ -116,15 +188,25 @@ def _starts(recording: Recording, target: _Target) -> Iterator[RecordedReset | N
 
 
 def _episode(
-    recording: Recording, replay: Replay, target: _Target, start: RecordedReset | None
+    recording: Recording,
+    replay: Replay,
+    target: _Target,
+    start: RecordedReset | None,
+    on_reset: Callable[[], None] = lambda: None,
 ) -> Iterator[RedoneSteps]:
     """Yield the steps of one episode, after taking those between `start` and its reset.
+
+    `on_reset` is called before its reset.
 
     Raises:
         _Astray: steps before the episode differ, and it was not begun at the beginning of the recording.
         CannotRedo: the state of the random generators at its beginning is not known.
     """
+    is_begun = False
     for piece, is_target in _approach(recording, target, start):
+        if is_target and not is_begun:
+            on_reset()
+            is_begun = True
         for steps in replay.steps(piece, target.environment, draws=is_target and replay.render):
             if is_target:
                 yield _numbered(steps, target.number)

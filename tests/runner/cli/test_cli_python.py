@@ -23,6 +23,7 @@ def test_the_public_names():
         "Run",
         "RunnerError",
         "__version__",
+        "branch",
         "evaluate",
         "find_run",
         "frames",

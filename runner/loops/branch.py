@@ -1,0 +1,280 @@
+"""A recorded episode of a loop, branched: another action at one of its steps, and a policy from there on.
+
+    branch = runner.branch(run, at="12:40", action=1, policy="random")
+    print(branch.parent.returns, branch.outcome.returns, branch.run.run_id)
+
+The environment is made again, and brought to the step by the recorded reset and actions, which also brings
+its random generators there. The branch is a run of one episode, equal to its parent's before the step.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from runner.analysis.evaluations import evaluation_after, evaluations_of
+from runner.analysis.step_reference import StepRef
+from runner.errors import CannotRedo, ConfigError, RunnerError
+from runner.loops.actions import action_names, parsed_action
+from runner.loops.env import record
+from runner.loops.policies import Policy, from_policy, policy_named
+from runner.loops.vector import record_parallel
+from runner.recording.reader import Recording, open_recording
+from runner.replay.capabilities import why_not_redone
+from runner.replay.engine import BLOCK_SECONDS, Replay, Report
+from runner.replay.environment import stream_from_child
+from runner.replay.episodes import episode_at
+from runner.replay.stepping import RowStepper
+from runner.replay.steps import transitions_of
+from runner.runs.branches import BranchOrigin
+from runner.runs.run import Run, recordings_folder, run_at
+from runner.util.files import storage_errors
+from runner.util.jsonable import as_json
+from runner.util.processes import report_progress
+from runner.util.values import checked_run_name
+
+POLICIES: Final = ("recorded", "random", "constant")
+MAX_STEPS: Final = 100_000
+"""The most steps that a branch takes unless chosen otherwise."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Where an episode led."""
+
+    returns: dict[str, float]
+    """The sum of the rewards of each agent."""
+    length: int
+    end: str
+    """`terminated` or `truncated`; else why the episode was not played to its end."""
+
+
+@dataclass(frozen=True)
+class Branch:
+    """A branch of an episode."""
+
+    run: Run
+    """The run that it was recorded in."""
+    origin: BranchOrigin
+    parent: Outcome
+    outcome: Outcome
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What to branch, and how."""
+
+    at: StepRef
+    action: Any
+    policy: str
+    seed: int
+    name: str | None
+    max_steps: int
+    trust: bool
+    user_folder: Path
+    """Where the module of a policy is looked for."""
+
+
+def branch(
+    run: Run,
+    *,
+    at: str | StepRef,
+    action: Any = None,
+    policy: str = "recorded",
+    seed: int = 0,
+    name: str | None = None,
+    recordings: str | os.PathLike[str] | None = None,
+    max_steps: int = MAX_STEPS,
+    trust: bool = False,
+    report: Report = lambda _: None,
+) -> Branch:
+    """Take another action at a step of a loop's recorded episode, play on, and record it as a run of its own.
+
+    The environment runs in a child process with limits on memory and time, and is compared with the recording
+    on the way to the step. What fails leaves no run.
+
+    Args:
+        run: the recorded loop; the environment that a vector had for the episode is branched alone.
+        at: the step: `EPISODE:T`, or `eval:N:TRIAL:T`.
+        action: as the environment takes it, or as text: a number or a name, numbers separated by commas, JSON
+            for `Dict` and `Tuple`; of a game a mapping by agent, or `AGENT=VALUE`, where the other agents
+            act as recorded. None for the recorded action.
+        policy: what acts after the step: `recorded`, the rest of the recorded actions, and where they run out
+            before the end the branch stops; `random`; `constant`, the action of the step; or
+            `module:function`, which takes an observation and returns an action (of a game both by agent).
+        seed: of the policy `random`.
+        name: of the new run; `NAME.branch` by default.
+        recordings: the folder of the new run: $DUALTAXI_RECORDINGS, or ./recordings, by default.
+        max_steps: the most steps to take from the step on.
+        trust: whether to import what the recording names to make its environment again.
+        report: called with the number of steps taken so far.
+
+    Raises:
+        CannotRedo: the environment cannot be made again, differs from the recording, or fails.
+        ConfigError: an argument cannot be used, or the action is not in the environment's space.
+        RecordingError: there is no such episode or step, or the recording is damaged.
+        StorageError: the folder of the new run cannot be written.
+    """
+    if policy not in POLICIES and ":" not in policy:
+        raise ConfigError(
+            f"policy: found {policy!r}, expected {', '.join(POLICIES)}, or module:function of your own"
+        )
+    if max_steps < 1:
+        raise ConfigError(f"max_steps: found {max_steps}, expected 1 or more")
+    at = StepRef.parse(at) if isinstance(at, str) else at
+    task = _Task(at, action, policy, seed, checked_run_name(name), max_steps, trust, Path.cwd())
+    folder = recordings_folder(recordings).absolute()
+    with storage_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        staging = tempfile.TemporaryDirectory(prefix=".branch-", dir=folder)  # hidden: no run is listed there
+    with staging:
+        for found in stream_from_child(_record_branch, run.recording.absolute(), Path(staging.name), task):
+            if isinstance(found, int):
+                report(found)
+            else:
+                run_id, origin, stopped = found
+        with storage_errors(folder / run_id):
+            (Path(staging.name) / run_id).rename(folder / run_id)
+    own = run_at(folder / run_id)
+    with open_recording(run.recording) as recording:
+        before = _outcome(recording, origin.phase, origin.episode, "unfinished")
+    with open_recording(own.recording) as recording:
+        return Branch(own, origin, before, _outcome(recording, origin.phase, 0, stopped))
+
+
+def _outcome(recording: Recording, phase: str, episode: int, otherwise: str) -> Outcome:
+    """Return where an episode led; `otherwise` is its end if it has none."""
+    returns, length, end = [0.0] * len(recording.agents), 0, otherwise
+    for step in transitions_of(recording, phase, episode):
+        length += 1
+        returns = [sum(pair) for pair in zip(returns, map(float, step["rewards"]), strict=True)]
+        end = "terminated" if step["terminated"] else "truncated" if step["truncated"] else otherwise
+    return Outcome(dict(zip(recording.agents, returns, strict=True)), length, end)
+
+
+# --- in the child process -----------------------------------------------------------------------------
+
+
+def _record_branch(path: Path, folder: Path, task: _Task) -> None:
+    """Record a branch; report the steps taken, then its run id, its origin, and why it stopped early."""
+    os.chdir(task.user_folder)
+    with open_recording(path) as recording:
+        if recording.is_job:
+            raise RunnerError(
+                f"run {recording.run_id} was trained here; only episodes of loops are branched: runs whose "
+                "environment runner.record wrapped."
+            )
+        if reason := why_not_redone(recording, task.trust):
+            raise CannotRedo(reason)
+        player = _Player(recording, folder, task)
+        make = partial(Replay, recording, task.trust, 0.0, report_progress, False)
+        with episode_at(recording, player.phase, player.episode, task.at.t, make, player.begin):
+            stopped = player.play()
+    report_progress((player.rec.run.run_id, player.origin, stopped))
+
+
+class _Player:
+    """Records an episode from its reset on, and plays on from a step.
+
+    Args:
+        recording: of the parent.
+        folder: the recordings folder of the branch.
+        task: what to do.
+    """
+
+    rec: Any
+    """The recorded environment."""
+    origin: BranchOrigin
+
+    def __init__(self, recording: Recording, folder: Path, task: _Task) -> None:
+        self._recording, self._folder, self._task = recording, folder, task
+        self.phase, self.episode = "train", task.at.episode
+        if task.at.after is not None:
+            where = str(recording.path)
+            trials = evaluation_after(evaluations_of(recording), task.at.after, where)
+            self.phase, self.episode = "eval", trials.trial(task.at.episode, where)
+        function: Any = policy_named(task.policy) if ":" in task.policy else None
+        self._function: Policy | None = function
+        self._is_game = False
+        self._actions: Iterator[Any] = iter(())
+
+    def begin(self, stepper: RowStepper, actions: Iterator[Any]) -> None:
+        """Record the environment from now on."""
+        env, task, recording = stepper.env, self._task, self._recording
+        maker = recording.maker_of(self.phase)
+        assert maker is not None  # or `why_not_redone` gave a reason
+        self._is_game, self._actions = maker.kind == "pettingzoo", actions
+        self._space = copy.deepcopy(stepper.action_space)
+        self._space.seed(task.seed)
+        names = action_names(env, recording)
+        self._action = parsed_action(self._space, task.action, next(actions), names, self._is_game)
+        self.origin = BranchOrigin(
+            recording.run_id,
+            self.phase,
+            self.episode,
+            task.at.t,
+            str(task.at),
+            _text(self._action),
+            task.policy,
+            task.seed,
+        )
+        wrap: Callable[..., Any] = record_parallel if self._is_game else record
+        self.rec = stepper.env = wrap(
+            env,
+            self._folder,
+            name=task.name or f"{recording.name[:90]}.branch",
+            seed=recording.seed,
+            config={"origin": self.origin},
+            make=maker.make if task.trust and maker.make else None,
+        )
+        self.rec._enter(self.phase)
+
+    def play(self) -> str:
+        """Take the action, and play on; return why that stopped before the end, empty if it did not."""
+        task, action, reported = self._task, self._action, time.monotonic()
+        for count in range(1, task.max_steps + 1):
+            try:
+                observation, _, terminated, truncated, _ = self.rec.step(action)
+            except (MemoryError, RunnerError):
+                raise
+            except Exception as error:  # foreign code raises anything
+                raise CannotRedo(
+                    f"The environment failed at t {task.at.t + count - 1:,} of the branch, with the action "
+                    f"{_text(action)}: {type(error).__name__}: {error}"
+                ) from error
+            if not self.rec.agents if self._is_game else terminated or truncated:
+                return ""
+            action = self._next(observation)
+            if action is None:
+                return "the recorded actions ran out"
+            if time.monotonic() - reported > BLOCK_SECONDS:
+                reported = time.monotonic()
+                report_progress(task.at.t + count)
+        return f"stopped after {task.max_steps:,} steps"
+
+    def _next(self, observation: Any) -> Any:
+        """Return the policy's action; None where the recorded ones run out."""
+        if self._function is not None:
+            with from_policy(self._task.policy):
+                return self._function(observation)
+        if self._task.policy == "recorded":
+            action = next(self._actions, None)
+        else:
+            action = self._space.sample() if self._task.policy == "random" else self._action
+        if not self._is_game or action is None:
+            return action
+        agents = self.rec.agents
+        return {agent: action[agent] for agent in agents} if all(map(action.__contains__, agents)) else None
+
+
+def _text(action: Any) -> str:
+    """Return an action as JSON."""
+    return json.dumps(as_json(action))

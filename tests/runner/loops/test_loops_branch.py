@@ -1,0 +1,257 @@
+"""Branches of loops: equal to the parent before the step, with its luck, led by the chosen policy."""
+
+from __future__ import annotations
+
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import SyncVectorEnv
+from numpy.lib.recfunctions import repack_fields
+
+import runner
+from runner.errors import CannotRedo, ConfigError, RecordingError, RunnerError
+from runner.execution.verify import verify
+from runner.recording.reader import open_recording
+from runner.runs.branches import branches_of, origin_in
+from tests.runner.loops.making import Rooms, make, play
+
+# Of Box2D's and PettingZoo's own makers.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+    pytest.mark.filterwarnings("ignore::UserWarning"),
+]
+
+ENVIRONMENTS = {
+    "CartPole-v1": (1 - np.arange(2)).tolist(),
+    "Taxi-v4": [1, 0, 3, 2, 5, 4],
+    "LunarLander-v3": [1, 2, 3, 0],
+    "FrozenLake-v1": [2, 3, 0, 1],
+}
+"""Environments, and for each action another one."""
+VALUES = (
+    *("t", "state", "action", "next_state", "next_observation", "rewards", "terminated", "truncated"),
+    *("acted", "agents_terminated", "agents_truncated"),
+)
+"""The fields of a step that do not count it over the run."""
+
+
+def recorded(folder, env, steps=150, **options):
+    """Return the run of a loop that plays at random: one seeded reset, then unseeded ones."""
+    with runner.record(env, folder, **options) as rec:
+        for _ in play(rec, steps):
+            pass
+    return rec.run
+
+
+def rows(run, episode, phase="train"):
+    """Return the steps of an episode, without what counts them over the run."""
+    with open_recording(run.recording) as recording:
+        kept = recording.episode_steps(phase, episode)
+        return repack_fields(kept[[name for name in kept.dtype.names if name in VALUES]])
+
+
+def middle_of(run, episode):
+    return len(rows(run, episode)) // 2
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Return runs by environment."""
+    folder = tmp_path_factory.mktemp("branching")
+    return {name: recorded(folder, make(name), 450) for name in ENVIRONMENTS}
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_without_another_action_a_branch_equals_its_parent_to_the_byte(runs, name, tmp_path):
+    run = runs[name]
+    for at in (f"0:{middle_of(run, 0)}", f"1:{middle_of(run, 1)}"):
+        branch = runner.branch(run, at=at, recordings=tmp_path)
+        assert rows(branch.run, 0).tobytes() == rows(run, branch.origin.episode).tobytes()
+        assert branch.outcome == branch.parent
+        assert branch.parent.end in ("terminated", "truncated")
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_another_action_changes_nothing_before_it_and_is_done_again_with_its_luck(runs, name, tmp_path):
+    run = runs[name]
+    t = middle_of(run, 1)
+    before = rows(run, 1)
+    other = ENVIRONMENTS[name][int(before["action"][t])]
+    branch = runner.branch(run, at=f"1:{t}", action=other, policy="random", seed=4, recordings=tmp_path)
+    own = rows(branch.run, 0)
+    assert own[:t].tobytes() == before[:t].tobytes()
+    assert own["action"][t] == other
+    assert verify(branch.run.recording).sound
+    back = runner.branch(branch.run, at=f"0:{t}", action=int(before["action"][t]), recordings=tmp_path)
+    assert rows(back.run, 0)[: t + 1].tobytes() == before[: t + 1].tobytes()
+
+
+def test_the_luck_after_a_branch_is_that_of_the_parent(runs, tmp_path):
+    """On slippery ice the same draw decides between three directions: its number is the same."""
+    run = runs["FrozenLake-v1"]
+    table = gymnasium.make("FrozenLake-v1").unwrapped.P
+    parent = rows(run, 2)
+    branch = runner.branch(run, at="2:0", action=(int(parent["action"][0]) + 2) % 4, recordings=tmp_path)
+    own = rows(branch.run, 0)
+    slips = []
+    for each in (parent[0], own[0]):
+        outcomes = [outcome[1] for outcome in table[int(each["state"])][int(each["action"])]]
+        slips.append({i for i, state in enumerate(outcomes) if state == each["next_state"]})
+    assert slips[0] & slips[1]
+
+
+def test_policies_recorded_constant_and_of_the_user(runs, tmp_path, monkeypatch):
+    run = runs["CartPole-v1"]
+    (tmp_path / "pole_agent.py").write_text("def balance(o):\n    return int(o[2] + o[3] > 0)\n")
+    monkeypatch.chdir(tmp_path)
+    t = middle_of(run, 0)
+    constant = runner.branch(run, at=f"0:{t}", action=1, policy="constant", recordings=tmp_path)
+    assert (rows(constant.run, 0)["action"][t:] == 1).all()
+    balanced = runner.branch(run, at="0:2", policy="pole_agent:balance", recordings=tmp_path, max_steps=300)
+    assert balanced.outcome.length == 302
+    assert balanced.outcome.end == "stopped after 300 steps"
+    assert balanced.run.status == "finished"
+    ended = runner.branch(balanced.run, at="0:301", action=0, recordings=tmp_path)
+    assert ended.outcome.end == "the recorded actions ran out"
+
+
+def test_a_branch_says_where_it_comes_from_and_its_parent_lists_it(runs, tmp_path):
+    run = runs["CartPole-v1"]
+    folder = run.folder.parent
+    branch = runner.branch(run, at="1:2", action="1", policy="random", recordings=folder, name="tried")
+    assert branch.run.name == "tried"
+    assert origin_in(branch.run.file.config) == branch.origin
+    assert (branch.origin.run, branch.origin.at, branch.origin.action) == (run.run_id, "1:2", "1")
+    assert branches_of(run.run_id, folder) == {branch.run.run_id: branch.origin}
+    again = runner.branch(run, at="1:2", action="1", policy="random", recordings=folder)
+    assert rows(again.run, 0).tobytes() == rows(branch.run, 0).tobytes()
+    assert list(branches_of(run.run_id, folder)) == [again.run.run_id, branch.run.run_id]
+    assert branches_of(branch.run.run_id, folder) == {}
+
+
+def test_a_dict_space_takes_json(tmp_path):
+    run = recorded(tmp_path, Rooms(), 60, make="tests.runner.loops.making:Rooms")
+    with pytest.raises(CannotRedo, match="--trust"):
+        runner.branch(run, at="0:1", recordings=tmp_path)
+    given = '{"go": 2, "push": [0.25]}'
+    branch = runner.branch(run, at="1:1", action=given, recordings=tmp_path, trust=True)
+    own, before = rows(branch.run, 0), rows(run, 1)
+    assert own[:1].tobytes() == before[:1].tobytes()
+    assert own["action"][1].tolist() == (2, [0.25])
+    assert json.loads(branch.origin.action) == json.loads(given)
+    for text, message in {
+        '{"go": 2}': "expected an object with go, push",
+        "{": "expected JSON",
+        '{"go": 4, "push": [0]}': r"action\['go'\]: found 4, expected 0 to 3",
+        '{"go": 1, "push": [2]}': r"action\['push'\]\[0\]: found 2, expected 0 to 1",
+    }.items():
+        with pytest.raises(ConfigError, match=message):
+            runner.branch(run, at="1:1", action=text, recordings=tmp_path, trust=True)
+
+
+def test_numbers_of_a_box(tmp_path):
+    run = recorded(tmp_path, gymnasium.make("Pendulum-v1"), 30)
+    branch = runner.branch(run, at="0:5", action="-1.5", policy="constant", recordings=tmp_path, max_steps=3)
+    assert rows(branch.run, 0)["action"][5:].tolist() == [[-1.5]] * 3
+    with pytest.raises(ConfigError, match=r"action\[0\]: found 3, expected -2 to 2"):
+        runner.branch(run, at="0:5", action="3", recordings=tmp_path)
+
+
+def test_a_sub_environment_of_a_vector(tmp_path):
+    envs = SyncVectorEnv([lambda: gymnasium.make("CartPole-v1")] * 3)
+    with runner.record_vector(envs, tmp_path) as rec:
+        rec.action_space.seed(0)
+        rec.reset(seed=3)
+        for _ in range(120):
+            rec.step(rec.action_space.sample())
+    for episode in (1, 5):
+        same = runner.branch(rec.run, at=f"{episode}:4", recordings=tmp_path)
+        assert rows(same.run, 0).tobytes() == rows(rec.run, episode).tobytes()
+        assert same.outcome == same.parent
+    with pytest.raises(RecordingError, match="has no training episode"):
+        runner.branch(rec.run, at="400:0", recordings=tmp_path)
+
+
+def test_a_game_of_several_agents(tmp_path):
+    env = pytest.importorskip("mpe2.simple_spread_v3").parallel_env(max_cycles=10)
+    with runner.record_parallel(env, tmp_path) as rec:
+        for seed in (3, None):
+            rec.reset(seed=seed)
+            while rec.agents:
+                rec.step({agent: (i + 1) % 5 for i, agent in enumerate(rec.agents)})
+    same = runner.branch(rec.run, at="1:4", recordings=tmp_path)
+    assert rows(same.run, 0).tobytes() == rows(rec.run, 1).tobytes()
+    branch = runner.branch(rec.run, at="1:4", action="agent_1=0", policy="constant", recordings=tmp_path)
+    own = rows(branch.run, 0)
+    assert own[:4].tobytes() == rows(rec.run, 1)[:4].tobytes()
+    assert [tuple(each) for each in own["action"][4:].tolist()] == [(1, 0, 3)] * 6
+    assert set(branch.outcome.returns) == {"agent_0", "agent_1", "agent_2"}
+    with pytest.raises(ConfigError, match="expected AGENT=VALUE of an agent that acts at this step: agent_0"):
+        runner.branch(rec.run, at="1:4", action="1", recordings=tmp_path)
+
+
+def test_steps_of_evaluation_names_of_actions_and_an_episode_that_was_cut(tmp_path):
+    with runner.record(make("Taxi-v4"), tmp_path) as rec, rec.phase("eval"):
+        for steps in (200, 3):
+            rec.reset(seed=2)
+            for _ in range(steps):
+                rec.step(0)
+        with rec.phase("train"):
+            rec.reset(seed=2)
+            rec.step(0)
+    branch = runner.branch(rec.run, at="eval:0:0:1", action="North", policy="constant", recordings=tmp_path)
+    assert rows(branch.run, 0, "eval")["action"][:3].tolist() == [0, 1, 1]
+    assert branch.parent.end == branch.outcome.end == "truncated"
+    cut = runner.branch(rec.run, at="0:0", action="west", recordings=tmp_path)
+    assert (cut.parent.end, cut.outcome.end) == ("unfinished", "the recorded actions ran out")
+    with pytest.raises(ConfigError, match="or a name: south, north, east"):
+        runner.branch(rec.run, at="eval:0:0:1", action="nord", recordings=tmp_path)
+
+
+def test_what_cannot_be_branched_leaves_no_run(runs, tmp_path):
+    run = runs["CartPole-v1"]
+    length = len(rows(run, 0))
+    for error, message, options in (
+        (RecordingError, f"no step {length} of training episode 0; it has {length}", {"at": f"0:{length}"}),
+        (RecordingError, "found no evaluation after 3 episodes", {"at": "eval:3:0:0"}),
+        (RunnerError, "expected EPISODE:T", {"at": "here"}),
+        (ConfigError, "action: found '2', expected 0 to 1", {"at": "0:1", "action": "2"}),
+        (ConfigError, "expected recorded, random, constant", {"at": "0:1", "policy": "best"}),
+        (ConfigError, "cannot be imported", {"at": "0:1", "policy": "no_such_module:act"}),
+    ):
+        with pytest.raises(error, match=message):
+            runner.branch(run, recordings=tmp_path, **options)
+    job = runner.run("quick", overrides=["episodes=2", "evaluation.trials=1"], recordings=tmp_path / "own")
+    with pytest.raises(RunnerError, match="only episodes of loops are branched"):
+        runner.branch(job, at="0:1", recordings=tmp_path)
+    own = recorded(tmp_path / "own", Rooms())
+    with pytest.raises(CannotRedo, match="not made by gymnasium"):
+        runner.branch(own, at="0:1", recordings=tmp_path)
+    assert [each.name for each in tmp_path.iterdir()] == ["own"]
+
+
+def test_an_environment_that_is_not_the_recorded_one_is_found_out(tmp_path, monkeypatch):
+    env = gymnasium.make("CartPole-v1")
+    run = recorded(tmp_path, env, 40, make="tests.runner.loops.test_loops_branch:heavier")
+    with pytest.raises(CannotRedo, match=r"train episode 0, t 5: reward: recorded 1.0, got 2.0"):
+        runner.branch(run, at="0:8", recordings=tmp_path, trust=True)
+
+
+def heavier():
+    env = gymnasium.make("CartPole-v1")
+
+    class Own(gymnasium.Wrapper):
+        t = 0
+
+        def reset(self, **kwargs):
+            self.t = 0
+            return self.env.reset(**kwargs)
+
+        def step(self, action):
+            self.t += 1
+            observation, reward, *rest = self.env.step(action)
+            return observation, reward + (self.t > 5), *rest
+
+    return Own(env)
