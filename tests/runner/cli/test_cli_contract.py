@@ -66,7 +66,7 @@ WRITING = {
     "values": "{loop} --episode 0 --checkpoint @0 --policy {policy} -o {folder}/values.csv",
 }
 """Commands whose JSON lists the files that they wrote, and what is typed after them."""
-LOOPS = {"checkpoints": "{loop}"}
+LOOPS = {"checkpoints": "{loop}", "branch": "{loop} --at 0:2 --recordings {folder}/branches"}
 WITHOUT_JSON = ("view", "completion", "serve")
 """Commands that print an address, a script or nothing."""
 LINES = ("run", "play", "table", "archive")
