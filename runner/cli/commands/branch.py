@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @click.command("branch", cls=Command)
 @run_argument
-@click.option("--at", type=STEP, required=True, metavar="STEP", help="EPISODE:T, or eval:N:TRIAL:T.")
+@click.option("--at", type=STEP, metavar="STEP", help="The step: EPISODE:T, or eval:N:TRIAL:T.")
 @click.option(
     "--action",
     "actions",
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 @json_option
 def branch_command(
     run_name: str,
-    at: StepRef,
+    at: StepRef | None,
     actions: tuple[str, ...],
     policy: str,
     seed: int,
@@ -80,6 +80,8 @@ def branch_command(
             raise click.UsageError("--action: several are for the agents of a game: AGENT=VALUE each.")
         action = {agent: value for agent, _, value in pairs}
     run = find_recorded(run_name, recordings)
+    if at is None:
+        raise click.UsageError("expected --at EPISODE:T or --at eval:N:TRIAL:T, the step to branch at")
     with steps_line("branching") as report:
         found = branch(
             run,
