@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from runner.drawing.raster import Pixels
-    from runner.export.episodes import EpisodeChoice
+    from runner.export.episodes import EpisodePlace
     from runner.export.pictures import Pictures
     from runner.recording.reader import Recording
 
@@ -53,7 +53,7 @@ class Episode:
         RecordingError: there is no such episode, or the recording holds no steps.
     """
 
-    def __init__(self, recording: Recording, choice: EpisodeChoice, title: str) -> None:
+    def __init__(self, recording: Recording, choice: EpisodePlace, title: str) -> None:
         self._recording, self._phase, self._number = recording, choice.phase, choice.number
         self._length = len(recording.episode_span(choice.phase, choice.number))
         self._title = title

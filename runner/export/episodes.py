@@ -1,4 +1,4 @@
-"""Which episode of a run is shown: the one that was named, the best, the worst, or a typical one."""
+"""Which episode of a run is shown: one that was named, the best, the worst or a typical one; its name."""
 
 from __future__ import annotations
 
@@ -11,24 +11,42 @@ from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.environments.naming import trial_in_words
 from runner.errors import RecordingError
 from runner.export.contents import require_steps
-from runner.export.reports.episode import default_trial, last_episode
 from runner.recording import schema
 from runner.recording.reader import Recording
 
 
 @dataclass(frozen=True)
-class EpisodeChoice:
-    """An episode of a run."""
+class EpisodePlace:
+    """Where an episode stands in its recording."""
 
     phase: str
-    """`train` or `eval`."""
     number: int
-    """Among the episodes of the phase, counted from 0."""
+    """Counted over the phase."""
     title: str
-    """Its name as text: `training episode 12`, `trial 3 of the evaluation after 40 episodes`."""
+    table_step: int = -1
+    """Training steps before the evaluation of a trial."""
 
 
-def chosen_episode(recording: Recording, episode: int | None, trial: tuple[int, int] | None) -> EpisodeChoice:
+def place_of(recording: Recording, which: tuple[int, ...]) -> EpisodePlace:
+    """Return where an episode stands.
+
+    Args:
+        recording: the run.
+        which: (episode,) of training, or (training episodes before, trial) of an evaluation.
+
+    Raises:
+        RecordingError: there is no such evaluation or trial.
+    """
+    if len(which) == 1:
+        return EpisodePlace("train", which[0], f"training episode {which[0]:,}")
+    after, number = which
+    where = str(recording.path)
+    evaluation = evaluation_after(evaluations_of(recording), after, where)
+    title = trial_in_words(after, number)
+    return EpisodePlace("eval", evaluation.trial(number, where), title, evaluation.train_step)
+
+
+def chosen_episode(recording: Recording, episode: int | None, trial: tuple[int, int] | None) -> EpisodePlace:
     """Return the training episode or trial of these numbers; without any, a typical one.
 
     That is `default_trial`, or the last training episode of a run without evaluations.
@@ -42,15 +60,9 @@ def chosen_episode(recording: Recording, episode: int | None, trial: tuple[int, 
         RecordingError: there is no such evaluation or trial, or no steps.
     """
     require_steps(recording, "show")
-    if episode is None and trial is None:
-        trial = default_trial(recording)
-    if trial is None:
-        number = last_episode(recording) if episode is None else episode
-        return EpisodeChoice("train", number, f"training episode {number:,}")
-    after, number = trial
-    where = str(recording.path)
-    index = evaluation_after(evaluations_of(recording), after, where).trial(number, where)
-    return EpisodeChoice("eval", index, trial_in_words(after, number))
+    if episode is not None:
+        return place_of(recording, (episode,))
+    return place_of(recording, trial or default_trial(recording) or (last_episode(recording),))
 
 
 def ranked_episodes(recording: Recording) -> tuple[str, NDArray[np.int64]]:
@@ -67,16 +79,83 @@ def ranked_episodes(recording: Recording) -> tuple[str, NDArray[np.int64]]:
     records = records[records["last_step"] < recording.count(recording.topic(f"/{phase}/step"))]
     if not len(records):
         raise RecordingError(f"{recording.path}: found no episode that ended; --episode 0 shows the first.")
-    returns = np.nan_to_num(records["returns"].sum(axis=1), nan=-np.inf, posinf=np.inf, neginf=-np.inf)
-    order = np.lexsort((-records["length"].astype(np.int64), returns, records["success"]))
-    return phase, records["episode"][order].astype(np.int64)
+    return phase, _by_rank(records)
 
 
-def named_episode(recording: Recording, phase: str, number: int) -> EpisodeChoice:
-    """Return an episode with its name."""
+def named_episode(recording: Recording, phase: str, number: int) -> EpisodePlace:
+    """Return where an episode of a phase stands, counted over the phase."""
     if phase == "train":
-        return EpisodeChoice(phase, number, f"training episode {number:,}")
-    for evaluation in evaluations_of(recording):
-        if evaluation.start <= number < evaluation.stop:
-            return EpisodeChoice(phase, number, trial_in_words(evaluation.after, number - evaluation.start))
-    return EpisodeChoice(phase, number, f"evaluation episode {number:,}")
+        return place_of(recording, (number,))
+    for one in evaluations_of(recording):
+        if one.start <= number < one.stop:
+            return place_of(recording, (one.after, number - one.start))
+    return EpisodePlace(phase, number, f"evaluation episode {number:,}")
+
+
+def ranked_trials(recording: Recording, after: int) -> tuple[int, int, int]:
+    """Return the worst, the median and the best trial of an evaluation: by success, return and length."""
+    evaluation = evaluation_after(evaluations_of(recording), after, str(recording.path))
+    worst, median, best = ranked(recording, "eval", evaluation.start, evaluation.stop)
+    return worst - evaluation.start, median - evaluation.start, best - evaluation.start
+
+
+def ranked(recording: Recording, phase: str, start: int, stop: int) -> tuple[int, int, int]:
+    """Return the worst, the median and the best of some episodes: by success, return and length."""
+    ranked_numbers = _by_rank(recording.episodes(phase, start, stop))
+    worst, median, best = (int(ranked_numbers[i]) for i in (0, len(ranked_numbers) // 2, -1))
+    return worst, median, best
+
+
+def _by_rank(records: NDArray[np.void]) -> NDArray[np.int64]:
+    """Return the numbers of episodes from worst to best; a return that is no number is the worst."""
+    with np.errstate(over="ignore", invalid="ignore"):  # rewards may be infinite
+        returns = records["returns"].sum(axis=1)
+    returns[np.isnan(returns)] = -np.inf
+    order = np.lexsort((-records["length"].astype(np.int64), returns, records["success"]))
+    return records["episode"][order].astype(np.int64)
+
+
+def typical_trial(recording: Recording) -> tuple[int, int]:
+    """Return the last evaluation (training episodes before it) and its median trial.
+
+    Raises:
+        RecordingError: there is no evaluation, or no steps.
+    """
+    require_steps(recording, "show")
+    after = last_whole_evaluation(recording)
+    if after is None:
+        raise RecordingError(f"{recording.path}: has no whole evaluation; choose a training episode.")
+    return after, ranked_trials(recording, after)[1]
+
+
+def default_trial(recording: Recording) -> tuple[int, int] | None:
+    """Return the trial to show if the user names none: training episodes before it, and its number.
+
+    It is the typical trial of the last whole evaluation. In a loop, where the number of trials of an
+    evaluation is unknown, it is the first trial after the last training. None if there is no such trial.
+    """
+    if recording.is_job:
+        return typical_trial(recording) if last_whole_evaluation(recording) is not None else None
+    evaluations = evaluations_of(recording)
+    return (evaluations[-1].after, 0) if evaluations else None
+
+
+def last_episode(recording: Recording) -> int:
+    """Return the number of the last training episode that ended; 0 if none did."""
+    return max(0, recording.count(schema.TRAIN_EPISODE) - 1)
+
+
+def last_whole_evaluation(recording: Recording) -> int | None:
+    """Return the training episodes before the last evaluation whose trials were all recorded.
+
+    A recording that was cut off may have an evaluation's metrics without its trials. The evaluations of a
+    loop are the trials that were recorded.
+    """
+    episodes, steps = recording.count(schema.EVAL_EPISODE), recording.count(schema.EVAL_STEP)
+    for one in reversed(evaluations_of(recording)):
+        if (
+            one.stop <= episodes
+            and recording.episodes("eval", one.stop - 1, one.stop)[0]["last_step"] < steps
+        ):
+            return one.after
+    return None

@@ -23,9 +23,10 @@ from runner.analysis.summary import random_policy_sentence
 from runner.drawing import svg
 from runner.errors import RecordingError, RunnerError
 from runner.export.encoded import picture_note
+from runner.export.episodes import last_episode, last_whole_evaluation, typical_trial
 from runner.export.plots.curves import footnote, panel_plots
 from runner.export.reports.diff import ShownDivergence, difference_view
-from runner.export.reports.episode import last_episode, last_whole_evaluation, trial, typical_trial
+from runner.export.reports.episode import trial
 from runner.export.reports.maps import maps_of, stages_of
 from runner.export.reports.playback import playback_of
 from runner.export.reports.rendering import Link, partials

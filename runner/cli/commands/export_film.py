@@ -26,7 +26,7 @@ from runner.util.humanize import size
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from runner.export.episodes import EpisodeChoice
+    from runner.export.episodes import EpisodePlace
     from runner.export.pictures import Pictures
     from runner.recording.reader import Recording
 
@@ -149,7 +149,7 @@ def command(
         raise SystemExit(ExitCode.DIFFERENT)
 
 
-def _ranked(recording: Recording, grid: tuple[int, int] | None, best: bool) -> list[EpisodeChoice]:
+def _ranked(recording: Recording, grid: tuple[int, int] | None, best: bool) -> list[EpisodePlace]:
     """Return the best episode, the worst, or those of a grid from the best to the worst."""
     from runner.export.episodes import named_episode, ranked_episodes
 

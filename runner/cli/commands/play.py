@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from rich.live import Live
 
     from runner.cli.episode import Frame
-    from runner.export.episodes import EpisodeChoice
+    from runner.export.episodes import EpisodePlace
     from runner.export.pictures import Pictures
     from runner.recording.reader import Recording
 
@@ -147,7 +147,7 @@ def _image_type(is_tabular: bool) -> Any:
 
 
 def _pictures(
-    recording: Recording, choice: EpisodeChoice, trust: bool, stack: contextlib.ExitStack
+    recording: Recording, choice: EpisodePlace, trust: bool, stack: contextlib.ExitStack
 ) -> Pictures | None:
     """Return the pictures of an episode, closed with the stack; None if there are only values."""
     from runner.export.pictures import Source, pictures

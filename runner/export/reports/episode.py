@@ -12,13 +12,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.environments.mdp import events_of
-from runner.environments.naming import (
-    trial_in_words,
-)
 from runner.errors import RecordingError
 from runner.export.contents import ENDINGS, ending_of, require_steps
+from runner.export.episodes import EpisodePlace, place_of
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.steps import check_steps
@@ -86,37 +83,6 @@ class Episode:
         return outcome_in_words(self.length, self.ended, self.total)
 
 
-@dataclass(frozen=True)
-class EpisodePlace:
-    """Where an episode stands in its recording."""
-
-    phase: str
-    number: int
-    """Counted over the phase."""
-    title: str
-    table_step: int = -1
-    """Training steps before the evaluation of a trial."""
-
-
-def place_of(recording: Recording, which: tuple[int, ...]) -> EpisodePlace:
-    """Return where an episode stands.
-
-    Args:
-        recording: the run.
-        which: (episode,) of training, or (training episodes before, trial) of an evaluation.
-
-    Raises:
-        RecordingError: there is no such evaluation or trial.
-    """
-    if len(which) == 1:
-        return EpisodePlace("train", which[0], f"training episode {which[0]:,}")
-    after, number = which
-    where = str(recording.path)
-    evaluation = evaluation_after(evaluations_of(recording), after, where)
-    title = trial_in_words(after, number)
-    return EpisodePlace("eval", evaluation.trial(number, where), title, evaluation.train_step)
-
-
 def outcome_in_words(length: int, ended: str, total: float | None) -> str:
     """Return length, end and return of an episode as text; a return of None is unknown."""
     rewards = "" if total is None else f" Rewards sum to {total:g}."
@@ -146,69 +112,6 @@ def trial(recording: Recording, after: int, number: int, limit: int = MAX_STEPS,
         RecordingError: there is no such evaluation or trial, or no steps.
     """
     return episode_at(recording, place_of(recording, (after, number)), limit, first)
-
-
-def ranked_trials(recording: Recording, after: int) -> tuple[int, int, int]:
-    """Return the worst, the median and the best trial of an evaluation: by success, return and length."""
-    evaluation = evaluation_after(evaluations_of(recording), after, str(recording.path))
-    worst, median, best = ranked(recording, "eval", evaluation.start, evaluation.stop)
-    return worst - evaluation.start, median - evaluation.start, best - evaluation.start
-
-
-def ranked(recording: Recording, phase: str, start: int, stop: int) -> tuple[int, int, int]:
-    """Return the worst, the median and the best of some episodes: by success, return and length."""
-    records = recording.episodes(phase, start, stop)
-    with np.errstate(over="ignore", invalid="ignore"):  # rewards may be infinite
-        returns = records["returns"].sum(axis=1)
-    order = np.lexsort((-records["length"].astype(np.int64), returns, records["success"]))
-    worst, median, best = (int(records["episode"][order[i]]) for i in (0, len(order) // 2, -1))
-    return worst, median, best
-
-
-def typical_trial(recording: Recording) -> tuple[int, int]:
-    """Return the last evaluation (training episodes before it) and its median trial.
-
-    Raises:
-        RecordingError: there is no evaluation, or no steps.
-    """
-    require_steps(recording, "show")
-    after = last_whole_evaluation(recording)
-    if after is None:
-        raise RecordingError(f"{recording.path}: has no whole evaluation; choose a training episode.")
-    return after, ranked_trials(recording, after)[1]
-
-
-def default_trial(recording: Recording) -> tuple[int, int] | None:
-    """Return the trial to show if the user names none: training episodes before it, and its number.
-
-    It is the typical trial of the last whole evaluation. In a loop, where the number of trials of an
-    evaluation is unknown, it is the first trial after the last training. None if there is no such trial.
-    """
-    if recording.is_job:
-        return typical_trial(recording) if last_whole_evaluation(recording) is not None else None
-    evaluations = evaluations_of(recording)
-    return (evaluations[-1].after, 0) if evaluations else None
-
-
-def last_episode(recording: Recording) -> int:
-    """Return the number of the last training episode that ended; 0 if none did."""
-    return max(0, recording.count(schema.TRAIN_EPISODE) - 1)
-
-
-def last_whole_evaluation(recording: Recording) -> int | None:
-    """Return the training episodes before the last evaluation whose trials were all recorded.
-
-    A recording that was cut off may have an evaluation's metrics without its trials. The evaluations of a
-    loop are the trials that were recorded.
-    """
-    episodes, steps = recording.count(schema.EVAL_EPISODE), recording.count(schema.EVAL_STEP)
-    for one in reversed(evaluations_of(recording)):
-        if (
-            one.stop <= episodes
-            and recording.episodes("eval", one.stop - 1, one.stop)[0]["last_step"] < steps
-        ):
-            return one.after
-    return None
 
 
 def episode_at(recording: Recording, place: EpisodePlace, limit: int = MAX_STEPS, first: int = 0) -> Episode:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from runner.environments.naming import spoken
 from runner.errors import RecordingError
 from runner.export.contents import ENDINGS, ending_of
-from runner.export.reports.episode import EpisodePlace, outcome_in_words
+from runner.export.episodes import EpisodePlace
+from runner.export.reports.episode import outcome_in_words
 from runner.export.reports.player_data import (
     Playback,
     Series,

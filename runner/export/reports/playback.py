@@ -20,7 +20,8 @@ from runner.environments.naming import (
     states_in_words,
 )
 from runner.export.contents import ENDINGS, require_steps
-from runner.export.reports.episode import MAX_STEPS, Episode, episode_at, place_of
+from runner.export.episodes import place_of
+from runner.export.reports.episode import MAX_STEPS, Episode, episode_at
 from runner.export.reports.loop_playback import loop_playback
 from runner.export.reports.player_data import (
     Grid,

@@ -21,14 +21,9 @@ from runner.environments.naming import spoken
 from runner.errors import RecordingError
 from runner.export.contents import flat_text, shortcomings, why_no_steps
 from runner.export.encoded import picture_note
+from runner.export.episodes import last_whole_evaluation, place_of, ranked, ranked_trials
 from runner.export.plots.curves import Plot, footnote, plots_of
-from runner.export.reports.episode import (
-    episode_at,
-    last_whole_evaluation,
-    place_of,
-    ranked,
-    ranked_trials,
-)
+from runner.export.reports.episode import episode_at
 from runner.export.reports.evaluations import EvaluationTable, evaluation_table
 from runner.export.reports.maps import MapRow, maps_of, stages_of
 from runner.export.reports.playback import MAX_VALUES, playback_of, titled

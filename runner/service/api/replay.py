@@ -15,7 +15,7 @@ from starlette.concurrency import run_in_threadpool
 
 from runner.errors import RunnerError
 from runner.export.encoded import encoded_pictures
-from runner.export.reports.episode import place_of
+from runner.export.episodes import place_of
 from runner.export.reports.player_data import Playback
 from runner.recording.reader import open_recording
 from runner.service import fragments

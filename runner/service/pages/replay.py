@@ -18,7 +18,7 @@ from runner.analysis.evaluations import evaluations_of
 from runner.analysis.step_reference import StepRef
 from runner.drawing import svg
 from runner.errors import RunnerError
-from runner.export.reports.episode import EpisodePlace, place_of
+from runner.export.episodes import EpisodePlace, place_of
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service import fragments

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 import runner
-from runner.export.reports.episode import typical_trial
+from runner.export.episodes import typical_trial
 
 
 def _frames(text):

@@ -14,9 +14,8 @@ from PIL import Image
 import runner
 from runner.cli import cli
 from runner.export.encoder import FORMATS, Encoder
-from runner.export.episodes import ranked_episodes
+from runner.export.episodes import ranked_episodes, typical_trial
 from runner.export.pictures import pictures
-from runner.export.reports.episode import typical_trial
 from runner.recording.reader import open_recording
 from tests.runner.export.making import made_otherwise
 from tests.runner.loops.making import Rooms, play

@@ -16,7 +16,7 @@ from selenium.webdriver.support.select import Select
 from runner.cli import cli
 from runner.drawing.svg import Drawing, trail_points, transform
 from runner.environments.naming import deeds_in_words, states_in_words
-from runner.export.reports.episode import ranked_trials
+from runner.export.episodes import ranked_trials
 from runner.export.reports.report import render_report
 from runner.recording.reader import open_recording
 from tests.runner.export.outline import Outline, check_page
