@@ -196,7 +196,7 @@ def test_rooms_of_every_kind_of_space_come_back_from_a_vector(tmp_path):
         assert np.array_equal(rows["room"]["1"], observation["room"][1])
 
 
-def test_an_export_to_rerun_notes_that_it_shows_the_first_environment(tmp_path):
+def test_an_export_to_rerun_notes_how_many_environments_it_shows(tmp_path):
     from runner.export.rerun.selection import Request, select
 
     with runner.record_vector(SyncVectorEnv([lambda: make("CartPole-v1")] * 3), tmp_path) as rec:
@@ -204,9 +204,7 @@ def test_an_export_to_rerun_notes_that_it_shows_the_first_environment(tmp_path):
         for _ in range(5):
             rec.step(rec.action_space.sample())
     with open_recording(rec.run.recording) as recording:
-        assert select(recording, Request()).exported == [
-            "of 3 environments the first, in 15 of 15 training steps"
-        ]
+        assert select(recording, Request()).exported == ["15 of 15 training steps in 3 environments"]
 
 
 def test_an_export_to_rerun_notes_that_texts_are_not_drawn(tmp_path):
