@@ -26,6 +26,7 @@ from runner.export.painting import (
     paint_redrawn,
 )
 from runner.export.pictures import Source, source_of, source_of_recorded
+from runner.export.reports.rendering import sentence
 from runner.recording.reader import Recording, open_recording
 from runner.replay.steps import recorded_frames
 from runner.util.extras import require
@@ -39,9 +40,9 @@ def picture_note(recording: Recording, phase: str) -> tuple[bool, str]:
     """Return whether an episode has pictures besides those of a scene, and why not, or why no better ones."""
     source, reason = source_of(recording, phase)
     if source is Source.VALUES:
-        return False, f"There is no picture. {reason}"
+        return False, f"There is no picture. {sentence(reason)}"
     if source is Source.OBSERVATION:
-        return True, f"These are the observations. {reason}"
+        return True, f"These are the observations. {sentence(reason)}"
     return source is not Source.SCENE, ""
 
 

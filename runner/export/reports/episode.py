@@ -86,7 +86,7 @@ class Episode:
 def outcome_in_words(length: int, ended: str, total: float | None) -> str:
     """Return length, end and return of an episode as text; a return of None is unknown."""
     rewards = "" if total is None else f" Rewards sum to {total:g}."
-    return f"{length:,} steps, {ENDINGS[ended]}.{rewards}"
+    return f"{length:,} step{'s' if length != 1 else ''}, {ENDINGS[ended]}.{rewards}"
 
 
 def training_episode(recording: Recording, number: int, limit: int = MAX_STEPS, first: int = 0) -> Episode:
