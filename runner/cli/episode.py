@@ -83,7 +83,8 @@ class Episode:
                 yield Frame(self._above(0) + show(row, is_first=True), Text("the start"))
             action, events = describe(row)
             rewards = np.asarray(row["rewards"], np.float64)
-            returns += rewards
+            with np.errstate(over="ignore", invalid="ignore"):  # rewards may be infinite
+                returns += rewards
             ended = ENDINGS[ending_of(recording, phase, episode)] if t == self._length else ""
             below = _below(action, rewards.tolist(), returns.tolist(), events, ended)
             yield Frame(self._above(t) + show(row, is_first=False), below)
@@ -192,4 +193,4 @@ def _png(pixels: Pixels) -> bytes:
 
 def _joined(rewards: Sequence[float]) -> str:
     """Return rewards as text: `-4`, or `-2 / -2` of several agents."""
-    return " / ".join(number(reward, 0 if reward == round(reward) else 2) for reward in rewards)
+    return " / ".join(number(reward, 0 if reward % 1 == 0 else 2) for reward in rewards)

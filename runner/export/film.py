@@ -29,6 +29,10 @@ USUAL_WIDTH: Final = 480
 """Smaller pictures are enlarged to about this width, in pixels."""
 MAX_WIDTH: Final = 1280
 """Larger pictures, and grids, are reduced to this width."""
+MAX_HEIGHT: Final = 2048
+"""The largest height of a picture."""
+_LEAST_WIDTH: Final = 160
+"""Frames are at least this wide, for their text."""
 _MARGIN: Final = 12
 _LINES: Final = 3
 """Lines of text below a picture that change."""
@@ -147,11 +151,13 @@ def captioned(shot: Shot, width: int | None, notes: list[str]) -> Iterator[Pixel
     for picture in shot.pictures:
         if ground is None:
             size = _size(picture.pixels.shape[1], picture.pixels.shape[0], width)
-            text = 17 if size[0] >= 400 else 12
-            line, inner = round(1.4 * text), size[0] - 2 * _MARGIN
+            frame_width = max(size[0], _LEAST_WIDTH)
+            text = 17 if frame_width >= 400 else 12
+            line, inner = round(1.4 * text), frame_width - 2 * _MARGIN
             heading = wrapped(shot.heading, inner, text, 2, bold=True)
             top = line * len(heading) + _MARGIN
-            ground = Image.new("RGB", (size[0], top + size[1] + _LINES * line + _MARGIN), palette.WHITE)
+            height = top + size[1] + _LINES * line + _MARGIN
+            ground = Image.new("RGB", (frame_width, height), palette.WHITE)
             _write(ground, heading, _MARGIN // 2, text, bold=True)
         frame = ground.copy()
         frame.paste(_resized(picture.pixels, size), (0, top))
@@ -172,11 +178,14 @@ def _write(image: Image.Image, lines: Sequence[str], top: int, text: int, bold: 
 
 def _size(width: int, height: int, wanted: int | None) -> tuple[int, int]:
     """Return the width and height at which a picture is shown."""
-    if wanted is None:
-        factor = float(max(1, round(USUAL_WIDTH / width))) if width < MAX_WIDTH else MAX_WIDTH / width
-    else:
+    if wanted is not None:
         factor = wanted / width
-    return round(width * factor), max(1, round(height * factor))
+    elif width < MAX_WIDTH:
+        factor = float(max(1, round(USUAL_WIDTH / width)))
+    else:
+        factor = MAX_WIDTH / width
+    factor = min(factor, MAX_HEIGHT / height)
+    return max(1, round(width * factor)), max(1, round(height * factor))
 
 
 def _resized(pixels: Pixels, size: tuple[int, int]) -> Image.Image:

@@ -134,7 +134,8 @@ class Pictures:
                 note = str(error)
             action, events = describe(row)
             rewards = np.asarray(row["rewards"], np.float64)
-            returns += rewards
+            with np.errstate(over="ignore", invalid="ignore"):  # rewards may be infinite
+                returns += rewards
             ended = ENDINGS[ending_of(recording, phase, episode)] if t == self.steps else ""
             paid, total = tuple(rewards.tolist()), tuple(returns.tolist())
             yield Picture(t, pixels, action, paid, total, events, ended, note)

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 _SCENE_FPS = 4.0
 """Frames per second of a drawn scene, whose steps are large."""
 _FPS = 30.0
+_MAX_GIF_FPS = 50
+"""A GIF counts in hundredths of a second, and players show one of them too slowly."""
 
 
 @click.command("film", cls=Command, short_help="A film of an episode: MP4, WebM, GIF or WebP.")
@@ -113,6 +115,8 @@ def command(
             shown = [chosen_episode(recording, episode, trial)]
         is_scene = source_of(recording, shown[0].phase, trust)[0] is Source.SCENE
         speed = fps or (_SCENE_FPS if is_scene else _FPS)
+        if path.suffix.lower() == ".gif" and speed > _MAX_GIF_FPS:
+            raise click.UsageError(f"--fps: found {speed:g}, expected at most {_MAX_GIF_FPS} of a GIF.")
         opened: list[Pictures] = []
 
         def shots() -> Iterator[film.Shot]:

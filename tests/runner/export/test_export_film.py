@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import json
 import re
 
 import av
@@ -134,6 +136,72 @@ def test_a_film_ends_with_a_note_where_the_environment_differs(tmp_path):
     assert len(frames_of(tmp_path / "film.mp4")) == 5
 
 
+REAL = {
+    "LunarLander": lambda: gymnasium.make("LunarLander-v3", render_mode="rgb_array"),
+    "Pong": lambda: gymnasium.make("ALE/Pong-v5", render_mode="rgb_array"),
+}
+
+
+@pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")  # of Box2D when it is imported
+@pytest.mark.parametrize("name", REAL)
+def test_environments_draw_the_film_of_a_loop_without_frames(tmp_path, name):
+    if name == "Pong":
+        gymnasium.register_envs(pytest.importorskip("ale_py"))
+    drawn, env = [], REAL[name]()
+    with runner.record(env, tmp_path / "runs") as rec:
+        drawn += [env.render() for _ in itertools.islice(play(rec, 40), 40)]
+    path = tmp_path / "film.mp4"
+    result = film(rec.run.recording, "--episode", 0, "-o", path, "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["source"] == "pictures drawn again"
+    frames = frames_of(path)
+    assert len(frames) == len(drawn)
+    scale = frames.shape[2] // drawn[0].shape[1]
+    for shown, expected in ((frames[0], drawn[0]), (frames[-1], drawn[-1])):
+        assert_shows(shown, expected.repeat(scale, axis=0).repeat(scale, axis=1))
+
+
+def test_the_film_of_a_game_shows_what_its_environment_draws(tmp_path):
+    spread = pytest.importorskip("mpe2.simple_spread_v3")
+    game = runner.record_parallel(spread.parallel_env(max_cycles=5), tmp_path / "runs", name="spread")
+    other, drawn = spread.parallel_env(max_cycles=5, render_mode="rgb_array"), []
+    for env in (game, other):
+        env.reset(seed=0)
+    drawn.append(other.render())
+    while game.agents:
+        actions = dict.fromkeys(game.agents, 2)
+        game.step(actions)
+        other.step(actions)
+        drawn.append(other.render())
+    game.close()
+    result = film(game.run.recording, "--episode", 0, "-o", tmp_path / "film.webm")
+    assert result.exit_code == 0, result.output
+    frames = frames_of(tmp_path / "film.webm")
+    assert len(frames) == len(drawn)
+    for shown, expected in zip(frames, drawn, strict=True):
+        assert_shows(shown, np.asarray(expected))
+
+
+def test_infinite_rewards_and_odd_pictures_are_shown(tmp_path):
+    class Odd(Rooms):
+        def step(self, action):
+            observation, _, _, _, info = super().step(action)
+            return observation, [np.inf, -np.inf, np.nan][self._t - 1], False, self._t == 3, info
+
+        def render(self):
+            return np.full((900, 3, 3), 40 * self._t, np.uint8)
+
+    with runner.record(Odd(), tmp_path / "runs", frames_every=1) as rec:
+        list(play(rec, 3))
+    result = film(rec.run.recording, "--best", "-o", tmp_path / "film.mp4")
+    assert result.exit_code == 0, result.output
+    frames = frames_of(tmp_path / "film.mp4")
+    assert len(frames) == 4
+    assert frames.shape[2] == 160
+    played = CliRunner().invoke(cli, ["play", str(rec.run.recording), "--episode", "0"])
+    assert "reward inf, so far inf" in played.stdout
+
+
 def test_best_and_worst_are_chosen_by_return(pictured, tmp_path):
     run = pictured("taxi")
     with open_recording(run.recording) as recording:
@@ -220,6 +288,7 @@ REFUSED = {
     "both": (("--eval", "0:0", "--episode", 0), "--episode and --eval exclude each other"),
     "best of a grid": (("--best", "--grid", "2x2"), "--best and --grid exclude each other"),
     "a grid of nothing": (("--grid", "0x3"), "expected ROWSxCOLUMNS"),
+    "too many frames": (("--fps", 60), "expected at most 50 of a GIF"),
     "an unknown ending": (
         ("-o", "film.avi"),
         "found the ending '.avi', expected one of .mp4, .webm, .gif, .webp",
