@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
@@ -48,7 +49,7 @@ class Replay:
 
     Args:
         recording: of a loop.
-        trust: whether what the recording names may be imported, see `runner.replay.makers`.
+        trust: whether what the recording names may be imported, see `runner.replay.specifications`.
         tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
         report: called with the number of steps taken so far, after each block.
         render: whether the environments can draw.
@@ -84,9 +85,10 @@ class Replay:
         """Steps left out, as the state of the random generators at their beginning is not known."""
 
     def close(self) -> None:
-        """Close the environments."""
+        """Close the environments; what they raise then changes no result."""
         for stepper in self._steppers.values():
-            stepper.env.close()
+            with contextlib.suppress(Exception):
+                stepper.env.close()
 
     def all(self) -> Iterator[RedoneSteps]:
         """Yield all steps of both phases in the order of time, up to the first difference."""
@@ -158,30 +160,31 @@ class Replay:
         """
         key, maker = self._key(phase, environment), self._makers.get(phase)
         if key not in self._steppers:
-            stepper: Stepper
-            if environment == ALL and self.render:
-                raise CannotRedo(
-                    "The environments of this vector cannot be made one by one, to draw themselves."
-                )
-            if self._make is not None:
-                env = self._make()
-            else:
-                assert maker is not None  # or `why_not_redone` gave a reason
-                if environment == ALL:
-                    env = make_vector(maker, self._trust)
+            env = self._environment(phase, environment)
+            try:
+                if environment == ALL and maker is not None and maker.vector is not None:
+                    stepper: Stepper = VectorStepper(env, self._recording, maker.vector.autoreset)
+                elif maker is not None and maker.kind == "pettingzoo":
+                    stepper = GameStepper(env, self._recording)
                 else:
-                    env = make_environment(maker, self._trust, self.render)
-            if environment == ALL:
-                assert maker is not None
-                assert maker.vector is not None
-                stepper = VectorStepper(env, self._recording, maker.vector.autoreset)
-            elif maker is not None and maker.kind == "pettingzoo":
-                stepper = GameStepper(env, self._recording)
-            else:
-                stepper = EnvironmentStepper(env, self._recording)
+                    stepper = EnvironmentStepper(env, self._recording)
+                stepper.check_spaces()
+            except (CannotRedo, MemoryError):
+                raise
+            except Exception as error:  # foreign code raises anything
+                found = f"{type(error).__name__}: {error}"
+                raise CannotRedo(f"The environment cannot be used: {found}") from error
             self._steppers[key] = stepper
-            stepper.check_spaces()
         return self._steppers[key]
+
+    def _environment(self, phase: str, environment: int) -> Any:
+        if environment == ALL and self.render:
+            raise CannotRedo("The environments of this vector cannot be made one by one, to draw themselves.")
+        if self._make is not None:
+            return self._make()
+        if environment == ALL:
+            return make_vector(self._makers[phase], self._trust)
+        return make_environment(self._makers[phase], self._trust, self.render)
 
     # --- comparing ------------------------------------------------------------------------------------
 
