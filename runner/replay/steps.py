@@ -44,15 +44,26 @@ def transitions_of(recording: Recording, phase: str, episode: int) -> Iterator[A
     Raises:
         RecordingError: the recording has no such episode, or steps of it were lost.
     """
-    topic, numbers = recording.topic(f"/{phase}/step"), recording.episode_span(phase, episode)
-    if topic not in recording.dtypes:
-        yield from islice(recording.transitions(phase), numbers.start, numbers.stop)
+    if recording.topic(f"/{phase}/step") in recording.dtypes:
+        for block in episode_blocks(recording, phase, episode):
+            yield from block
         return
+    numbers = recording.episode_span(phase, episode)
+    yield from islice(recording.transitions(phase), numbers.start, numbers.stop)
+
+
+def episode_blocks(recording: Recording, phase: str, episode: int) -> Iterator[NDArray[np.void]]:
+    """Yield an episode's steps in blocks, where they have one size.
+
+    Raises:
+        RecordingError: the recording has no such episode, or steps of it were lost.
+    """
+    topic, numbers = recording.topic(f"/{phase}/step"), recording.episode_span(phase, episode)
     found = 0
     for block in recording.blocks(topic, numbers.start, numbers.stop):
         steps = block[(numbers.start - int(block["step"][0])) % numbers.step :: numbers.step]
         found += len(steps)
-        yield from steps
+        yield steps
     if found != len(numbers):
         raise RecordingError(
             f"{recording.path}: {len(numbers) - found:,} of the {len(numbers):,} steps of "

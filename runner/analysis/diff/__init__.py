@@ -15,6 +15,7 @@ from typing import Any, Final, TypedDict
 from runner.analysis.diff.causes import Cause, Row, find_cause, find_kind
 from runner.analysis.diff.divergence import (
     Divergence,
+    branch_divergence,
     evaluation_divergences,
     have_same_spaces,
     loop_divergence,
@@ -35,6 +36,7 @@ from runner.analysis.diff.settings import (
 from runner.analysis.diff.tables import Cell, TableDiff, table_diffs
 from runner.recording import schema
 from runner.recording.reader import Recording
+from runner.runs.branches import BranchOrigin, origin_in
 from runner.runs.run import Run
 
 __all__ = [
@@ -87,7 +89,7 @@ class RunDiff:
     divergence: Divergence | None = None
     """The first step of training that differs."""
     cause: Cause | None = None
-    """Why it differs; None for loops, whose learning is unknown."""
+    """Why it differs; None for loops, whose learning is unknown, but for a loop and a branch of it."""
     overlap: Overlap | None = None
     visits: VisitsDiff | None = None
     evaluation_divergence: Divergence | None = None
@@ -132,6 +134,15 @@ def diff(
     )
     if jobs:
         return _diff_jobs(difference, a, b, targets or {}, first)
+    for branch, parent, names in ((b, a, "B is a branch of A"), (a, b, "A is a branch of B")):
+        origin = origin_in(branch.config)
+        if (
+            origin is not None
+            and origin.run == parent.run_id
+            and have_same_spaces(a, b)
+            and a.kind != "variable"
+        ):
+            return _diff_branch(difference, a, b, Cause("branch", f"{names}, {origin}"), origin)
     return _diff_loops(difference, a, b)
 
 
@@ -159,6 +170,19 @@ def _diff_jobs(
         return difference
     tables = list(table_diffs(a, b, visits)) if _same_sizes(a, b) else []
     return replace(difference, tables=tables, metrics=metric_diffs(a, b, targets))
+
+
+def _diff_branch(
+    difference: RunDiff, a: Recording, b: Recording, cause: Cause, origin: BranchOrigin
+) -> RunDiff:
+    """Add to the difference of a loop and a branch of it where the branched episode diverges."""
+    note = f"{cause.text}: the branched episode is compared with the branch"
+    difference = replace(difference, notes=[note])
+    if (found := branch_divergence(a, b, origin)) is None:
+        return difference
+    if origin.phase == "train":
+        return replace(difference, divergence=found, cause=cause)
+    return replace(difference, evaluation_divergence=found, evaluation_cause=cause)
 
 
 def _diff_loops(difference: RunDiff, a: Recording, b: Recording) -> RunDiff:

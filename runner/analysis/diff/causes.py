@@ -44,7 +44,7 @@ class Cause:
     """Why two runs diverge at a step."""
 
     kind: str
-    """start, exploration, random_action, greedy_action, policy_action, transition, or end."""
+    """start, exploration, random_action, greedy_action, policy_action, transition, end, or branch."""
     text: str
     rows: list[Row] = field(default_factory=list)
     """The Q-values of each agent in the state in which the greedy actions differ."""

@@ -16,10 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.evaluations import evaluations_of
+from runner.analysis.step_reference import StepRef
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES
 from runner.recording.messages import decode
 from runner.recording.reader import Recording
+from runner.replay.steps import episode_blocks
+from runner.runs.branches import BranchOrigin
 
 Block = NDArray[np.void]
 
@@ -226,6 +229,25 @@ def loop_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None
     if fields is FIELDS:
         return found  # a step has the state before it
     return _reset_divergence(a, b, phase, math.inf if found is None else found.step) or found
+
+
+def branch_divergence(a: Recording, b: Recording, origin: BranchOrigin) -> Divergence | None:
+    """Return where a branched episode of a loop and its branch diverge; its place is that in the parent.
+
+    Args:
+        a: the parent or the branch, in the same spaces, whose steps have one size.
+        b: the other.
+        origin: of the branch.
+    """
+    blocks = [
+        episode_blocks(one, origin.phase, origin.episode if one.run_id == origin.run else 0) for one in (a, b)
+    ]
+    fields = tuple(name for name in (FIELDS if a.kind == "step" else _TRANSITION_FIELDS) if name != "episode")
+    found = _divergence(origin.phase, first_difference(blocks[0], blocks[1], fields), fields)
+    if found is None:
+        return None
+    at = StepRef.parse(origin.at)
+    return replace(found, episode=at.episode, after=at.after, a_step=None, b_step=None)
 
 
 def _reset_divergence(a: Recording, b: Recording, phase: str, last: float) -> Divergence | None:

@@ -64,7 +64,14 @@ def summary(difference: RunDiff) -> str:
     runs = (("A", difference.a), ("B", difference.b))
     unfinished = [name for name, run in runs if run["status"] != "finished"]
     sentences = [f"{' and '.join(unfinished)} did not finish." if unfinished else "The content differs."]
-    settings = [change for change in difference.config if change.path.split(".")[0] not in NOT_CONTENT]
+    cause = difference.cause or difference.evaluation_cause
+    is_branch = cause is not None and cause.kind == "branch"
+    settings = [
+        change
+        for change in difference.config
+        if change.path.split(".")[0] not in NOT_CONTENT
+        and not (is_branch and change.path.startswith("config.origin."))
+    ]
     if settings:
         values = [("not set" if c.a is None else c.a, "not set" if c.b is None else c.b) for c in settings]
         named = [f"{c.path} ({a} in A, {b} in B)" for c, (a, b) in zip(settings, values, strict=True)]
@@ -75,7 +82,9 @@ def summary(difference: RunDiff) -> str:
         other = "other " if difference.ignored else ""
         sentences.append(f"No {other}setting that determines the content differs.")
     divergence = difference.divergence
-    if divergence is not None and divergence.step:
+    if is_branch and cause is not None:
+        sentences.append(f"{cause.text}.")
+    elif divergence is not None and divergence.step:
         sentences.append(f"Training is the same for {divergence.step:,} steps.")
     elif divergence is not None:
         sentences.append("Training differs from the first step on.")

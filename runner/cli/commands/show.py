@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from runner.analysis.summary import RecordedExtras, RunDetails
     from runner.recording.reader import Recording
     from runner.recording.run_file import Summary
+    from runner.runs.branches import BranchOrigin
 
 MAX_CYCLES: Final = 8
 """Cycles of states shown, in which episodes reach the step limit."""
@@ -39,23 +41,25 @@ def show_command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     its exact measures, if the run takes them; under `train` one for each report of training; under `loop` the
     last results of a loop: its last evaluation, the means of its last 100 training episodes and the last
     values it logged; under `extras` the names of the values that it recorded with its steps; under
-    `checkpoints` what it kept of its agent.
+    `checkpoints` what it kept of its agent; under `branches` its branches, by run id.
 
     Examples:
       dualtaxi show @latest
       dualtaxi show k3v9m2xq --json
     """
     from runner.analysis.summary import describe_run
+    from runner.runs.branches import branches_of
 
     run = restored(find(run_name, recordings))
     details = describe_run(run, say)
+    branches = {} if run.stands_alone else branches_of(run.run_id, run.folder.parent, say)
     if as_json:
-        print_json(details.as_json())
+        print_json(details.as_json() | {"branches": {name: asdict(each) for name, each in branches.items()}})
     else:
-        draw(*_parts(details))
+        draw(*_parts(details, branches))
 
 
-def _parts(details: RunDetails) -> list[RenderableType]:
+def _parts(details: RunDetails, branches: Mapping[str, BranchOrigin]) -> list[RenderableType]:
     from runner.analysis.summary import random_policy_sentence
     from runner.cli.evaluations import evaluation_table
     from runner.recording.reader import open_recording
@@ -76,6 +80,8 @@ def _parts(details: RunDetails) -> list[RenderableType]:
         last = details.checkpoints[-1]
         kept = f"{len(details.checkpoints):,}, the last {last.reference}; `{command_for(run, 'checkpoints')}`"
         parts += [title("Checkpoints"), kept]
+    if branches:
+        parts += [title("Branches"), facts({name: str(each) for name, each in branches.items()})]
     if details.optimality:
         with open_recording(run.recording) as recording:
             measures = _optimality(recording, details.optimality[-1])
@@ -97,7 +103,9 @@ def _parts(details: RunDetails) -> list[RenderableType]:
 
 
 def _head(details: RunDetails) -> dict[str, str]:
-    run, summary = details.run, details.run.summary
+    from runner.runs.branches import origin_in
+
+    run, summary, origin = details.run, details.run.summary, origin_in(details.config)
     ago = age((datetime.now(UTC) - run.created).total_seconds())
     took = "" if summary.seconds is None else f", took {duration(summary.seconds)}"
     steps = ""
@@ -109,6 +117,7 @@ def _head(details: RunDetails) -> dict[str, str]:
         "status": f"{run.status}, begun {ago} ago{took}",
         "damage": run.problem,
         "error": summary.error or "",
+        "branch": "" if origin is None else f"of run {origin.run} {origin}",
         "steps": steps,
         "digest": summary.content_digest or f"{UNKNOWN} (written when a run ends properly)",
         "file": f"{run.recording}  {size(details.bytes)}" if details.bytes else "no recording",

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
 
 import gymnasium
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from gymnasium.vector import SyncVectorEnv
 from numpy.lib.recfunctions import repack_fields
 
 import runner
+from runner.analysis.diff import diff
+from runner.analysis.diff.sections import summary
+from runner.cli import cli
 from runner.errors import CannotRedo, ConfigError, RecordingError, RunnerError
 from runner.execution.verify import verify
 from runner.recording.reader import open_recording
@@ -129,6 +134,44 @@ def test_a_branch_says_where_it_comes_from_and_its_parent_lists_it(runs, tmp_pat
     assert rows(again.run, 0).tobytes() == rows(branch.run, 0).tobytes()
     assert list(branches_of(run.run_id, folder)) == [again.run.run_id, branch.run.run_id]
     assert branches_of(branch.run.run_id, folder) == {}
+
+
+def test_the_difference_of_parent_and_branch_is_the_branch(runs, tmp_path):
+    run = runs["FrozenLake-v1"]
+    t = middle_of(run, 1)
+    action = (int(rows(run, 1)["action"][t]) + 1) % 4
+    branch = runner.branch(run, at=f"1:{t}", action=action, recordings=tmp_path)
+    with open_recording(run.recording) as a, open_recording(branch.run.recording) as b:
+        for found, which in ((diff(a, b), "B is a branch of A"), (diff(b, a), "A is a branch of B")):
+            place = found.divergence.episode, found.divergence.t, found.divergence.field
+            assert place == (1, t, "action")
+            assert found.cause.kind == "branch"
+            assert found.cause.text == f"{which}, at 1:{t}, action {action}, then recorded"
+            lead = summary(found)
+            assert lead.startswith("The content differs. No setting that determines the content differs.")
+            assert found.cause.text in lead
+        same = runner.branch(run, at=f"1:{t}", recordings=tmp_path)
+        with open_recording(same.run.recording) as c:
+            assert diff(a, c).divergence is None
+
+
+def test_the_command_and_what_show_lists(runs, tmp_path):
+    run = recorded(tmp_path, make("CartPole-v1"), 40)
+
+    def command(*words):
+        done = CliRunner().invoke(cli, [*words, "--recordings", str(tmp_path)])
+        assert done.exit_code == 0, done.output
+        return done.stdout
+
+    printed = json.loads(command("branch", run.run_id, "--at", "0:3", "--action", "1", "--json"))
+    assert printed["origin"]["action"] == "1"
+    assert printed["parent"]["length"] == len(rows(run, 0))
+    text = command("branch", run.run_id, "--at", "0:3", "--action", "0", "--policy", "constant")
+    assert re.search(r"parent +\w+ .*terminated\nbranch +\w+ .*terminated", text)
+    assert f"dualtaxi diff {run.run_id}" in text
+    assert printed["run_id"] in json.loads(command("show", run.run_id, "--json"))["branches"]
+    assert "at 0:3, action 0, then constant" in command("show", run.run_id)
+    assert f"of run {run.run_id} at 0:3, action 1" in command("show", printed["run_id"])
 
 
 def test_a_dict_space_takes_json(tmp_path):
