@@ -41,7 +41,7 @@ class Results:
     """What an environment returned for some steps and resets, as it is recorded: arrays [rows], [resets]."""
 
     def __init__(self, rows: int, resets: int, dtypes: Dtypes, learners: int) -> None:
-        self.observations: NDArray[Any] = np.zeros(rows, dtypes.step)
+        self.observations: NDArray[Any] = np.empty(rows, dtypes.step)
         self.rewards: NDArray[np.float64] = np.zeros((rows, learners))
         self.terminated: NDArray[np.bool_] = np.zeros(rows, np.bool_)
         self.truncated: NDArray[np.bool_] = np.zeros(rows, np.bool_)
@@ -49,7 +49,7 @@ class Results:
         self.agents_terminated = np.zeros(masks, np.uint32)
         """Bit i: agent i of a game; empty for one agent."""
         self.agents_truncated = np.zeros(masks, np.uint32)
-        self.first_observations: NDArray[Any] = np.zeros(resets, dtypes.reset)
+        self.first_observations: NDArray[Any] = np.empty(resets, dtypes.reset)
         self.frames: list[Frame] = []
         self.first_frames: list[Frame] = []
         self.done = self.resets_done = 0
