@@ -344,6 +344,12 @@ def target_option(multiple: bool) -> Decorator:
 def selection_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that select the steps to export."""
     for option in (
+        trust_option,
+        click.option(
+            "--frames",
+            is_flag=True,
+            help="Draw pictures of a loop's selected episodes, by its environment, which is made again.",
+        ),
         all_option,
         click.option("--every", type=COUNT, metavar="N", help="Every Nth training episode."),
         click.option(

@@ -88,7 +88,7 @@ def _painted(painted: Painted, start: int) -> Iterator[bytes]:
     with closing(painted):
         for k, pixels in enumerate(painted):
             if k >= start:
-                yield _encoded(pixels)
+                yield encoded_picture(pixels)
 
 
 def _recorded(recording: Recording, phase: str, episode: int, start: int) -> Iterator[bytes]:
@@ -99,7 +99,7 @@ def _recorded(recording: Recording, phase: str, episode: int, start: int) -> Ite
         shown = frame
 
 
-def _encoded(pixels: NDArray[np.uint8]) -> bytes:
+def encoded_picture(pixels: NDArray[np.uint8]) -> bytes:
     """Return a picture, [height, width, 3], as a file."""
     image = require("PIL.Image", extra="plots", purpose="a picture").fromarray(pixels)
     buffer = io.BytesIO()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 from collections import deque
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from typing import Any, Final
 
@@ -89,24 +89,40 @@ def _like(pixels: Pixels, before: Pixels | None) -> Pixels:
 
 
 def paint_redrawn(recording: Recording, phase: str, episode: int, trust: bool = False) -> Painted:
-    """Draw each state by the environment, made again in a child process and compared with the recording.
+    """Draw each state by the environment; see `redrawn`."""
+    shown: Pixels | None = None
+    with closing(redrawn(recording, phase, [episode], trust)) as found:
+        for _, _, frame in found:
+            shown = _like(frame, shown)
+            yield shown
+
+
+def redrawn(
+    recording: Recording, phase: str, episodes: Sequence[int], trust: bool = False
+) -> Generator[tuple[int, int, Pixels], None, None]:
+    """Draw episodes by the environment, made again in a child process and compared with the recording.
+
+    Yields:
+        the number of an episode, how many of its steps were taken, and the picture after them.
 
     Raises:
         CannotRedo: the environment cannot be made again, or draws no pictures.
         EnvironmentDiffers: it differs from the recording, of which no picture comes after that step.
     """
-    blocks: Any = redo_in_child(recording.path, phase, [episode], render=True, trust=trust)
-    shown: Pixels | None = None
+    blocks: Any = redo_in_child(recording.path, phase, episodes, render=True, trust=trust)
+    waiting, episode, t = iter(episodes), episodes[0], 0
     with closing(blocks):
         for steps in blocks:
             differs = steps.difference
-            frames = [start.frame for start in steps.starts if start.frame is not None]
-            frames += steps.frames
+            first = [start.frame for start in steps.starts if start.frame is not None]
+            if first:
+                episode, t = next(waiting), 0
+            frames = [*first, *steps.frames]
             if differs is not None:  # the last of them is not a picture of what was recorded
                 frames = frames[:-1]
             for frame in frames:
-                shown = _like(frame, shown)
-                yield shown
+                yield episode, t, frame
+                t += 1
             if differs is not None and (differs.phase, differs.episode) != (phase, episode):
                 raise EnvironmentDiffers(f"The environment differs from the recording before, at {differs}.")
             if differs is not None:

@@ -114,12 +114,13 @@ def recorded_frames(
     """
     span, n = recording.episode_span(phase, episode), recording.environments
     first = max(0, start - frames_every(recording))
-    steps = transitions_of(recording, phase, episode)
-    times = [int(step["log_time"]) for step in islice(steps, max(0, first - 1), None)]
+    times = log_times_of(recording, phase, episode)
     # The frames of a vector come after the step of its last environment.
     later = (n - 1 - span.start % n) * schema.STEP_NANOSECONDS
     reset = reset_of(recording, phase, episode) if first == 0 else None
-    begin = times[0] - n * schema.STEP_NANOSECONDS if reset is None else int(reset["log_time"])
+    begin = (
+        times[max(0, first - 1)] - n * schema.STEP_NANOSECONDS if reset is None else int(reset["log_time"])
+    )
     topic = recording.topic(f"/{phase}/frame")
     frames = (
         (int(frame["log_time"]), frame_place(frame)[1], frame)
@@ -129,7 +130,7 @@ def recorded_frames(
     shown, following = None, next(frames, None)
     for t in range(first, len(span) + 1):
         # After the reset there may be several, of which the last one shows the state; after a step one.
-        time = times[t - max(1, first)] + later if t else times[0]
+        time = times[t - 1] + later if t else times[0]
         while following is not None and following[0] < time:
             shown, following = following[2], next(frames, None)
         if t and following is not None and following[0] == time and not following[1]:
@@ -138,6 +139,15 @@ def recorded_frames(
             raise RecordingError(f"{recording.path}: the first frame of {phase} episode {episode} is lost.")
         if t >= start:
             yield shown
+
+
+def log_times_of(recording: Recording, phase: str, episode: int) -> list[int]:
+    """Return the `log_time` of each step of an episode, in nanoseconds.
+
+    Raises:
+        RecordingError: the recording has no such episode, or steps of it were lost.
+    """
+    return [int(step["log_time"]) for step in transitions_of(recording, phase, episode)]
 
 
 def frames_every(recording: Recording) -> int:

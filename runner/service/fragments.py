@@ -30,7 +30,8 @@ from runner.export.reports.episode import trial
 from runner.export.reports.maps import maps_of, stages_of
 from runner.export.reports.playback import playback_of
 from runner.export.reports.rendering import Link, partials
-from runner.export.rerun.selection import Request, locate
+from runner.export.rerun.location import locate
+from runner.export.rerun.selection import Request
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.addresses import link

@@ -48,6 +48,8 @@ def rerun(
     evaluations: tuple[int, ...] | None,
     every: int | None,
     everything: bool,
+    frames: bool,
+    trust: bool,
     force: bool,
     recordings: Path | None,
     as_json: bool,
@@ -61,6 +63,7 @@ def rerun(
       dualtaxi export rerun @latest
       dualtaxi export rerun k3v9m2xq -o look.rrd --episodes 0:20,49980: --evaluations 49000
       dualtaxi export rerun k3v9m2xq --all --force
+      dualtaxi export rerun my-loop --episodes 0:5 --frames
     """
     from runner.recording.reader import open_recording
 
@@ -73,10 +76,10 @@ def rerun(
     run = find_recorded(run_name, recordings)
     path = output or EXPORTS / f"{run.file_stem}.rrd"
     require_new(path, force)
-    request = Request(episodes or (), evaluations or (), every or 0, everything)
-    with open_recording(run.recording) as recording, compilation_notice(), stage_line("exporting"):
+    request = Request(episodes or (), evaluations or (), every or 0, everything, frames=frames, trust=trust)
+    with open_recording(run.recording) as recording, compilation_notice(), stage_line("exporting") as stage:
         source = Source(recording, f"{run.title} ({run.run_id})")
-        (selection,) = export([source], request, path)
+        (selection,) = export([source], request, path, stage)
     print_selection(selection)
     took = duration(time.monotonic() - started)
     text = f"{path}  {size(path.stat().st_size)}, {selection.steps:,} steps, in {took}"

@@ -17,7 +17,7 @@ from runner.cli.runs import find_recorded
 
 if TYPE_CHECKING:
     from runner.analysis.step_reference import StepRef
-    from runner.export.rerun.selection import Location
+    from runner.export.rerun.location import Location
 
 
 @click.command("view", cls=Command)
@@ -68,6 +68,8 @@ def view_command(
     evaluations: tuple[int, ...] | None,
     every: int | None,
     everything: bool,
+    frames: bool,
+    trust: bool,
     recordings: Path | None,
 ) -> None:
     """Open RUN in the Rerun viewer at a step, or two runs side by side where they diverge.
@@ -80,6 +82,7 @@ def view_command(
       dualtaxi view @latest
       dualtaxi view @latest --at 2999:3
       dualtaxi view first second --web
+      dualtaxi view my-loop --frames
       dualtaxi view @latest --at eval:3000:0:4 --screenshot step.png
     """
     if len(run_names) > 2:
@@ -95,9 +98,12 @@ def view_command(
     runs = [find_recorded(name, recordings) for name in run_names]
     with stage_line("loading Rerun") as stage:
         from runner.export.rerun.cache import cached_export
-        from runner.export.rerun.selection import Request, locate, locate_divergence
+        from runner.export.rerun.location import locate, locate_divergence
+        from runner.export.rerun.selection import Request
 
-        request = Request(episodes or (), evaluations or (), every or 0, everything)
+        request = Request(
+            episodes or (), evaluations or (), every or 0, everything, frames=frames, trust=trust
+        )
 
         divergence = None
         if len(runs) == 2 and step is None:
@@ -112,7 +118,7 @@ def view_command(
             say(f"On the timeline that is step {first:,}{also}.")
         stage("exporting")
         with compilation_notice():
-            path, selections = cached_export(runs, location.request)
+            path, selections = cached_export(runs, location.request, stage)
     for selection in selections:
         print_selection(selection)
     _show(path, location, web, port, screenshot, picture_size)

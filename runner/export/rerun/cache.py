@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -19,10 +19,12 @@ MAX_CACHED: Final = 20
 """Exports in the cache; those that were not used for longest are removed."""
 
 
-def cached_export(runs: Sequence[Run], request: Request) -> tuple[Path, list[Selection]]:
+def cached_export(
+    runs: Sequence[Run], request: Request, stage: Callable[[str], None] = lambda _: None
+) -> tuple[Path, list[Selection]]:
     """Return the export of these runs in the user's cache, made now if missing, and the selection of each.
 
-    Rerun, which takes a second to load, is loaded only to make an export.
+    Rerun, which takes a second to load, is loaded only to make an export. `stage` is as for `export`.
 
     Raises:
         RecordingError: a recording cannot be read, or does not have what is requested.
@@ -42,7 +44,7 @@ def cached_export(runs: Sequence[Run], request: Request) -> tuple[Path, list[Sel
             cached = sorted(folder.glob("*.rrd"), key=lambda file: file.stat().st_mtime, reverse=True)
             for old in cached[MAX_CACHED - 1 :]:
                 old.unlink(missing_ok=True)
-        return path, export_runs(runs, recordings, request, path)
+        return path, export_runs(runs, recordings, request, path, stage)
 
 
 def _cache_key(runs: Sequence[Run], request: Request) -> str:

@@ -5,11 +5,9 @@ Entities of a vector environment are below `train/env_3`, those of a game's agen
 
 from __future__ import annotations
 
-import math
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import islice
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import rerun as rr
@@ -17,44 +15,25 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from runner.export.rerun.columns import MAX_ROWS, Batch, Sender, scalars
+from runner.export.rerun.frames import FrameSender
 from runner.export.rerun.labels import Labels
 from runner.export.rerun.layout import draw_scene, grid_bounds, whole_axis
+from runner.export.rerun.members import Member, entity_name, members_of, numbers_in
 from runner.export.rerun.metrics import line_colours, phase_colours, series_lines
 from runner.export.rerun.scene import scene_of
-from runner.export.rerun.selection import Selection, Span
+from runner.export.rerun.selection import MAX_MEMBERS, Selection, Span
 from runner.export.rerun.steps import StepWriter
-from runner.export.values import number_names
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.recording.spaces import leaves_of
 from runner.replay.steps import check_steps
 
-MAX_LINES: Final = 24
-"""Observations or actions of more numbers are not drawn as lines."""
 MAX_BARS: Final = 16
 """Extras of more numbers are drawn as bars."""
-MAX_MEMBERS: Final = 8
-"""Environments or agents that are shown in views; all are sent."""
 MAX_ARRAYS: Final = 2
 MAX_LOGGED: Final = 6
 """Views of logged arrays, and of logged scalars, in the blueprint; all are sent."""
 _BATCH_BYTES: Final = 64 << 20
-_FRAMES: Final = {"train": schema.TRAIN_FRAME, "eval": schema.EVAL_FRAME}
 _OVERVIEW: Final = "Overview"
-Part = tuple[tuple[str, ...], int, list[str]]
-"""The path of a field in the record of a step, what is added to its numbers, and their names."""
-
-
-class Member(NamedTuple):
-    """An environment of a vector, or an agent of a game."""
-
-    number: int
-    name: str = ""
-    """`env_3`, or the agent; empty if there is only one."""
-    column: int = 0
-    """Its column among the rewards."""
-    parts: Mapping[str, list[Part]] = {}
-    """`observation` and `action`, if they are drawn as lines."""
 
 
 class LoopExporter:
@@ -67,7 +46,7 @@ class LoopExporter:
         self._root = root
         self._scene = scene_of(recording.mdp) if recording.tabular else None
         self._is_game = len(recording.agents) > 1
-        self._members = _members(recording, self._scene is not None)
+        self._members = members_of(recording, self._scene is not None)
         self._plots: dict[str, dict[str, list[str]]] = {_OVERVIEW: {}}
         """The entities that views show as lines, by tab and title."""
         self._drawn: set[str] = set()
@@ -76,7 +55,8 @@ class LoopExporter:
         """Names of logged scalars; a dictionary keeps them in order."""
         self._bars: dict[str, str] = {}
         """Titles of extras that are drawn as bars, by entity."""
-        self._frames: list[str] = []
+        names = [""] if self._is_game else [member.name for member in self._members]
+        self._frames = FrameSender(stream, root, recording, names)
         self._arrays: dict[str, None] = {}
         self._has_log = False
         self._last = 0
@@ -91,10 +71,7 @@ class LoopExporter:
             bounds = grid_bounds(self._scene)
             grid = rrb.Spatial2DView(origin=f"{root}/", contents=contents, visual_bounds=bounds, name=title)
             left.append((grid, 4))
-        left += [
-            (rrb.Spatial2DView(origin=f"{root}/{phase}/frame", name=f"Frames ({phase})"), 3)
-            for phase in self._frames
-        ]
+        left += [(view, 3) for view in self._frames.views()]
         left += [
             (rrb.TensorView(origin=f"{root}/array/{name}", name=name), 2)
             for name in islice(self._arrays, MAX_ARRAYS)
@@ -116,14 +93,15 @@ class LoopExporter:
             return rrb.Vertical(right, name=title)
         shown, shares = zip(*left, strict=True)
         column = rrb.Vertical(*shown, row_shares=shares)
-        return rrb.Horizontal(column, right, column_shares=[2, 3], name=title)
+        share = 3 if len(self._members) > 1 else 2
+        return rrb.Horizontal(column, right, column_shares=[share, 3], name=title)
 
     def export(self) -> None:
         """Send everything that is selected."""
         recording = self._recording
         for phase in schema.PHASES:
             self._send_episodes(phase)
-            self._send_frames(phase)
+            self._frames.send_recorded(phase)
         self._send_logged()
         self._send_texts()
         self._send_arrays()
@@ -140,6 +118,19 @@ class LoopExporter:
             else:
                 self._send_steps(phase, spans[phase], labels)
 
+    def draw_frames(self, trust: bool, stage: Callable[[str], None]) -> None:
+        """Send pictures of the chosen episodes that the environment draws; report what is missing.
+
+        Args:
+            trust: whether what the recording names may be imported.
+            stage: called with the progress.
+        """
+        for phase, episodes in self._selection.drawn.items():
+            for note in self._frames.draw(phase, episodes, trust, stage):
+                self._selection.warnings.append(note)
+                self._has_log = True
+                self._log(self._last * schema.STEP_NANOSECONDS, "log", rr.TextLog(note, level="WARN"))
+
     def _send_episodes(self, phase: str) -> None:
         """Send returns and lengths: of a game one length, and the return of each agent."""
         for block in self._recording.blocks(schema.PHASES[phase][1]):
@@ -154,13 +145,6 @@ class LoopExporter:
                     one = member._replace(name="") if self._is_game else member
                     self._send_lines(phase, one, "length", times, length)
 
-    def _send_frames(self, phase: str) -> None:
-        for frame in self._recording.decoded(_FRAMES[phase]):
-            if phase not in self._frames:
-                self._frames.append(phase)
-            image = rr.EncodedImage(contents=frame["data"], media_type=f"image/{frame['format']}")
-            self._log(frame["log_time"], f"{phase}/frame", image)
-
     def _send_logged(self) -> None:
         """Send the logged scalars, a batch of each name at a time."""
         sender = self._sender("logged")
@@ -172,7 +156,7 @@ class LoopExporter:
             sender.send(name, self._times(times, episodes), columns)
 
         for scalar in self._recording.decoded(schema.SCALAR_TOPIC):
-            name = _entity(scalar["name"])
+            name = entity_name(scalar["name"])
             if name not in self._logged:
                 self._logged[name] = None
                 sender.send_static(name, series_lines([name]))
@@ -192,7 +176,7 @@ class LoopExporter:
     def _send_arrays(self) -> None:
         times = (time for time, _ in self._recording.messages(schema.ARRAY_TOPIC))
         for time, array in zip(times, self._recording.arrays(), strict=True):
-            name = _entity(array.name)
+            name = entity_name(array.name)
             self._arrays[name] = None
             self._log(time, f"array/{name}", rr.Tensor(np.atleast_1d(array.values)))
 
@@ -216,7 +200,7 @@ class LoopExporter:
                 times.append(rr.TimeColumn("t", sequence=own["t"].astype(np.int64)))
                 self._send_lines(phase, member, "reward", times, own["rewards"][:, [member.column]])
                 for quantity, parts in member.parts.items():
-                    numbers = [_numbers(own, path) + start for path, start, _ in parts]
+                    numbers = [numbers_in(own, path) + start for path, start, _ in parts]
                     names = [name for _, _, each in parts for name in each]
                     self._send_lines(phase, member, quantity, times, np.concatenate(numbers, axis=1), names)
                 values = {name: each[is_own] for name, each in extras.items()}
@@ -268,11 +252,11 @@ class LoopExporter:
             own = name
             if self._is_game:
                 agent, _, own = name.partition("/")
-                if _entity(agent) != member.name:
+                if entity_name(agent) != member.name:
                     continue
             given = ~np.ma.getmaskarray(values).reshape(len(values), -1)[:, 0]
             numbers = values.data.reshape(len(values), -1).astype(np.float64)
-            quantity = f"extra/{_entity(own)}"
+            quantity = f"extra/{entity_name(own)}"
             if numbers.shape[1] > MAX_BARS:
                 entity = _join(phase, member.name, quantity)
                 self._bars.setdefault(entity, _spaced(member.name, own))
@@ -358,52 +342,6 @@ class LoopExporter:
             rr.TimeColumn("step", sequence=steps),
             rr.TimeColumn("episode", sequence=episode.astype(np.int64)),
         ]
-
-
-def _members(recording: Recording, has_scene: bool) -> list[Member]:
-    """Return the environments of a vector, or the agents of a game, or the only environment."""
-    agents, n = recording.agents, recording.environments
-    if len(agents) > 1:
-        return [Member(i, _entity(agent), i, _parts(recording, agent)) for i, agent in enumerate(agents)]
-    parts = {} if has_scene else _parts(recording)
-    return [Member(i, f"env_{i}" if n > 1 else "", 0, parts) for i in range(n)]
-
-
-def _parts(recording: Recording, agent: str = "") -> dict[str, list[Part]]:
-    """Return the numbers of a step, of one agent or of all, that are drawn as lines."""
-    spaces = recording.spaces
-    if recording.kind == "step":
-        fields = {"observation": "state", "action": "action"}
-        starts = {part: spaces[part].get("start") for part in fields}
-        return {
-            part: [((field,), start if isinstance(start := starts[part], int) else 0, [field])]
-            for part, field in fields.items()
-        }
-    found: dict[str, list[Part]] = {}
-    for part, field in (("observation", "next_observation"), ("action", "action")):
-        leaves = [
-            leaf
-            for leaf in leaves_of(spaces[part], f"the {part} space")
-            if leaf.dtype is not None and (not agent or leaf.path[0] == agent)
-        ]
-        count = sum(math.prod(leaf.dtype.shape) for leaf in leaves if leaf.dtype is not None)
-        if recording.kind != "variable" and 0 < count <= MAX_LINES:
-            names = [number_names(leaf, part, skip=1 if agent else 0) for leaf in leaves]
-            found[part] = [((field, *leaf.path), 0, own) for leaf, own in zip(leaves, names, strict=True)]
-    return found
-
-
-def _numbers(steps: NDArray[np.void], path: tuple[str, ...]) -> NDArray[np.float64]:
-    """Return the numbers of a field, [n, numbers]."""
-    column: NDArray[Any] = steps
-    for name in path:
-        column = column[name]
-    return column.reshape(len(steps), -1).astype(np.float64)
-
-
-def _entity(name: str) -> str:
-    """Return a user's name as a part of an entity's path."""
-    return re.sub(r"[^\w.-]+", "_", name)[:80] or "_"
 
 
 def _join(*parts: str) -> str:

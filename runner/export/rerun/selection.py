@@ -1,28 +1,27 @@
-"""Which steps of a recording are exported, and where a step is on the viewer's timeline."""
+"""Which steps of a recording are exported."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.diff import can_compare_steps
-from runner.analysis.diff.divergence import evaluation_divergences, training_divergence
-from runner.analysis.diff.sections import where_in_words
-from runner.analysis.evaluations import Evaluation, evaluation_after, evaluations_of
-from runner.analysis.step_reference import StepRef
+from runner.analysis.evaluations import Evaluation, evaluation_after
 from runner.errors import RecordingError
 from runner.export.contents import require_steps, shortcomings, whole_ranges, why_no_steps
 from runner.recording import schema
-from runner.recording.reader import Recording, open_recording
-from runner.runs.run import Run
+from runner.recording.reader import Recording
 
 DEFAULT_EPISODES: Final = 20
 """Training episodes of the default selection."""
+FRAME_STEPS: Final = 2_000
+"""Steps at which the default choice of episodes that are drawn stops growing."""
+MAX_MEMBERS: Final = 8
+"""Environments of a vector that are shown in views, and drawn; the values of all are exported."""
 DEFAULT_STEPS: Final = 50_000
 """Steps at which the default selection stops growing, however long episodes are."""
 
@@ -41,6 +40,12 @@ class Request:
     """Whether all steps are exported."""
     with_default: bool = False
     """Whether the default selection is exported as well."""
+    frames: bool = False
+    """Whether the environment of a loop draws pictures of the selected episodes."""
+    trials: tuple[int, ...] = ()
+    """Evaluation episodes of a loop to draw as well, counted over the phase."""
+    trust: bool = False
+    """Whether what the recording names may be imported for that, see `runner.replay.makers`."""
 
     @property
     def is_default(self) -> bool:
@@ -84,6 +89,8 @@ class Selection:
 
     train: list[Span] = field(default_factory=list)
     evaluations: list[tuple[Evaluation, Span]] = field(default_factory=list)
+    drawn: dict[str, list[int]] = field(default_factory=dict)
+    """Episodes of a loop of which pictures are drawn, by phase."""
     exported: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -92,14 +99,6 @@ class Selection:
     def steps(self) -> int:
         """The number of selected steps."""
         return _count([*self.train, *(span for _, span in self.evaluations)])
-
-
-@dataclass(frozen=True)
-class Location:
-    """A point of the timeline, and a request that includes its episode."""
-
-    time: int
-    request: Request
 
 
 def select(recording: Recording, request: Request) -> Selection:
@@ -111,6 +110,8 @@ def select(recording: Recording, request: Request) -> Selection:
     selection = Selection(warnings=shortcomings(recording))
     if not recording.is_job:
         return _select_loop(recording, request, selection)
+    if request.frames:
+        selection.warnings.append("--frames draws loops only: the run was trained here.")
     if recording.mdp.scene is None or recording.mdp.scene_cells is None:
         selection.warnings.append("The environment has no scene: state and action are shown as series.")
     if not recording.has_steps:
@@ -121,7 +122,7 @@ def select(recording: Recording, request: Request) -> Selection:
         )
         return selection
     train, evals = episodes_of(recording, "train"), episodes_of(recording, "eval")
-    available = _evaluations_with_steps(recording, train, evals)
+    available = evaluations_with_steps(recording, train, evals)
     numbers = _training_episodes(recording, request, np.diff(train.first_step))
     selection.train = train.spans(numbers)
     where = str(recording.path)
@@ -141,84 +142,6 @@ def select(recording: Recording, request: Request) -> Selection:
     return selection
 
 
-def locate(run: Run, request: Request, step: StepRef | None) -> Location:
-    """Return where a step is on the timeline.
-
-    Args:
-        run: the run.
-        request: what is exported anyway.
-        step: the step; None for the first step of the last evaluation exported, or of the last training
-            episode if there is none.
-
-    Raises:
-        RecordingError: there is no such step, or none at all.
-    """
-    with open_recording(run.recording) as recording:
-        if step is None:
-            return Location(_default_time(recording, request), request)
-        require_steps(recording, "look at")
-        phase = "train" if step.after is None else "eval"
-        episodes, t = episodes_of(recording, phase), step.t
-        if step.after is None:
-            number, more = step.episode, Request(episodes=((step.episode, step.episode + 1),))
-            if recording.environments == 1 and number >= episodes.count:
-                raise RecordingError(
-                    f"{recording.path}: found no training episode {number}; there are {episodes.count:,}, "
-                    "from 0."
-                )
-        else:
-            evaluations = evaluations_of(recording)
-            if recording.is_job:
-                evaluations = _evaluations_with_steps(recording, episodes_of(recording, "train"), episodes)
-            where = str(recording.path)
-            number = evaluation_after(evaluations, step.after, where).trial(step.episode, where)
-            more = Request(
-                evaluations=(step.after,) if recording.is_job else ()
-            )  # a loop's are always exported
-        if recording.environments > 1:
-            steps = recording.episode_span(phase, number)
-        else:
-            steps = range(*episodes.first_step[number : number + 2].tolist())
-        if t >= len(steps):
-            raise RecordingError(
-                f"{recording.path}: found no t = {t} there; the episode has {len(steps)} steps, from 0."
-            )
-        time = _time(recording, phase, steps[t])
-    if request.everything:
-        return Location(time, request)
-    added = dataclasses.replace(
-        request,
-        episodes=request.episodes + more.episodes,
-        evaluations=request.evaluations + more.evaluations,
-        with_default=request.is_default,
-    )
-    return Location(time, added)
-
-
-def locate_divergence(runs: Sequence[Run]) -> tuple[StepRef | None, str]:
-    """Return the step at which two runs diverge, as `locate` takes it, and a sentence about it.
-
-    That is the first step of training that differs, or else the first evaluation's. None if they do not
-    diverge, or if they cannot be compared.
-    """
-    with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
-        if not (a.is_job and b.is_job):
-            return None, "`dualtaxi diff` shows where two loops diverge."
-        if not can_compare_steps(a, b):
-            return (
-                None,
-                "Where they diverge is unknown: states or actions differ, or steps were not recorded.",
-            )
-        divergence = training_divergence(a, b)
-        if divergence is None or None in (divergence.a_step, divergence.b_step):
-            suffix = ", as far as the shorter goes" if divergence is not None else ""
-            divergence = next(evaluation_divergences(a, b), None)
-            if divergence is None:
-                return None, f"They never diverge: every step is the same{suffix}."
-    step = StepRef(divergence.episode, divergence.t, divergence.after)
-    return step, f"They diverge {where_in_words(divergence)}."
-
-
 def episodes_of(recording: Recording, phase: str) -> Episodes:
     """Return the episodes of a phase that have steps."""
     steps, episodes = schema.PHASES[phase]
@@ -236,7 +159,7 @@ def episodes_of(recording: Recording, phase: str) -> Episodes:
     return Episodes(np.append(first, total) if total > first[-1] else first, len(first) - 1)
 
 
-def _evaluations_with_steps(recording: Recording, train: Episodes, evals: Episodes) -> list[Evaluation]:
+def evaluations_with_steps(recording: Recording, train: Episodes, evals: Episodes) -> list[Evaluation]:
     """Return the evaluations that have steps, including an incomplete one."""
     evaluations = []
     trials = int(recording.config["evaluation"]["trials"]) if evals.count else 1
@@ -267,11 +190,11 @@ def _training_episodes(
     return np.unique(np.concatenate(numbers))
 
 
-def _default_episodes(lengths: NDArray[np.int64]) -> NDArray[np.int64]:
+def _default_episodes(lengths: NDArray[np.int64], limit: int = DEFAULT_STEPS) -> NDArray[np.int64]:
     """Return episodes evenly spread from the first to the last, as many as the limits allow."""
     for count in range(min(DEFAULT_EPISODES, len(lengths)), 1, -1):
         numbers = np.unique(np.linspace(0, len(lengths) - 1, count).round().astype(np.int64))
-        if int(lengths[numbers].sum()) <= DEFAULT_STEPS:
+        if int(lengths[numbers].sum()) <= limit:
             return numbers
     return np.unique([0, len(lengths) - 1]).astype(np.int64)
 
@@ -347,6 +270,8 @@ def _select_loop(recording: Recording, request: Request, selection: Selection) -
     else:
         train = episodes_of(recording, "train")
         selection.train = train.spans(_training_episodes(recording, request, np.diff(train.first_step)))
+    if request.frames:
+        _select_drawn(recording, request, selection)
     first = 0 if request.everything else max(0, tested - DEFAULT_STEPS)
     if tested:
         selection.evaluations = [(Evaluation(0, 0, 0, 0), Span(first, tested, 0))]
@@ -361,6 +286,44 @@ def _select_loop(recording: Recording, request: Request, selection: Selection) -
     return selection
 
 
+def _select_drawn(recording: Recording, request: Request, selection: Selection) -> None:
+    """Choose the episodes that are drawn: those that were selected, by default a few of each environment."""
+    n, total = recording.environments, 0
+    for phase in schema.PHASES:
+        if not recording.count(schema.PHASES[phase][0]):
+            continue
+        ended = recording.episodes(phase)
+        lengths = (
+            ended["length"].astype(np.int64) if n > 1 else np.diff(episodes_of(recording, phase).first_step)
+        )
+        numbers = [np.empty(0, np.int64)]
+        if request.everything:
+            numbers.append(np.arange(len(lengths)))
+        elif phase == "train":
+            explicit = dataclasses.replace(request, with_default=False)
+            if not explicit.is_default:
+                numbers.append(_training_episodes(recording, explicit, lengths))
+        else:
+            numbers.append(np.array(request.trials, np.int64))
+        if request.is_default:
+            for environment in range(min(n, MAX_MEMBERS)):
+                own = (
+                    np.flatnonzero(ended["last_step"] % n == environment)
+                    if n > 1
+                    else np.arange(len(lengths))
+                )
+                if len(own):
+                    numbers.append(own[_default_episodes(lengths[own], FRAME_STEPS // min(n, MAX_MEMBERS))])
+        selection.drawn[phase] = np.unique(np.concatenate(numbers)).tolist()
+        total += len(lengths)
+    drawn = sum(map(len, selection.drawn.values()))
+    selection.exported.append(f"pictures of {drawn:,} of {total:,} episodes")
+    if drawn < total:
+        selection.left_out.append(
+            f"pictures of {total - drawn:,} episodes (--episodes START:STOP selects; --all: everything)"
+        )
+
+
 def _joined(episodes: Sequence[range]) -> list[Span]:
     """Return the steps of episodes of a vector, and of its other environments meanwhile, as few spans."""
     spans: list[Span] = []
@@ -372,21 +335,6 @@ def _joined(episodes: Sequence[range]) -> list[Span]:
         else:
             spans.append(Span(start, stop, 0))
     return spans
-
-
-def _default_time(recording: Recording, request: Request) -> int:
-    selection = select(recording, request)
-    spans = {"eval": [span for _, span in selection.evaluations], "train": selection.train}
-    for phase, of_phase in spans.items():
-        if of_phase and recording.kind != "variable":
-            return _time(recording, phase, of_phase[-1].start)
-    return 0
-
-
-def _time(recording: Recording, phase: str, step: int) -> int:
-    """Return the time of a step of a phase."""
-    record: Any = next(recording.blocks(schema.PHASES[phase][0], step, step + 1))[0]
-    return int(record["log_time"]) // schema.STEP_NANOSECONDS
 
 
 def _count(spans: Sequence[Span]) -> int:

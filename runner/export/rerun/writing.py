@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import itertools
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import rerun as rr
@@ -23,8 +23,16 @@ from runner.runs.run import Run
 from runner.util.files import storage_errors
 
 
-def export(sources: Sequence[Source], request: Request, path: Path) -> list[Selection]:
+def export(
+    sources: Sequence[Source], request: Request, path: Path, stage: Callable[[str], None] = lambda _: None
+) -> list[Selection]:
     """Write runs to an `.rrd` file; return the selection of each.
+
+    Args:
+        sources: the runs.
+        request: the steps to export.
+        path: the file.
+        stage: called with what is being done, where that takes long.
 
     Raises:
         RecordingError: a recording cannot be read, or does not have what is requested.
@@ -53,13 +61,19 @@ def export(sources: Sequence[Source], request: Request, path: Path) -> list[Sele
             ]
             for loop in loops:
                 loop.export()
+                if request.frames:
+                    loop.draw_frames(request.trust, stage)
             views = [loop.blueprint(source.title) for loop, source in zip(loops, sources, strict=True)]
             stream.send_blueprint(loop_blueprint(views))
     return selections
 
 
 def export_runs(
-    runs: Sequence[Run], recordings: Sequence[Recording], request: Request, path: Path
+    runs: Sequence[Run],
+    recordings: Sequence[Recording],
+    request: Request,
+    path: Path,
+    stage: Callable[[str], None] = lambda _: None,
 ) -> list[Selection]:
     """Write runs and their opened recordings as `export` does; several have different colours."""
     sources = [
@@ -72,7 +86,7 @@ def export_runs(
             dataclasses.replace(source, root=f"/{run.run_id}", tint=next(colours))
             for source, run in zip(sources, runs, strict=True)
         ]
-    return export(sources, request, path)
+    return export(sources, request, path, stage)
 
 
 @contextlib.contextmanager

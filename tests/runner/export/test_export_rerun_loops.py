@@ -11,8 +11,9 @@ from rerun.chunk import RrdReader
 import runner
 from runner.analysis.step_reference import StepRef
 from runner.errors import RecordingError
+from runner.export.rerun.location import locate
 from runner.export.rerun.runs import Source
-from runner.export.rerun.selection import Request, locate, select
+from runner.export.rerun.selection import Request, select
 from runner.export.rerun.writing import export
 from runner.recording import schema
 from runner.recording.reader import open_recording

@@ -25,7 +25,8 @@ from runner.export.rerun import live as live_view
 from runner.export.rerun import viewer, writing
 from runner.export.rerun.cache import cached_export
 from runner.export.rerun.live import LiveView
-from runner.export.rerun.selection import Request, locate
+from runner.export.rerun.location import locate
+from runner.export.rerun.selection import Request
 from runner.recording import schema
 from runner.recording.reader import open_recording
 

@@ -1,0 +1,108 @@
+"""Pictures of a loop in Rerun: frames that were recorded, and those that its environment draws afterwards."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from runner.errors import CannotRedo
+from runner.export.encoded import encoded_picture
+from runner.export.painting import EnvironmentDiffers, redrawn
+from runner.export.pictures import Source, source_of
+from runner.export.rerun.selection import MAX_MEMBERS
+from runner.recording.messages import frame_place
+from runner.recording.reader import Recording
+from runner.recording.schema import STEP_NANOSECONDS
+from runner.replay.steps import environment_of, frames_every, log_times_of
+
+
+class FrameSender:
+    """Sends pictures of the environments of a loop.
+
+    Args:
+        stream: where to.
+        root: the entity path of everything of the run.
+        recording: the loop.
+        names: of its environments, as parts of entities; empty for a single one.
+    """
+
+    def __init__(
+        self, stream: rr.RecordingStream, root: str, recording: Recording, names: Sequence[str]
+    ) -> None:
+        self._stream, self._root, self._recording, self._names = stream, root, recording, names
+        self._sent: dict[str, dict[int, int]] = {}
+        """The step of the last picture, by phase and environment."""
+
+    def send_recorded(self, phase: str) -> None:
+        """Send the frames that were recorded, each with the step of its own environment."""
+        n, is_each_step = len(self._names), frames_every(self._recording) == 1
+        for frame in self._recording.decoded(self._recording.topic(f"/{phase}/frame")):
+            environment, _ = frame_place(frame)
+            if environment < n:
+                step = max(0, frame["log_time"] // STEP_NANOSECONDS - (n - 1 - environment))
+                self._send(phase, environment, step, frame["data"], is_each_step)
+
+    def draw(
+        self, phase: str, episodes: Sequence[int], trust: bool, stage: Callable[[str], None]
+    ) -> Iterator[str]:
+        """Send the pictures of episodes that the environment draws, as far as it does what was recorded.
+
+        Args:
+            phase: `train` or `eval`.
+            episodes: their numbers, ascending.
+            trust: whether what the recording names may be imported.
+            stage: called with the progress.
+
+        Yields:
+            what is not shown, and why, as text.
+        """
+        recording = self._recording
+        sources = {number: source_of(recording, phase, trust, number) for number in episodes}
+        yield from sorted({f"No {phase} pictures: {reason}" for _, reason in sources.values() if reason})
+        chosen = [number for number, (source, _) in sources.items() if source is Source.REDRAWN]
+        if not chosen:
+            return
+        number, times, environment = chosen[0], [0], 0
+        try:
+            for number, t, pixels in redrawn(recording, phase, chosen, trust):
+                if t == 0:
+                    times = [time // STEP_NANOSECONDS for time in log_times_of(recording, phase, number)]
+                    environment = environment_of(recording, phase, number)
+                    stage(f"drawing {phase} episode {chosen.index(number) + 1:,} of {len(chosen):,}")
+                step = times[t - 1] if t else times[0] - 1
+                self._send(phase, environment, step, encoded_picture(pixels), True)
+                if t == len(times):  # nothing is shown until the next picture
+                    self._stream.set_time("step", sequence=step + len(self._names))
+                    self._stream.log(self._entity(phase, environment), rr.Clear(recursive=False))
+        except (CannotRedo, EnvironmentDiffers) as error:
+            yield f"No {phase} pictures from episode {number} on: {error}"
+
+    def _send(self, phase: str, environment: int, step: int, data: bytes, is_each_step: bool) -> None:
+        """Send a picture; where each step has one, that of a reset must not hide that of the last step."""
+        sent = self._sent.setdefault(phase, {})
+        if not is_each_step or sent.get(environment, -1) < step:
+            sent[environment] = step
+            kind = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
+            self._stream.set_time("step", sequence=step)
+            image = rr.EncodedImage(contents=data, media_type=kind)
+            self._stream.log(self._entity(phase, environment), image)
+
+    def views(self) -> list[rrb.Container]:
+        """Return the views of each phase that has pictures, those of several environments side by side."""
+        grids: list[rrb.Container] = []
+        for phase, sent in self._sent.items():
+            shown = sorted(sent)[:MAX_MEMBERS]
+            views = [
+                rrb.Spatial2DView(
+                    origin=self._entity(phase, environment), name=f"{phase} {self._names[environment]}"
+                )
+                for environment in shown
+            ]
+            grids.append(rrb.Grid(*views, grid_columns=math.ceil(math.sqrt(len(views)))))
+        return grids
+
+    def _entity(self, phase: str, environment: int) -> str:
+        return "/".join([self._root, phase, *filter(None, [self._names[environment]]), "frame"])

@@ -1,0 +1,121 @@
+"""Where a step is on the viewer's timeline, and the request that exports it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from runner.analysis.diff import can_compare_steps
+from runner.analysis.diff.divergence import evaluation_divergences, training_divergence
+from runner.analysis.diff.sections import where_in_words
+from runner.analysis.evaluations import evaluation_after, evaluations_of
+from runner.analysis.step_reference import StepRef
+from runner.errors import RecordingError
+from runner.export.contents import require_steps
+from runner.export.rerun.selection import Request, episodes_of, evaluations_with_steps, select
+from runner.recording import schema
+from runner.recording.reader import Recording, open_recording
+from runner.runs.run import Run
+
+
+@dataclass(frozen=True)
+class Location:
+    """A point of the timeline, and a request that includes its episode."""
+
+    time: int
+    request: Request
+
+
+def locate(run: Run, request: Request, step: StepRef | None) -> Location:
+    """Return where a step is on the timeline.
+
+    Args:
+        run: the run.
+        request: what is exported anyway.
+        step: the step; None for the first step of the last evaluation exported, or of the last training
+            episode if there is none.
+
+    Raises:
+        RecordingError: there is no such step, or none at all.
+    """
+    with open_recording(run.recording) as recording:
+        if step is None:
+            return Location(_default_time(recording, request), request)
+        require_steps(recording, "look at")
+        phase = "train" if step.after is None else "eval"
+        episodes, t = episodes_of(recording, phase), step.t
+        if step.after is None:
+            number, more = step.episode, Request(episodes=((step.episode, step.episode + 1),))
+            if recording.environments == 1 and number >= episodes.count:
+                raise RecordingError(
+                    f"{recording.path}: found no training episode {number}; there are {episodes.count:,}, "
+                    "from 0."
+                )
+        else:
+            evaluations = evaluations_of(recording)
+            if recording.is_job:
+                evaluations = evaluations_with_steps(recording, episodes_of(recording, "train"), episodes)
+            where = str(recording.path)
+            number = evaluation_after(evaluations, step.after, where).trial(step.episode, where)
+            # The steps of a loop's evaluations are always exported.
+            more = Request(evaluations=(step.after,)) if recording.is_job else Request(trials=(number,))
+        if recording.environments > 1:
+            steps = recording.episode_span(phase, number)
+        else:
+            steps = range(*episodes.first_step[number : number + 2].tolist())
+        if t >= len(steps):
+            raise RecordingError(
+                f"{recording.path}: found no t = {t} there; the episode has {len(steps)} steps, from 0."
+            )
+        time = _time(recording, phase, steps[t])
+    if request.everything:
+        return Location(time, request)
+    added = dataclasses.replace(
+        request,
+        episodes=request.episodes + more.episodes,
+        evaluations=request.evaluations + more.evaluations,
+        trials=more.trials,
+        with_default=request.is_default,
+    )
+    return Location(time, added)
+
+
+def locate_divergence(runs: Sequence[Run]) -> tuple[StepRef | None, str]:
+    """Return the step at which two runs diverge, as `locate` takes it, and a sentence about it.
+
+    That is the first step of training that differs, or else the first evaluation's. None if they do not
+    diverge, or if they cannot be compared.
+    """
+    with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
+        if not (a.is_job and b.is_job):
+            return None, "`dualtaxi diff` shows where two loops diverge."
+        if not can_compare_steps(a, b):
+            return (
+                None,
+                "Where they diverge is unknown: states or actions differ, or steps were not recorded.",
+            )
+        divergence = training_divergence(a, b)
+        if divergence is None or None in (divergence.a_step, divergence.b_step):
+            suffix = ", as far as the shorter goes" if divergence is not None else ""
+            divergence = next(evaluation_divergences(a, b), None)
+            if divergence is None:
+                return None, f"They never diverge: every step is the same{suffix}."
+    step = StepRef(divergence.episode, divergence.t, divergence.after)
+    return step, f"They diverge {where_in_words(divergence)}."
+
+
+def _default_time(recording: Recording, request: Request) -> int:
+    selection = select(recording, request)
+    spans = {"eval": [span for _, span in selection.evaluations], "train": selection.train}
+    for phase, of_phase in spans.items():
+        if of_phase and recording.kind != "variable":
+            return _time(recording, phase, of_phase[-1].start)
+    return 0
+
+
+def _time(recording: Recording, phase: str, step: int) -> int:
+    """Return the time of a step of a phase."""
+    record: Any = next(recording.blocks(schema.PHASES[phase][0], step, step + 1))[0]
+    return int(record["log_time"]) // schema.STEP_NANOSECONDS
