@@ -97,7 +97,8 @@ class FrameSender:
             shown = sorted(sent)[:MAX_MEMBERS]
             views = [
                 rrb.Spatial2DView(
-                    origin=self._entity(phase, environment), name=f"{phase} {self._names[environment]}"
+                    origin=self._entity(phase, environment),
+                    name=" ".join([*filter(None, [phase, self._names[environment]]), "frame"]),
                 )
                 for environment in shown
             ]

@@ -309,7 +309,10 @@ class LoopExporter:
                 shown = line_colours(min(len(self._members), MAX_MEMBERS))
                 colours = [shown[member.number % len(shown)]]
             lines = names if len(names) > 1 else [_spaced(phase, member.name)]
-            self._sender("").send_static(entity, series_lines(lines, colours))
+            style: Any = series_lines(lines, colours)
+            if names == ["action"]:  # of a Discrete space: lines between such numbers mean nothing
+                style = rr.SeriesPoints(names=lines, colors=colours, marker_sizes=[1.5])
+            self._sender("").send_static(entity, style)
             tab, title = _OVERVIEW, quantity.removeprefix("extra/")
             if member.name and len(names) > 1:
                 tab, title = title.capitalize(), _spaced(member.name, title)

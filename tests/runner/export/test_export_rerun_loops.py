@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from PIL import Image
 from rerun.chunk import RrdReader
 
 import runner
 from runner.analysis.step_reference import StepRef
 from runner.errors import RecordingError
+from runner.export.encoded import encoded_picture
+from runner.export.pictures import Source as PictureSource
+from runner.export.pictures import pictures
 from runner.export.rerun.location import locate
 from runner.export.rerun.runs import Source
 from runner.export.rerun.selection import Request, select
 from runner.export.rerun.writing import export
 from runner.recording import schema
 from runner.recording.reader import open_recording
-from tests.runner.loops.making import Leaving, parallel
+from tests.runner.export.making import made_otherwise
+from tests.runner.loops.making import Leaving, Rooms, parallel, play, record_counting
 
 N = 3
 
@@ -61,7 +69,9 @@ class Exported:
             if str(chunk.entity_path) == entity and not chunk.is_static
         ]
         columns = [
-            (batch.column("step").to_pylist(), batch.column(component).to_pylist()) for batch in batches
+            (batch.column("step").to_pylist(), batch.column(component).to_pylist())
+            for batch in batches
+            if component in batch.schema.names  # that which clears an entity is elsewhere
         ]
         return sorted(
             (row for steps, values in columns for row in zip(steps, values, strict=True)), key=lambda r: r[0]
@@ -145,3 +155,72 @@ def test_episodes_of_a_vector_are_selected_and_located(tmp_path):
         locate(run, Request(), StepRef(4, 9999, None))
     with pytest.raises(RecordingError, match="no training episode 999"):
         locate(run, Request(), StepRef(999, 0, None))
+
+
+def picture_rows(exported, entity):
+    """Return (step, bytes of the file) of each picture."""
+    return [(step, bytes(blob[0])) for step, blob in exported.rows(entity, "EncodedImage:blob") if blob]
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_recorded_frames_stand_at_the_steps_of_their_environment(tmp_path, mode):
+    with open_recording(record_counting(tmp_path, mode)) as recording:
+        exported, steps = Exported(recording, tmp_path / "run.rrd", everything=True), steps_of(recording)
+    for i in range(N):
+        own = steps[steps["step"] % N == i]
+        if mode == AutoresetMode.SAME_STEP:  # the environment was reset before it could be rendered
+            own = own[~own["terminated"]]
+        shown = dict(picture_rows(exported, f"/train/env_{i}/frame"))
+        for step in own:
+            pixels = np.asarray(Image.open(io.BytesIO(shown[step["log_time"] // schema.STEP_NANOSECONDS])))
+            assert pixels[0, 0].tolist() == [i, int(step["next_observation"][1]), int(step["t"]) + 1]
+
+
+def test_pictures_of_selected_episodes_of_a_vector_are_drawn(tmp_path):
+    run = record_poles(tmp_path)
+    with open_recording(run.recording) as recording:
+        exported = Exported(recording, tmp_path / "run.rrd", episodes=((2, 5),), frames=True)
+        assert exported.selection.drawn["train"] == [2, 3, 4]
+        assert any("pictures of 3 of" in text for text in exported.selection.exported)
+        steps = steps_of(recording)
+        for number in (2, 3, 4):
+            span = recording.episode_span("train", number)
+            own = steps[np.isin(steps["step"], list(span))]["log_time"] // schema.STEP_NANOSECONDS
+            shown = dict(picture_rows(exported, f"/train/env_{span.start % N}/frame"))
+            with contextlib.closing(pictures(recording, "train", number)) as expected:
+                assert expected.source is PictureSource.REDRAWN
+                first, *others = [encoded_picture(picture.pixels) for picture in expected]
+            assert shown[own[0] - 1] == first
+            assert [shown[time] for time in own] == others
+            cleared = exported.rows(f"/train/env_{span.start % N}/frame", "Clear:is_recursive")
+            assert own[-1] + N in [step for step, flag in cleared if flag]
+
+
+def test_each_environment_of_a_vector_has_pictures_by_default(tmp_path):
+    with open_recording(record_poles(tmp_path, steps=60).recording) as recording:
+        drawn = select(recording, Request(frames=True)).drawn["train"]
+        assert {recording.episode_span("train", number).start % N for number in drawn} == set(range(N))
+        assert not select(recording, Request()).drawn
+
+
+def test_pictures_end_where_the_environment_differs(tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path / "runs") as rec:
+        list(play(rec, 60))
+    other = made_otherwise(rec.run.recording, tmp_path / "other.mcap", max_episode_steps=5)
+    with open_recording(other) as recording:
+        exported = Exported(recording, tmp_path / "run.rrd", frames=True)
+    (warning,) = [text for text in exported.selection.warnings if "pictures" in text]
+    assert "from episode 0 on: At step 5 the environment differs" in warning
+    assert [step for step, _ in picture_rows(exported, "/train/frame")] == list(range(5))
+    ((_, [text]),) = exported.rows("/log", "TextLog:text")
+    assert text == warning
+
+
+def test_a_loop_whose_environment_cannot_be_made_again_is_exported_without_pictures(tmp_path):
+    with runner.record(Rooms(), tmp_path) as rec:
+        list(play(rec, 30))
+    with open_recording(rec.run.recording) as recording:
+        exported = Exported(recording, tmp_path / "run.rrd", frames=True)
+    assert any("No train pictures: " in text for text in exported.selection.warnings)
+    assert "/train/frame" not in exported.entities
+    assert "/train/reward" in exported.entities

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from click.testing import CliRunner
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
 from runner.cli import cli
@@ -158,3 +158,57 @@ def dualtaxi(folder: Path, *words: str) -> Any:
     done = CliRunner().invoke(cli, [*words, "--recordings", str(folder)])
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
     return done
+
+
+N_COUNTING = 3
+
+
+class Counting(gymnasium.Env[Any, Any]):
+    """Draws its own number, its episode and the steps of the episode, which has 4 to 8 of them."""
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - as Gymnasium has it
+    render_mode = "rgb_array"
+    observation_space = spaces.Box(0, 255, (3,), np.float32)
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, number: int) -> None:
+        self._state = [number, -1, 0]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        self._state[1:] = self._state[1] + 1, 0
+        return self._observation(), {}
+
+    def step(self, action: Any) -> Any:
+        self._state[2] += 1
+        number, episode, t = self._state
+        return self._observation(), 1.0, t == 4 + (number + episode) % 5, False, {}
+
+    def _observation(self) -> Any:
+        return np.array(self._state, np.float32)
+
+    def render(self) -> Any:
+        return np.tile(np.array(self._state, np.uint8), (2, 4, 1))
+
+
+def counting(number: int) -> Any:
+    return lambda: Counting(number)
+
+
+def record_counting(
+    folder: Path, mode: AutoresetMode, kind: Any = SyncVectorEnv, steps: int = 60, **options: Any
+) -> Path:
+    envs = kind([counting(i) for i in range(N_COUNTING)], autoreset_mode=mode)
+    options = {"frames_every": 1} | options
+    with runner.record_vector(envs, folder, name="counting", index="chunk", **options) as rec:
+        rec.reset(seed=0)
+        for k in range(steps):
+            over = np.logical_or(*rec.step(np.zeros(N_COUNTING, int))[2:4])
+            if mode == AutoresetMode.DISABLED and over.any():
+                rec.reset(options={"reset_mask": over})
+            if k == steps // 2:
+                with rec.phase("eval"):
+                    rec.reset(seed=1)
+                    rec.step(np.zeros(N_COUNTING, int))
+                rec.reset(seed=2)
+    return rec.run.recording

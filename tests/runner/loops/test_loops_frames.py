@@ -20,58 +20,8 @@ from runner.export.pictures import Source, pictures
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
 from tests.runner.archive.whole import archived, contents
-
-N = 3
-
-
-class Counting(gymnasium.Env):
-    """Draws its own number, its episode and the steps of the episode, which has 4 to 8 of them."""
-
-    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - as Gymnasium has it
-    render_mode = "rgb_array"
-    observation_space = gymnasium.spaces.Box(0, 255, (3,), np.float32)
-    action_space = gymnasium.spaces.Discrete(2)
-
-    def __init__(self, number):
-        self._state = [number, -1, 0]
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self._state[1:] = self._state[1] + 1, 0
-        return self._observation(), {}
-
-    def step(self, action):
-        self._state[2] += 1
-        number, episode, t = self._state
-        return self._observation(), 1.0, t == 4 + (number + episode) % 5, False, {}
-
-    def _observation(self):
-        return np.array(self._state, np.float32)
-
-    def render(self):
-        return np.tile(np.array(self._state, np.uint8), (2, 4, 1))
-
-
-def counting(number):
-    return lambda: Counting(number)
-
-
-def record_counting(folder, mode, kind=SyncVectorEnv, steps=60, **options):
-    envs = kind([counting(i) for i in range(N)], autoreset_mode=mode)
-    options = {"frames_every": 1} | options
-    with runner.record_vector(envs, folder, name="counting", index="chunk", **options) as rec:
-        rec.reset(seed=0)
-        for k in range(steps):
-            over = np.logical_or(*rec.step(np.zeros(N, int))[2:4])
-            if mode == AutoresetMode.DISABLED and over.any():
-                rec.reset(options={"reset_mask": over})
-            if k == steps // 2:
-                with rec.phase("eval"):
-                    rec.reset(seed=1)
-                    rec.step(np.zeros(N, int))
-                rec.reset(seed=2)
-    check_integrity(rec.run.recording)
-    return rec.run.recording
+from tests.runner.loops.making import N_COUNTING as N
+from tests.runner.loops.making import counting, record_counting
 
 
 def shown_states(recording, phase, episode):
@@ -94,6 +44,7 @@ def encoded_states(path, phase, episode, start=0):
 @pytest.mark.parametrize("mode", AutoresetMode)
 def test_each_picture_of_a_vector_shows_its_environment_at_its_step(tmp_path, mode, kind):
     path = record_counting(tmp_path, mode, kind)
+    check_integrity(path)
     with open_recording(path) as recording:
         episodes = recording.episodes("train")
         assert len(episodes) > 2 * N
