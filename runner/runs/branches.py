@@ -1,24 +1,17 @@
-"""The branches of runs: what each was branched from, and the branches that a run has."""
+"""What a run was branched from, as its configuration has it."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
-from peewee import fn
-
 from runner.recording.schema import PHASES
-from runner.runs.catalogue.filters import Filter, setting_path
-from runner.runs.catalogue.index import Index, look
-from runner.runs.catalogue.rows import Row
 from runner.util.values import is_whole
 
+ORIGIN: Final = "config.origin."
+"""What the paths of its fields in a configuration begin with."""
 _MAX_NUMBER: Final = 2**62
-_PATH: Final = "config.origin"
-"""The path of an origin in the configuration."""
 
 
 @dataclass(frozen=True)
@@ -51,30 +44,12 @@ def origin_in(config: Mapping[str, Any]) -> BranchOrigin | None:
     """Return what the run with this configuration was branched from; None if it is no branch."""
     settings = config.get("config")
     found = settings.get("origin") if isinstance(settings, Mapping) else None
-    return _origin(found) if isinstance(found, Mapping) else None
+    return parse_origin(found) if isinstance(found, Mapping) else None
 
 
-def _origin(found: Mapping[str, Any]) -> BranchOrigin | None:
+def parse_origin(found: Mapping[str, Any]) -> BranchOrigin | None:
+    """Return the origin with these fields, among others; None if one is missing or of another type."""
     values: dict[str, Any] = {name: found.get(name) for name in BranchOrigin.__dataclass_fields__}
     are_numbers = all(is_whole(values[name], 0, _MAX_NUMBER) for name in ("episode", "t", "seed"))
     are_texts = all(isinstance(values[name], str) for name in ("run", "at", "action", "policy"))
     return BranchOrigin(**values) if are_numbers and are_texts and values["phase"] in PHASES else None
-
-
-def branches_of(
-    run_id: str, recordings: Path, report: Callable[[str], None] = lambda _: None
-) -> dict[str, BranchOrigin]:
-    """Return the branches of a run in its folder by run id, the newest first."""
-    return look([recordings], lambda index: branches_in(index, run_id), report)
-
-
-def branches_in(index: Index, run_id: str) -> dict[str, BranchOrigin]:
-    """Return the branches of a run by run id, the newest first."""
-    parent = fn.json_extract(Row.settings, setting_path(f"{_PATH}.run"))
-    branches = {}
-    for row in index.rows(Filter(parent == run_id), columns=("id", "settings")):
-        settings = json.loads(row["settings"])
-        found = {name: settings.get(f"{_PATH}.{name}") for name in BranchOrigin.__dataclass_fields__}
-        if (origin := _origin(found)) is not None:
-            branches[row["id"]] = origin
-    return branches

@@ -9,6 +9,7 @@ from typing import Any, Final
 from runner.analysis.diff import NOT_CONTENT, Cause, Change, Divergence, RunDiff
 from runner.analysis.sections import Grid, Section
 from runner.environments.naming import spoken
+from runner.runs.branches import ORIGIN
 from runner.util.humanize import UNKNOWN
 
 _MAX_SETTINGS: Final = 4
@@ -69,8 +70,7 @@ def summary(difference: RunDiff) -> str:
     settings = [
         change
         for change in difference.config
-        if change.path.split(".")[0] not in NOT_CONTENT
-        and not (is_branch and change.path.startswith("config.origin."))
+        if change.path.split(".")[0] not in NOT_CONTENT and not (is_branch and change.path.startswith(ORIGIN))
     ]
     if settings:
         values = [("not set" if c.a is None else c.a, "not set" if c.b is None else c.b) for c in settings]

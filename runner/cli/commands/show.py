@@ -48,11 +48,12 @@ def show_command(run_name: str, recordings: Path | None, as_json: bool) -> None:
       dualtaxi show k3v9m2xq --json
     """
     from runner.analysis.summary import describe_run
-    from runner.runs.branches import branches_of
+    from runner.runs.catalogue.index import look
 
     run = restored(find(run_name, recordings))
     details = describe_run(run, say)
-    branches = {} if run.stands_alone else branches_of(run.run_id, run.folder.parent, say)
+    folders = [] if run.stands_alone else [run.folder.parent]
+    branches = look(folders, lambda index: index.branches(run.run_id), say)
     if as_json:
         print_json(details.as_json() | {"branches": {name: asdict(each) for name, each in branches.items()}})
     else:

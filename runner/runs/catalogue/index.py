@@ -16,6 +16,7 @@ from typing import Any, Final, TypeVar
 from peewee import DatabaseError, OperationalError, SqliteDatabase, Tuple, Value, chunked, fn
 
 from runner.errors import RunnerError, nearest
+from runner.runs.branches import ORIGIN, BranchOrigin, parse_origin
 from runner.runs.catalogue.columns import SETTING, Kind, field_of, with_same_as
 from runner.runs.catalogue.database import Report, create, index_path, open_index, renew, tuples_of, version
 from runner.runs.catalogue.filters import ANY_RUN, Filter, matches, setting_path
@@ -164,6 +165,16 @@ class Index:
     def with_same_as(self, rows: Rows) -> Rows:
         """Return rows with `same_as`: the id of another run that recorded the same content first, or None."""
         return list(with_same_as(rows, self.originals([row["digest"] for row in rows if row["digest"]])))
+
+    def branches(self, run_id: str) -> dict[str, BranchOrigin]:
+        """Return the branches of a run by run id, the newest first."""
+        branches = {}
+        for row in self.rows(Filter(Row.parent == run_id), columns=("id", "settings")):
+            settings = json.loads(row["settings"])
+            values = {key.removeprefix(ORIGIN): value for key, value in settings.items()}
+            if (origin := parse_origin(values)) is not None:
+                branches[row["id"]] = origin
+        return branches
 
     def named(self, name: str) -> list[tuple[Any, ...]]:
         """Return the runs of a name, or whose ids begin with it, the newest first.

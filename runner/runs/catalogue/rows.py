@@ -14,6 +14,7 @@ from peewee import BigIntegerField, BooleanField, CompositeKey, Field, FloatFiel
 from runner.errors import RecordingError
 from runner.recording.metrics import METRICS
 from runner.recording.run_file import EvaluationMetrics
+from runner.runs.branches import origin_in
 from runner.runs.catalogue.columns import COLUMNS, Kind
 from runner.runs.run import Run
 
@@ -71,6 +72,8 @@ class Row(Model):
     status: TextField
     created: BigIntegerField
     digest: TextField
+    parent = TextField(null=True)
+    """The id of the run that it is a branch of."""
     words: TextField
     settings: TextField
     used_recording = BigIntegerField(null=True)
@@ -88,6 +91,7 @@ class Row(Model):
         indexes = (
             (("root", "entry", "fingerprint", "mark", "stable", "status"), False),
             (("digest",), False),
+            (("parent",), False),
             (("root", "created", "id", "name", "seed"), False),
             (_SUMMED, False),
         )
@@ -114,7 +118,7 @@ def row_of(run: Run, size: int | None) -> dict[str, Any]:
     last, recent = summary.last_evaluation or EvaluationMetrics(), summary.recent_training
     done = summary if summary.episodes is not None else {**_recorded(run), **summary}
     episodes, train, evaluation = (done.get(key) for key in ("episodes", "train_steps", "eval_steps"))
-    config_name, environment = text(config.get("name")), config.get("env")
+    config_name, environment, origin = text(config.get("name")), config.get("env"), origin_in(config)
     return {
         "id": run.run_id,
         "name": text(run.name),
@@ -143,6 +147,7 @@ def row_of(run: Run, size: int | None) -> dict[str, Any]:
         "seconds": summary.seconds,
         "bytes": size,
         "digest": summary.content_digest,
+        "parent": None if origin is None else text(origin.run),
         "mode": _MODES.get(f"{config.get('tables')} {config.get('rewards')}"),
         "environment": text(environment.get("id") if isinstance(environment, Mapping) else None),
         "host": text(run.file.provenance.get("host") or run.file.owner.get("host")),

@@ -16,6 +16,7 @@ from runner.errors import RunnerError
 from runner.export.reports.rendering import View
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
+from runner.runs.branches import origin_in
 from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.addresses import link
@@ -173,17 +174,18 @@ async def replay(
     else:
         first = (await _difference(runs, cache, processes))["first_step"]
         step = StepRef.parse(first).outcome if first else StepRef(0)
-    names = [each.run_id for each in runs]
+    names, places = [each.run_id for each in runs], _places(runs, step)
 
     def neighbour(by: int) -> str:
         other = replace(step, episode=step.episode + by, t=0)
-        return link("/compare/replay", {"run": names, "at": str(other)}) if other.episode >= 0 else ""
+        has_one = other.episode >= 0 and places == [step, step]
+        return link("/compare/replay", {"run": names, "at": str(other)}) if has_one else ""
 
     def show() -> Response:
         head = _compared(runs, "/replay")
         view = _ReplaysView(
             head,
-            shown=[_panel(compared, step) for compared in head.runs],
+            shown=[_panel(compared, place) for compared, place in zip(head.runs, places, strict=True)],
             episode=step.episode_name,
             prefix=step.episode_text,
             t=step.t,
@@ -263,6 +265,16 @@ def _results(runs: list[Run]) -> Rows:
         ("Training episodes", [humanize.number(each.summary.episodes, 0) for each in runs]),
         ("Training steps", [humanize.number(each.summary.train_steps, 0) for each in runs]),
         ("Content digest", digests),
+    ]
+
+
+def _places(runs: list[Run], step: StepRef) -> list[StepRef]:
+    """Return the step in each of two runs: a branch has its parent's episode as its only one."""
+    alone = StepRef(0, step.t, None if step.after is None else 0)
+    origins = [origin_in(run.file.config) for run in runs]
+    return [
+        step if origin is None or origin.run != other.run_id else alone
+        for origin, other in zip(origins, reversed(runs), strict=True)
     ]
 
 

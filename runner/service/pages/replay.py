@@ -7,6 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from http import HTTPStatus
+from itertools import islice
 from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
@@ -19,17 +20,30 @@ from runner.analysis.step_reference import StepRef
 from runner.drawing import svg
 from runner.errors import RunnerError
 from runner.export.episodes import EpisodePlace, place_of
+from runner.export.reports.rendering import Link
 from runner.recording.reader import Recording, open_recording
+from runner.runs.branches import origin_in
 from runner.runs.run import Run
 from runner.service import fragments
+from runner.service.addresses import link
 from runner.service.api.replay import part_of, prepare_pictures
-from runner.service.dependencies import CacheOf, PicturesOf, ProcessesOf, RecordedRun, recording_state
+from runner.service.catalogue import Catalogue
+from runner.service.dependencies import (
+    CacheOf,
+    CatalogueOf,
+    PicturesOf,
+    ProcessesOf,
+    RecordedRun,
+    recording_state,
+)
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.panels import Panel, panel_of
 from runner.service.pages.rendering import message_of, page
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
 
+MAX_BRANCHES: Final = 20
+"""Branches of a run that a page lists, the newest."""
 MAX_PANELS: Final = 8
 """Environments of a vector that a page shows side by side."""
 BEFORE: Final = 250
@@ -89,6 +103,8 @@ class _ReplayView(RunView):
     """Path of the episode below the replays."""
     environments: int
     """How many environments take turns."""
+    branches: list[Link]
+    """This run next to its parent, and to its branches."""
 
 
 @dataclass(frozen=True)
@@ -134,11 +150,12 @@ async def training_replay(
     cache: CacheOf,
     processes: ProcessesOf,
     streams: PicturesOf,
+    catalogue: CatalogueOf,
     episode: Number,
     t: T = 0,
 ) -> Response:
     """Show a step of a training episode."""
-    return await _replay(request, run, cache, processes, streams, (episode,), t)
+    return await _replay(request, run, cache, processes, streams, catalogue, (episode,), t)
 
 
 @router.get("/eval/{after}/{trial}")
@@ -148,12 +165,13 @@ async def trial_replay(
     cache: CacheOf,
     processes: ProcessesOf,
     streams: PicturesOf,
+    catalogue: CatalogueOf,
     after: Number,
     trial: Number,
     t: T = 0,
 ) -> Response:
     """Show a step of a trial of an evaluation."""
-    return await _replay(request, run, cache, processes, streams, (after, trial), t)
+    return await _replay(request, run, cache, processes, streams, catalogue, (after, trial), t)
 
 
 @router.get("/train/{episode}/environments")
@@ -228,6 +246,7 @@ async def _replay(
     cache: CacheOf,
     processes: ProcessesOf,
     streams: PicturesOf,
+    catalogue: CatalogueOf,
     which: tuple[int, ...],
     t: int,
 ) -> Response:
@@ -240,15 +259,33 @@ async def _replay(
     await preparing
 
     def show() -> Response:  # in a thread, as it reads the recording
+        branches = _branches(run, catalogue)
         if isinstance(part, RunnerError):
-            view = _view(run, which, None, message_of(part, request))
+            view = _view(run, which, branches, None, message_of(part, request))
             return page(request, view, HTTPStatus.NOT_FOUND)
-        return page(request, _view(run, which, _step(json.loads(part), t)))
+        return page(request, _view(run, which, branches, _step(json.loads(part), t)))
 
     return await run_in_threadpool(show)
 
 
-def _view(run: Run, which: tuple[int, ...], step: ShownStep | None, problem: str = "") -> _ReplayView:
+def _branches(run: Run, catalogue: Catalogue) -> list[Link]:
+    """Return links to the comparisons of a run with its parent, if it is a branch, and with its branches."""
+
+    def beside(parent: str, branch: str, at: str) -> str:
+        return link("/compare/replay", {"run": [parent, branch], "at": at})
+
+    own = origin_in(run.file.config)
+    parent = [] if own is None else [Link(f"Branch of {own.run} {own}", beside(own.run, run.run_id, own.at))]
+    branches = catalogue.read(lambda index: index.branches(run.run_id))
+    return parent + [
+        Link(f"Branch {name} {origin}", beside(run.run_id, name, origin.at))
+        for name, origin in islice(branches.items(), MAX_BRANCHES)
+    ]
+
+
+def _view(
+    run: Run, which: tuple[int, ...], branches: list[Link], step: ShownStep | None, problem: str = ""
+) -> _ReplayView:
     with open_recording(run.recording) as recording:
         episodes = recording.count(recording.topic("/train/episode"))
         environments = recording.environments
@@ -278,6 +315,7 @@ def _view(run: Run, which: tuple[int, ...], step: ShownStep | None, problem: str
         reference=at.episode_text,
         episode_path=at.episode_path,
         environments=environments,
+        branches=branches,
     )
 
 

@@ -19,7 +19,8 @@ from runner.cli import cli
 from runner.errors import CannotRedo, ConfigError, RecordingError, RunnerError
 from runner.execution.verify import verify
 from runner.recording.reader import open_recording
-from runner.runs.branches import branches_of, origin_in
+from runner.runs.branches import origin_in
+from runner.runs.catalogue.index import look
 from tests.runner.loops.making import Rooms, make, play
 
 # Of Box2D's and PettingZoo's own makers.
@@ -55,6 +56,10 @@ def rows(run, episode, phase="train"):
     with open_recording(run.recording) as recording:
         kept = recording.episode_steps(phase, episode)
         return repack_fields(kept[[name for name in kept.dtype.names if name in VALUES]])
+
+
+def branches_of(run):
+    return look([run.folder.parent], lambda index: index.branches(run.run_id))
 
 
 def middle_of(run, episode):
@@ -129,11 +134,11 @@ def test_a_branch_says_where_it_comes_from_and_its_parent_lists_it(runs, tmp_pat
     assert branch.run.name == "tried"
     assert origin_in(branch.run.file.config) == branch.origin
     assert (branch.origin.run, branch.origin.at, branch.origin.action) == (run.run_id, "1:2", "1")
-    assert branches_of(run.run_id, folder) == {branch.run.run_id: branch.origin}
+    assert branches_of(run) == {branch.run.run_id: branch.origin}
     again = runner.branch(run, at="1:2", action="1", policy="random", recordings=folder)
     assert rows(again.run, 0).tobytes() == rows(branch.run, 0).tobytes()
-    assert list(branches_of(run.run_id, folder)) == [again.run.run_id, branch.run.run_id]
-    assert branches_of(branch.run.run_id, folder) == {}
+    assert list(branches_of(run)) == [again.run.run_id, branch.run.run_id]
+    assert branches_of(branch.run) == {}
 
 
 def test_the_difference_of_parent_and_branch_is_the_branch(runs, tmp_path):

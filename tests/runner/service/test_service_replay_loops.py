@@ -485,3 +485,29 @@ def test_nothing_sticks_out_of_a_narrow_page(opened, name):
         assert browser.execute_script("return document.documentElement.scrollWidth") <= 380
     finally:
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_a_branch_is_listed_by_its_parent_and_shown_next_to_it(tmp_path):
+    folder = tmp_path / "recordings"
+    play(gymnasium.make("CartPole-v1"), folder, "pole")
+    run = find_run("pole", folder)
+    trained = runner.branch(run, at="2:3", action=0, policy="constant", recordings=folder).run.run_id
+    tried = runner.branch(run, at="eval:4:1:2", action=1, policy="constant", recordings=folder).run.run_id
+    settings = Settings(recordings=(folder,), tokens=tmp_path / "tokens.json")
+    with TestClient(create_app(settings), base_url="http://localhost") as client:
+        page = client.get(f"/runs/{run.run_id}/replay/train/2").text
+        own = client.get(f"/runs/{trained}/replay/train/0").text
+        for branch, at, places in (
+            (trained, "2:3", ("train/2", "train/0")),
+            (tried, "eval:4:1:2", ("eval/4/1", "eval/0/0")),
+        ):
+            address = f"/compare/replay?run={run.run_id}&run={branch}&at={at.replace(':', '%3A')}"
+            assert address.replace("&", "&amp;") in page
+            compared = client.get(address)
+            assert compared.status_code == 200
+            for name, place in zip((run.run_id, branch), places, strict=True):
+                assert f"/api/v1/runs/{name}/replay/{place}" in compared.text
+        assert f"Branch of {run.run_id} at 2:3, action 0, then constant" in own
+        assert tried not in own
+        divergence = client.get(f"/compare/divergence?run={run.run_id}&run={trained}").text
+        assert "B is a branch of A, at 2:3, action 0, then constant" in divergence
