@@ -65,7 +65,7 @@ class _ShownPart:
         for name in self.path:
             values = [each[int(name) if isinstance(each, tuple) else name] for each in values]
         if self.is_text:
-            return [each if len(each) <= _MAX_LETTERS else f"{each[:_MAX_LETTERS]}…" for each in values]
+            return list(map(_short_text, values))
         return np.array(values).reshape(len(values), -1)[:, : len(self.names)]
 
 
@@ -189,10 +189,10 @@ class _Reader:
             start = self._recording.spaces["action"]["start"]
             return {"": [str(int(action) + start) for action in records["action"]]}
         if len(agents) == 1:
-            return {"": [value_in_words(record["action"]) for record in records]}
+            return {"": [_short_text(value_in_words(record["action"])) for record in records]}
         return {
             agent: [
-                value_in_words(record["action"][agent]) if int(record["acted"]) >> i & 1 else "–"
+                _short_text(value_in_words(record["action"][agent])) if int(record["acted"]) >> i & 1 else "–"
                 for record in records
             ]
             for i, agent in enumerate(agents)
@@ -227,10 +227,11 @@ def _joined(found: Sequence[_Steps]) -> _Steps:
 def _extras(recording: Recording, phase: str, part: range, notes: list[str]) -> list[Series]:
     """Return the values that the loop recorded with these steps, each at the frame before its step."""
     series = []
+    agents = recording.agents if len(recording.agents) > 1 else ()
     extras = recording.extras(phase)
     found = extras.at(np.arange(part.start, part.stop, part.step)) if extras else {}
     for name, values in found.items():
-        agent = next((one for one in recording.agents if name.startswith(f"{one}/")), "")
+        agent = next((one for one in agents if name.startswith(f"{one}/")), "")
         shape = values.shape[1:]
         columns = values.reshape(len(part), -1)
         if columns.shape[1] > MAX_SERIES:
@@ -271,6 +272,10 @@ def _shown_parts(recording: Recording, space: str, limit: int) -> tuple[list[_Sh
     if unseen:
         notes.append(f"{unseen:,} more numbers of each {space} are in the recording")
     return shown, notes
+
+
+def _short_text(text: str) -> str:
+    return text if len(text) <= _MAX_LETTERS else f"{text[:_MAX_LETTERS]}…"
 
 
 def _sizes(shape: tuple[int, ...]) -> str:

@@ -21,6 +21,8 @@ MAX_LOGGED: Final = 5000
 """Logged values near a part that a page shows."""
 _NEAR: Final = 1000
 """Steps of the run before and after a part in which logged values are near it."""
+_MAX_LETTERS: Final = 300
+"""Letters of a logged name or text."""
 Value = float | int | str | None
 """A number; NaN and infinities as text; None where it is unknown."""
 
@@ -139,6 +141,7 @@ def logged_near(recording: Recording, phase: str, time: Sequence[int]) -> list[L
     count = 0
 
     def add(name: str, log_time: int, value: Value) -> None:
+        name = name[:_MAX_LETTERS]
         one = found.setdefault(name, Logged(name, [], []))
         one.at.append(log_time // tick)
         one.values.append(value)
@@ -155,7 +158,7 @@ def logged_near(recording: Recording, phase: str, time: Sequence[int]) -> list[L
         if count == MAX_LOGGED:
             break
     for text in recording.decoded(schema.LOG_TOPIC, times=times):
-        add(text["name"], text["log_time"], text["message"][:300])
+        add(text["name"], text["log_time"], text["message"][:_MAX_LETTERS])
         count += 1
         if count >= MAX_LOGGED:
             break

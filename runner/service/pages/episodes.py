@@ -62,16 +62,17 @@ def episodes(
         )
         for i, path in enumerate(paths)
     ]
-    headings = ("episode" if phase == "train" else "trial", "end", *map(_heading, names))
+    headings = [_heading(name, len(recording.agents)) for name in names]
+    headings = ["episode" if phase == "train" else "trial", "end", *headings]
     links = [f"/runs/{run.run_id}/replay/{path}" for path in paths]
     paging = Paging(number, total, ROWS, link(f"/runs/{run.run_id}/episodes", {"phase": phase}))
-    view = _EpisodesView(head_of(run), "episodes", phase, total, paging, Grid(headings, rows), links)
+    view = _EpisodesView(head_of(run), "episodes", phase, total, paging, Grid(tuple(headings), rows), links)
     return page(request, view)
 
 
-def _heading(column: str) -> str:
+def _heading(column: str, agents: int) -> str:
     if column.startswith("return."):
-        return f"return {column.removeprefix('return.').replace('_', ' ')}"
+        return "return" if agents == 1 else f"return {column.removeprefix('return.').replace('_', ' ')}"
     return event_in_words(column)
 
 
