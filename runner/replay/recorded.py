@@ -6,7 +6,7 @@ import heapq
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, pairwise
+from itertools import groupby, pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -21,6 +21,10 @@ from runner.recording.schema import STEP_NANOSECONDS
 _ROWS: Final = 1024
 """Steps of varying size in a piece."""
 _FOREVER: Final = 2**63 - 1
+_Row = tuple[Any, ...]
+"""Number, environment, episode, step, time, seed, whether it has one, and observation of a reset."""
+_Extra = tuple[dict[str, Any] | None, int | None]
+"""Options and large seed of a call of `reset`."""
 
 
 class RecordedReset(NamedTuple):
@@ -84,7 +88,23 @@ def pieces(
         RecordingError: the recording is damaged.
     """
     streams = [_pieces_of(recording, phase, start_time, stop_time) for phase in phases]
-    yield from heapq.merge(*streams, key=lambda piece: (piece.time, len(piece.rows) > 0))
+    last_phase = ""
+    resets: list[Piece] = []
+    for piece in heapq.merge(*streams, key=lambda piece: (piece.time, len(piece.rows) > 0)):
+        if resets and (len(piece.rows) or piece.time != resets[0].time):
+            yield from _in_turn(resets, last_phase)
+            resets = []
+        if len(piece.rows):
+            last_phase = piece.phase
+            yield piece
+        else:
+            resets.append(piece)
+    yield from _in_turn(resets, last_phase)
+
+
+def _in_turn(resets: list[Piece], last_phase: str) -> list[Piece]:
+    """Return resets of one time in their order: those of the phase that took the last step came first."""
+    return sorted(resets, key=lambda piece: piece.phase != last_phase)
 
 
 def resets_of(
@@ -92,23 +112,21 @@ def resets_of(
 ) -> Iterator[RecordedReset]:
     """Yield the resets of a phase in order, from `start_time` up to and with `stop_time`."""
     topic = recording.topic(f"/{phase}/reset")
-    stop = _FOREVER if stop_time is None else stop_time + 1
-    extras = _Extras(recording, phase, range(start_time, stop))
-    states = recording.reset_states(phase, range(start_time, stop))
+    times = range(start_time, _FOREVER if stop_time is None else stop_time + 1)
+    states = recording.reset_states(phase, times)
     state = next(states, None)
-    for number, environment, episode, step, time, seed, seeded, observation in _reset_rows(
-        recording, topic, range(start_time, stop)
-    ):
+    rows = _reset_rows(recording, topic, times)
+    for row, options, large_seed in _with_extras(recording, phase, rows, times):
+        number, environment, episode, step, time, seed, seeded, observation = row
         own = None
         while state is not None and state.reset <= number:
             own, state = state if state.reset == number else None, next(states, None)
-        options, large_seed = extras.of(step, time)
         known_seed = seed if seeded else large_seed
         yield RecordedReset(number, environment, episode, step, time, observation, known_seed, options, own)
 
 
-def _reset_rows(recording: Recording, topic: schema.Topic, times: range) -> Iterator[tuple[Any, ...]]:
-    """Yield number, environment, episode, step, time, seed, whether it has one, and observation."""
+def _reset_rows(recording: Recording, topic: schema.Topic, times: range) -> Iterator[_Row]:
+    """Yield the resets of a phase."""
     names = ("reset", "environment", "episode", "step", "log_time", "seed", "seeded")
     if topic in recording.dtypes:
         for block in recording.blocks_between(topic, times.start, times.stop):
@@ -118,42 +136,64 @@ def _reset_rows(recording: Recording, topic: schema.Topic, times: range) -> Iter
             yield (*(message[name] for name in names), message["observation"])
 
 
-class _Extras:
-    """Options of resets, and seeds too large for the record of a reset, which stand among the infos."""
+def _with_extras(
+    recording: Recording, phase: str, rows: Iterator[_Row], times: range
+) -> Iterator[tuple[_Row, dict[str, Any] | None, int | None]]:
+    """Yield resets with their options, and with seeds too large for the record of a reset.
 
-    def __init__(self, recording: Recording, phase: str, times: range) -> None:
-        topic = recording.topic(f"/{phase}/info")
-        self._messages: Iterator[tuple[int, int, dict[str, Any]]] = iter(())
-        if recording.has_messages(topic.name):
-            self._messages = (
-                (info["step"], info["log_time"], _reset_part(info["json"]))
-                for info in recording.decoded(topic, times=times)
-                if info["reset"] and '"reset": {' in info["json"]
-            )
-        self._next = next(self._messages, None)
-        self._last: tuple[int, int, dict[str, Any]] | None = None
-
-    def of(self, step: int, time: int) -> tuple[dict[str, Any] | None, int | None]:
-        """Return options and seed of the reset at this place; those of one call hold for all its resets."""
-        if self._next is None and self._last is None:
-            return None, None
-        while self._next is not None and (self._next[1], self._next[0]) <= (time, step):
-            self._last, self._next = self._next, next(self._messages, None)
-        if self._last is None or self._last[:2] != (step, time):
-            return None, None
-        found = self._last[2]
-        options, seed = found.get("options"), found.get("seed")
-        large = str(seed.get("value")) if isinstance(seed, dict) else ""
-        is_number = large.isdecimal() and len(large) < 100
-        return options if isinstance(options, dict) else None, int(large) if is_number else None
+    Both stand among the infos, once for a call of `reset`. If several calls came without a step between them,
+    and fewer infos, these belong to the last calls.
+    """
+    extras = _extras(recording, phase, times)
+    extra = next(extras, None)
+    for (step, time), group in groupby(rows, key=lambda row: row[3:5]):
+        here: list[_Extra] = []
+        while extra is not None and extra[:2] <= (time, step):
+            if extra[:2] == (time, step):
+                here.append(extra[2:])
+            extra = next(extras, None)
+        if not here:
+            yield from ((row, None, None) for row in group)
+            continue
+        calls = list(_calls(group))
+        none: list[_Extra] = [(None, None)] * (len(calls) - len(here))
+        for call, (options, seed) in zip(calls, [*none, *here[-len(calls) :]], strict=True):
+            yield from ((row, options, seed) for row in call)
 
 
-def _reset_part(text: str) -> dict[str, Any]:
-    try:
-        part = json.loads(text).get("reset")
-    except (ValueError, RecursionError, AttributeError):
-        part = None
-    return part if isinstance(part, dict) else {}
+def _extras(
+    recording: Recording, phase: str, times: range
+) -> Iterator[tuple[int, int, dict[str, Any] | None, int | None]]:
+    """Yield time, step, options and large seed of calls of `reset` that had one of both."""
+    if not recording.has_messages(f"/{phase}/info"):
+        return
+    for info in recording.decoded(recording.topic(f"/{phase}/info"), times=times):
+        if not info["reset"] or '"reset": {' not in info["json"]:
+            continue
+        try:
+            found = json.loads(info["json"])["reset"]
+            options, seed = found.get("options"), found.get("seed", {}).get("value", "")
+        except (ValueError, RecursionError, LookupError, TypeError, AttributeError):
+            continue  # not of a recorder
+        is_number = isinstance(seed, str) and seed.isdecimal() and len(seed) < 100
+        yield (
+            info["log_time"],
+            info["step"],
+            options if isinstance(options, dict) else None,
+            int(seed) if is_number else None,
+        )
+
+
+def _calls(rows: Iterable[_Row]) -> Iterator[list[_Row]]:
+    """Yield the resets of each call; within a call, the environments are in order."""
+    call: list[_Row] = []
+    for row in rows:
+        if call and row[1] <= call[-1][1]:
+            yield call
+            call = []
+        call.append(row)
+    if call:
+        yield call
 
 
 # --- pieces -------------------------------------------------------------------------------------------
@@ -168,9 +208,11 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
     nothing = np.empty(0, _row_dtype(recording, recording.topic(f"/{phase}/step")))
     for block in rows:
         first, time = int(block["step"][0]), int(block["log_time"][0]) - STEP_NANOSECONDS
+        early = []
         while waiting is not None and waiting.time < time and waiting.step <= first:
-            yield Piece(phase, waiting.step, nothing, [waiting], waiting.time)
+            early.append(waiting)
             waiting = next(resets, None)
+        yield from _without_steps(phase, early, nothing)
         here = []
         while waiting is not None and waiting.step < first + len(block):
             if waiting.step < first or (waiting.step - first) % n or waiting.environment >= n:
@@ -180,8 +222,14 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
             here.append(waiting)
             waiting = next(resets, None)
         yield Piece(phase, first, block, here, time)
-    for reset in chain([] if waiting is None else [waiting], resets):
-        yield Piece(phase, reset.step, nothing, [reset], reset.time)
+    yield from _without_steps(phase, resets if waiting is None else [waiting, *resets], nothing)
+
+
+def _without_steps(phase: str, resets: Iterable[RecordedReset], nothing: NDArray[np.void]) -> Iterator[Piece]:
+    """Yield resets that no step of their phase follows at once, those of one time together."""
+    for time, group in groupby(resets, key=lambda reset: reset.time):
+        here = list(group)
+        yield Piece(phase, here[0].step, nothing, here, time)
 
 
 def _blocks(
