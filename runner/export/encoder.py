@@ -42,8 +42,13 @@ FORMATS: Final = {
         "webm", "libvpx-vp9", "yuv420p", {"crf": "28", "b": "0", "deadline": "realtime", "cpu-used": "6"}
     ),
     ".gif": Format("gif", "gif", "pal8", {}, {"final_delay": str(round(100 * LAST_SECONDS))}),
+    # What hardly changes is transparent. FFmpeg's other encoder, libwebp_anim, keeps every frame in memory.
     ".webp": Format(
-        "webp", "libwebp_anim", "yuv420p", {"quality": "90", "compression_level": "2"}, {"loop": "0"}
+        "webp",
+        "libwebp",
+        "yuva420p",
+        {"quality": "90", "compression_level": "2", "cr_threshold": "100", "cr_size": "16"},
+        {"loop": "0"},
     ),
 }
 """By the ending of the file."""

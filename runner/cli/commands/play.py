@@ -186,7 +186,9 @@ class _Screen:
         lines = len(frame.above.plain.splitlines()) + len(below.plain.splitlines()) + 2
         height = max(self._live.console.height - lines, 4)
         picture = _Bounded(self._shown, _MAX_COLUMNS, height)
-        self._live.update(Group(frame.above, picture, below), refresh=True)
+        above = frame.above.copy()
+        above.rstrip()
+        self._live.update(Group(above, picture, below), refresh=True)
         if before is not None:
             before.cleanup()  # a terminal with graphics keeps every picture until it is removed
 
