@@ -49,7 +49,7 @@ def picture_note(recording: Recording, phase: str) -> tuple[bool, str]:
 def encoded_pictures(
     path: Path, phase: str, episode: int, start: int = 0
 ) -> Generator[bytes | str, None, None]:
-    """Yield the pictures of an episode from the frame after `start` steps on; none of a scene, or of values.
+    """Yield the pictures of an episode from the frame after `start` steps on; none of a scene.
 
     Before the first one there may be a note, a text: why they are not drawn by the environment, although it
     could be made again.
@@ -62,10 +62,13 @@ def encoded_pictures(
 
     Raises:
         RecordingError: there is no such episode, or the recording is damaged.
-        CannotRedo: the environment cannot be made again, or is another one than was recorded.
+        CannotRedo: the environment cannot be made again, or is another one than was recorded, and the
+            recording has no pictures of its own.
     """
     with open_recording(path) as recording:
-        source, _ = source_of(recording, phase, episode=episode)
+        source, reason = source_of(recording, phase, episode=episode)
+        if source is Source.VALUES:
+            raise CannotRedo(f"There is no picture. {reason}")
         if source is Source.REDRAWN:
             has_begun = False
             try:

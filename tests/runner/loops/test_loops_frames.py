@@ -16,7 +16,7 @@ from PIL import Image
 import runner
 from runner.archive import layout
 from runner.archive.restoring import restore
-from runner.errors import ConfigError
+from runner.errors import CannotRedo, ConfigError
 from runner.export.encoded import encoded_pictures
 from runner.export.pictures import Source, pictures
 from runner.recording.integrity import check_integrity
@@ -87,6 +87,11 @@ def test_frames_of_chosen_environments(tmp_path):
             with contextlib.closing(pictures(recording, "train", number)) as shown:
                 is_chosen = int(episode["last_step"]) % N == 2
                 assert shown.source is (Source.RECORDED if is_chosen else Source.VALUES)
+            if is_chosen:
+                assert len(encoded_states(path, "train", number)) == episode["length"] + 1
+            else:
+                with pytest.raises(CannotRedo, match="There is no picture"):
+                    next(encoded_pictures(path, "train", number))
 
 
 def test_a_game_has_a_frame_each_step(tmp_path):
