@@ -18,6 +18,8 @@ from runner.util.extras import require
 
 LAST_SECONDS: Final = 2.5
 """Duration of the last frame of a GIF, which starts again by itself."""
+_MAX_SIDE: Final = 16_000
+"""The most pixels on a side that all formats allow."""
 _COLOURS: Final = 256
 _FAR: Final = 24
 """A colour is far from another if they are this far apart, of 255."""
@@ -118,7 +120,11 @@ class Encoder:
             self._container.close()
 
     def add(self, pixels: Pixels) -> None:
-        """Add a frame, uint8 [height, width, 3]; sides of odd length get a white line more."""
+        """Add a frame, uint8 [height, width, 3]; sides of odd length get a white line more.
+
+        Raises:
+            RunnerError: it is too large.
+        """
         import av
 
         height, width, _ = pixels.shape
@@ -133,6 +139,11 @@ class Encoder:
         self._container.mux(self._stream.encode(frame))
 
     def _open(self, width: int, height: int) -> None:
+        if max(width, height) > _MAX_SIDE:
+            raise RunnerError(
+                f"the film: found frames of {width}x{height} pixels, expected at most {_MAX_SIDE:,} on a "
+                "side; choose a smaller width, or fewer episodes."
+            )
         self.size = width, height
         self._stream = self._container.add_stream(self._form.codec, rate=self._rate)
         self._stream.width, self._stream.height = width, height

@@ -15,6 +15,7 @@ from PIL import Image
 
 import runner
 from runner.cli import cli
+from runner.errors import RunnerError
 from runner.export.encoder import FORMATS, Encoder
 from runner.export.episodes import ranked_episodes, typical_trial
 from runner.export.pictures import pictures
@@ -197,6 +198,13 @@ def test_infinite_rewards_and_odd_pictures_are_shown(tmp_path):
     assert frames.shape[2] == 160
     played = CliRunner().invoke(cli, ["play", str(rec.run.recording), "--episode", "0"])
     assert "reward inf, so far inf" in played.stdout
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_frames_that_are_too_large_are_refused(tmp_path, ending):
+    encoder = Encoder(tmp_path / f"film{ending}", FORMATS[ending], 30)
+    with pytest.raises(RunnerError, match="20x20000 pixels, expected at most 16,000"), encoder:
+        encoder.add(np.zeros((20_000, 20, 3), np.uint8))
 
 
 def test_best_and_worst_are_chosen_by_return(pictured, tmp_path):
