@@ -88,11 +88,13 @@ def _pull_contents(client: Connection, run: Run, report: Report) -> None:
     there = {each["digest"] for each in listed["checkpoints"] if each["here"]}
     for digest, checkpoint in wanted.items():
         if digest in there:
-            part = run.folder.parent / FOLDER / f"{digest}.part"
+            part = run.folder.parent / FOLDER / f"{run.folder.name}-{digest}.part"
             path = f"/runs/{quote(run.run_id, safe='')}/checkpoints/{digest}"
             _download(client, path, f'"{digest}"', checkpoint.size, part, report)
-            store.put(run.folder.name, part, expected=digest)
-            part.unlink()
+            try:
+                store.put(run.folder.name, part, expected=digest)
+            finally:
+                part.unlink()
 
 
 def _download(client: Connection, path: str, tag: str, size: int, part: Path, report: Report) -> None:

@@ -54,10 +54,12 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
         """Take a step in every environment, and record it, with arrays [N, ...] of your own by name."""
         watch, frames_every = self._watch, self._options.frames_every
         watch.steps += 1
-        over = self._rows.over if frames_every else None
-        states = None
-        if watch.steps > watch.due and self._rows.is_any_over:
-            states = watch.before_step(self._rows.over)
+        over = states = None
+        if frames_every or (watch.steps > watch.due and self._rows.is_any_over):
+            with self._loop.lock:  # the rows are committed by another thread
+                over = self._rows.over
+            if watch.steps > watch.due:
+                states = watch.before_step(over)
         result = self.env.step(actions)
         observations, rewards, terminated, truncated, infos = result
         final = _final_observations(infos) if self._mode == AutoresetMode.SAME_STEP else None
@@ -69,7 +71,7 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
                 self._take_extras(extras)
         if self._options.info:
             self._messages.info(self._phase, _by_environment(infos))
-        if over is not None:
+        if frames_every:
             ended = np.logical_or(terminated, truncated)
             self._until_frame -= 1
             if self._mode == AutoresetMode.SAME_STEP:

@@ -104,10 +104,8 @@ def check_extras(recording: Recording, phase: str, complete: bool, on_block: OnB
             if (given.view(np.uint8) > 1).any() or values[~given].any():
                 raise Inconsistent(f"{where}: {name}: found values where none were given")
         if steps in recording.dtypes:
-            rows = np.concatenate(
-                [part[["step", "log_time"]] for part in recording.blocks(steps, int(numbers[0]), last + 1)]
-            )
-            found = rows["log_time"][np.isin(rows["step"], numbers)]
+            parts = recording.blocks(steps, int(numbers[0]), last + 1)
+            found = np.concatenate([part["log_time"][np.isin(part["step"], numbers)] for part in parts])
             if len(found) != len(block) or (found != block["log_time"]).any():
                 raise Inconsistent(f"{where}: found other times than those of the steps")
 

@@ -12,9 +12,11 @@ import contextlib
 import os
 import re
 import secrets
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Final
 
 from blake3 import blake3
 from filelock import FileLock
@@ -25,6 +27,8 @@ from runner.util.files import open_regular, storage_errors
 FOLDER: Final = ".store"
 DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 _PIECE: Final = 1 << 20
+_LEFT_OVER_SECONDS: Final = 3600
+"""What changed later may belong to an import, or to a process that is storing a content."""
 _ADVICE: Final = "free some disk"
 
 
@@ -72,29 +76,15 @@ class Store:
             StorageError: the file cannot be read, or the store cannot be written.
         """
         if not isinstance(content, Path):
-            return self._put(run, iter([content]), expected)
+            return self._put(run, [content], expected)
         try:
             stream = open_regular(content)
         except OSError as error:
             raise StorageError(f"{content}: cannot be read ({error.strerror}).") from error
         with stream:
-            return self._put(run, pieces_of(stream), expected)
-
-    def put_pieces(self, run: str, pieces: Iterable[bytes], expected: str, size: int) -> None:
-        """Store a content of `size` bytes that arrives in pieces; errors as for `put`."""
-
-        def bounded() -> Iterator[bytes]:
-            left = size
-            for piece in pieces:
-                left -= len(piece)
-                if left < 0:
-                    raise RecordingError(f"checkpoint {expected[:16]}…: found more than {size:,} bytes.")
-                yield piece
-
-        self._put(run, bounded(), expected)
+            return self._put(run, iter(partial(stream.read, _PIECE), b""), expected)
 
     def _put(self, run: str, pieces: Iterable[bytes | memoryview], expected: str) -> tuple[str, int]:
-        self.path(expected or "0" * 64)
         with storage_errors(self._folder, _ADVICE):
             (self._folder / "objects").mkdir(parents=True, exist_ok=True)
             fresh = self._folder / "objects" / f".{secrets.token_hex(8)}"
@@ -102,15 +92,13 @@ class Store:
                 digest, size = _write(fresh, pieces)
                 if expected and digest != expected:
                     raise RecordingError(
-                        f"checkpoint {expected[:16]}…: found content of digest {digest[:16]}…: it was "
-                        "changed."
+                        f"checkpoint {expected[:16]}…: found content of digest {digest[:16]}…: it was changed."
                     )
                 path = self.path(digest)
-                with self.locked():
+                with self._locked():
                     self._refer(run, [digest])
-                    if not self.has(digest, size):
-                        path.parent.mkdir(exist_ok=True)
-                        fresh.replace(path)
+                    path.parent.mkdir(exist_ok=True)
+                    fresh.replace(path)  # also where it is there already: that file may be damaged
             finally:
                 fresh.unlink(missing_ok=True)
         return digest, size
@@ -125,15 +113,17 @@ class Store:
         if digests := [digest for digest in digests if self.path(digest)]:
             with storage_errors(self._folder, _ADVICE):
                 self._folder.mkdir(exist_ok=True)
-                with self.locked():
+                with self._locked():
                     self._refer(run, digests)
 
     def _refer(self, run: str, digests: Iterable[str]) -> None:
-        if fresh := [digest for digest in dict.fromkeys(digests) if digest not in self.of_run(run)]:
+        known = set(self.of_run(run))
+        if fresh := [digest for digest in dict.fromkeys(digests) if digest not in known]:
             path = self._folder / "runs" / run
             path.parent.mkdir(parents=True, exist_ok=True)
             with path.open("a", encoding="ascii") as stream:
-                stream.writelines(f"{digest}\n" for digest in fresh)
+                # The empty line ends one that was cut off when the machine failed.
+                stream.write("\n".join(["", *fresh, ""]))
 
     def of_run(self, run: str) -> list[str]:
         """Return the digests that a run refers to."""
@@ -175,23 +165,40 @@ class Store:
         """
         if run not in self.runs():
             return 0
-        with storage_errors(self._folder), self.locked():
+        with storage_errors(self._folder), self._locked():
             unused = self.only_of([run])
             for digest in unused:
                 self.path(digest).unlink(missing_ok=True)
             (self._folder / "runs" / run).unlink(missing_ok=True)
         return sum(unused.values())
 
+    def clean(self) -> None:
+        """Forget runs that are gone, and remove what killed processes left, both after an hour.
+
+        Raises:
+            StorageError: the store cannot be written.
+        """
+        for run in self.runs():
+            if not (self._folder.parent / run).exists() and _is_old(self._folder / "runs" / run):
+                self.drop(run)
+        for path in (self._folder / "objects").glob(".*"):
+            if _is_old(path):
+                path.unlink(missing_ok=True)
+
     def _size(self, digest: str) -> int:
         with contextlib.suppress(OSError):
             return self.path(digest).stat().st_size
         return 0
 
-    @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
-        """Let no other process change what runs refer to."""
-        with FileLock(self._folder / "lock"):
-            yield
+    def _locked(self) -> FileLock:
+        """Return the lock, with which no other process changes what runs refer to."""
+        return FileLock(self._folder / "lock")
+
+
+def _is_old(path: Path) -> bool:
+    with contextlib.suppress(OSError):
+        return time.time() - path.stat().st_mtime > _LEFT_OVER_SECONDS
+    return False
 
 
 def _write(path: Path, pieces: Iterable[bytes | memoryview]) -> tuple[str, int]:
@@ -205,9 +212,3 @@ def _write(path: Path, pieces: Iterable[bytes | memoryview]) -> tuple[str, int]:
         stream.flush()
         os.fsync(stream.fileno())
     return digest.hexdigest(), size
-
-
-def pieces_of(stream: BinaryIO) -> Iterator[bytes]:
-    """Yield the rest of a file, a megabyte at a time."""
-    while piece := stream.read(_PIECE):
-        yield piece

@@ -161,10 +161,7 @@ def clean(root: Path) -> None:
         with contextlib.suppress(OSError):
             if time.time() - stray.stat().st_mtime > _STRAY_SECONDS:
                 _delete(stray, foreign=False)
-    store = Store(root)
-    for run in store.runs():
-        if not (root / run).exists():
-            store.drop(run)
+    Store(root).clean()
 
 
 def contents_freed(removals: Sequence[Removal]) -> int:

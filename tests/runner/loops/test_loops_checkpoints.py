@@ -163,7 +163,12 @@ def test_removing_runs_removes_contents_that_no_other_run_refers_to(tmp_path):
     assert not any("not here" in note for note in verify(second.recording).notes)
     shutil.rmtree(second.folder)
     third = record_loop(tmp_path, "three")
+    left_over = tmp_path / ".store/objects/.0123456789abcdef"
+    left_over.write_bytes(b"by a process that was killed")
+    for path in (left_over, tmp_path / ".store/runs" / second.folder.name):
+        os.utime(path, (0, 0))
     assert dualtaxi(tmp_path, "prune", "name:three", "--yes").exit_code == 0
+    assert not left_over.exists()
     assert not third.folder.exists()
     assert objects(tmp_path) == []
 
@@ -208,6 +213,18 @@ def test_a_digest_that_is_a_path_leads_nowhere(tmp_path):
         store.put("run", b"content", expected="0" * 64)
     assert objects(tmp_path) == []
     assert [path for path in tmp_path.rglob("*") if path.name.startswith(".") and path.is_file()] == []
+
+
+def test_a_store_that_was_damaged_is_mended_by_the_same_content(tmp_path):
+    store = Store(tmp_path)
+    digest, size = store.put("run", b"content")
+    store.path(digest).write_bytes(b"CONTENT")
+    references = tmp_path / ".store/runs/run"
+    references.write_bytes(references.read_bytes()[:-20])  # cut off when the machine failed
+    for _ in range(2):
+        assert store.put("run", b"content") == (digest, size)
+        assert store.path(digest).read_bytes() == b"content"
+        assert store.of_run("run") == [digest]
 
 
 def test_a_file_that_is_no_safetensors_is_refused():

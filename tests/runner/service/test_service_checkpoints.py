@@ -51,6 +51,12 @@ def test_a_pushed_run_has_its_checkpoints_and_so_has_a_pulled_one(server, tmp_pa
     content = httpx2.get(f"{server.url}/api/v1/runs/{run.run_id}/checkpoints/{there[0]['digest']}").content
     assert content == bytes(1000)
     words = ["remote", "pull", run.run_id, "--server", server.url, "--recordings", str(tmp_path / "other")]
+    part = tmp_path / "other/.pulling" / f"{run.run_id}-{there[0]['digest']}.part"
+    part.parent.mkdir(parents=True)
+    part.write_bytes(b"damaged while it was interrupted")
+    done = CliRunner().invoke(cli, words)
+    assert done.exit_code != 0
+    assert "it was changed" in done.output
     done = CliRunner().invoke(cli, words)
     assert done.exit_code == 0, done.output
     pulled = runner.find_run(run.run_id, tmp_path / "other")
