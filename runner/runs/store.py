@@ -92,7 +92,7 @@ class Store:
                 digest, size = _write(fresh, pieces)
                 if expected and digest != expected:
                     raise RecordingError(
-                        f"checkpoint {expected[:16]}…: found content of digest {digest[:16]}…: it was changed."
+                        f"checkpoint {expected[:16]}…: found content {digest[:16]}…: it was changed."
                     )
                 path = self.path(digest)
                 with self._locked():
