@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlencode
 
 from runner.analysis.step_reference import StepRef
+from runner.runs.branches import origin_in
+from runner.runs.run import Run
 
 
 @dataclass(frozen=True)
@@ -53,3 +55,13 @@ def link(path: str, values: Mapping[str, Any]) -> str:
 def replay_address(run_id: str, step: StepRef) -> str:
     """Return the page of the replay at the frame after a step."""
     return f"/runs/{run_id}/replay/{step.episode_path}?t={step.outcome.t}"
+
+
+def places_in(runs: Sequence[Run], step: StepRef) -> list[StepRef]:
+    """Return the step in each of two runs: a branch has its parent's episode as its only one."""
+    alone = StepRef(0, step.t, None if step.after is None else 0)
+    origins = [origin_in(run.file.config) for run in runs]
+    return [
+        step if origin is None or origin.run != other.run_id else alone
+        for origin, other in zip(origins, reversed(runs), strict=True)
+    ]

@@ -34,7 +34,7 @@ from runner.export.rerun.location import locate
 from runner.export.rerun.selection import Request
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
-from runner.service.addresses import link
+from runner.service.addresses import link, places_in
 from runner.service.settings import without_folders
 from runner.sweep.charts import learning, picture_of, picture_plots
 from runner.sweep.page import sweep_legend
@@ -109,10 +109,9 @@ def difference(a: Run, b: Run) -> bytes:
     def linked(shown: ShownDivergence) -> ShownDivergence:
         runs = [a.run_id, b.run_id]
         both = link("/compare/replay", {"run": runs, "at": str(shown.step.outcome)})
-        at = str(shown.step)
         viewers = [
-            Link(f"{letter} in Rerun", link(f"/runs/{run}/rerun", {"at": at}))
-            for letter, run in zip("AB", runs, strict=True)
+            Link(f"{letter} in Rerun", link(f"/runs/{run}/rerun", {"at": str(place)}))
+            for letter, run, place in zip("AB", runs, places_in([a, b], shown.step), strict=True)
         ]
         return replace(shown, links=[Link("Both replays at this step", both), *viewers])
 

@@ -176,8 +176,7 @@ def _diff_branch(
     difference: RunDiff, a: Recording, b: Recording, cause: Cause, origin: BranchOrigin
 ) -> RunDiff:
     """Add to the difference of a loop and a branch of it where the branched episode diverges."""
-    note = f"{cause.text}: the branched episode is compared with the branch"
-    difference = replace(difference, notes=[note])
+    difference = replace(difference, notes=["of the parent only the branched episode is compared"])
     if (found := branch_divergence(a, b, origin)) is None:
         return difference
     if origin.phase == "train":

@@ -16,10 +16,9 @@ from runner.errors import RunnerError
 from runner.export.reports.rendering import View
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
-from runner.runs.branches import origin_in
 from runner.runs.run import Run
 from runner.service import fragments
-from runner.service.addresses import link
+from runner.service.addresses import link, places_in
 from runner.service.api.comparing import found_runs
 from runner.service.api.replay import LONG
 from runner.service.dependencies import CacheOf, CatalogueOf, ProcessesOf, timed_recording_state
@@ -174,7 +173,7 @@ async def replay(
     else:
         first = (await _difference(runs, cache, processes))["first_step"]
         step = StepRef.parse(first).outcome if first else StepRef(0)
-    names, places = [each.run_id for each in runs], _places(runs, step)
+    names, places = [each.run_id for each in runs], places_in(runs, step)
 
     def neighbour(by: int) -> str:
         other = replace(step, episode=step.episode + by, t=0)
@@ -265,16 +264,6 @@ def _results(runs: list[Run]) -> Rows:
         ("Training episodes", [humanize.number(each.summary.episodes, 0) for each in runs]),
         ("Training steps", [humanize.number(each.summary.train_steps, 0) for each in runs]),
         ("Content digest", digests),
-    ]
-
-
-def _places(runs: list[Run], step: StepRef) -> list[StepRef]:
-    """Return the step in each of two runs: a branch has its parent's episode as its only one."""
-    alone = StepRef(0, step.t, None if step.after is None else 0)
-    origins = [origin_in(run.file.config) for run in runs]
-    return [
-        step if origin is None or origin.run != other.run_id else alone
-        for origin, other in zip(origins, reversed(runs), strict=True)
     ]
 
 

@@ -513,3 +513,5 @@ def test_a_branch_is_listed_by_its_parent_and_shown_next_to_it(tmp_path):
         assert tried not in own
         divergence = client.get(f"/compare/divergence?run={run.run_id}&run={trained}").text
         assert "B is a branch of A, at 2:3, action 0, then constant" in divergence
+        assert f"/runs/{run.run_id}/rerun?at=2%3A" in divergence
+        assert f"/runs/{trained}/rerun?at=0%3A" in divergence
