@@ -197,6 +197,7 @@ class Replay:
         failed_reset = self._first_reset(resets, results)
         if place is not None and (failed_reset is None or resets[failed_reset][0] > place[0]):
             done = place[0] + 1
+            resets_done = sum(row < done for row, _ in resets[:resets_done])
             difference = self._row_difference(phase, environment, rows, recorded, results, *place)
         elif failed_reset is not None:
             done, reset = resets[failed_reset]
@@ -211,13 +212,7 @@ class Replay:
             )
             resets_done = failed_reset + 1
         elif results.error is not None:
-            got = f"{type(results.error).__name__}: {results.error}"
-            if resets_done < len(resets) and resets[resets_done][0] == done:
-                reset = resets[resets_done][1]
-                episode, t, step = reset.episode, 0, reset.step
-            else:
-                episode, t, step = (int(rows[done][name]) for name in ("episode", "t", "step"))
-            difference = self._difference(phase, environment, episode, t, step, "error", None, got)
+            difference = self._failure(phase, part, results.error)
         else:
             difference = None
         starts = [
@@ -230,7 +225,6 @@ class Replay:
                 results.first_frames[k] if results.first_frames else None,
             )
             for k, (row, reset) in enumerate(resets[:resets_done])
-            if row <= done
         ]
         return RedoneSteps(
             phase=phase,
@@ -245,6 +239,20 @@ class Replay:
             frames=results.frames[:done],
             difference=difference,
         )
+
+    def _failure(self, phase: str, part: _Part, error: Exception) -> Difference:
+        """Return the difference that the environment raised an error where the recorded one did not."""
+        environment, rows, resets, results = part
+        got = f"{type(error).__name__}: {error}"
+        waiting = resets[results.resets_done :]
+        if waiting and (waiting[0][0] <= results.done or results.done >= len(rows)):
+            reset = waiting[0][1]
+            return self._difference(phase, environment, reset.episode, 0, reset.step, "error", None, got)
+        if not len(rows):  # another environment of the vector raised it
+            raise CannotRedo(f"The vector environment fails: {got}")
+        row = rows[min(results.done, len(rows) - 1)]
+        episode, t, step = (int(row[name]) for name in ("episode", "t", "step"))
+        return self._difference(phase, environment, episode, t, step, "error", None, got)
 
     def _first_row(
         self, rows: NDArray[np.void], recorded: Values, results: Results

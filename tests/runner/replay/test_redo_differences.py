@@ -19,6 +19,7 @@ from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import open_recording
 from runner.replay.environment import redo, redo_in_child
 from runner.replay.makers import make_environment, why_not_made
+from tests.runner.loops.making import drive
 from tests.runner.replay import loops
 from tests.runner.replay.loops import record, redone
 
@@ -107,6 +108,25 @@ def test_an_action_that_the_environment_refuses_is_named(tmp_path):
     assert difference.field == "error"
     assert "7" in difference.got
     assert "AssertionError" in difference.got
+
+
+@pytest.mark.parametrize("step", [1, 20, 61])
+def test_an_error_of_a_vector_is_named(step, tmp_path):
+    class Failing(gymnasium.vector.VectorWrapper):
+        steps = 0
+
+        def step(self, actions):
+            self.steps += 1
+            if self.steps == step:
+                raise RuntimeError("out of order")
+            return super().step(actions)
+
+    with runner.record_vector(gymnasium.make_vec("CartPole-v1", 3), tmp_path) as envs:
+        drive(envs, 80)
+    done, difference = redone(envs.run.recording, make=lambda: Failing(gymnasium.make_vec("CartPole-v1", 3)))
+    assert (difference.field, difference.got) == ("error", "RuntimeError: out of order")
+    assert difference.step // 3 in (step - 1, step)
+    assert done <= step
 
 
 def test_small_differences_are_accepted_within_a_tolerance(pole):
@@ -220,18 +240,18 @@ def test_another_space_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("make", "reason"),
+    ("make", "seconds", "reason"),
     [
-        (loops.hanging, "longer than 2 s"),
-        (loops.crashing, "ended its process"),
-        (loops.hungry, "more than 0.5 GiB"),
+        (loops.hanging, 2, "longer than 2 s"),
+        (loops.crashing, 60, "ended its process"),
+        (loops.hungry, 60, "more than 0.5 GiB"),
     ],
 )
-def test_an_environment_of_bad_habits_ends_with_the_reason(make, reason, tmp_path):
+def test_an_environment_of_bad_habits_ends_with_the_reason(make, seconds, reason, tmp_path):
     path = record(make(), tmp_path, 60, make=make)
     with pytest.raises(CannotRedo, match=reason):
-        list(redo_in_child(path, trust=True, seconds=2, memory_bytes=1 << 29))
-    found = verify_by_redoing(path, trust=True, seconds=2, memory_bytes=1 << 29)
+        list(redo_in_child(path, trust=True, seconds=seconds, memory_bytes=1 << 29))
+    found = verify_by_redoing(path, trust=True, seconds=seconds, memory_bytes=1 << 29)
     assert found.verdict == "impossible"
     assert reason in found.reason
 
