@@ -72,7 +72,7 @@ def encoded_pictures(
         if source is Source.REDRAWN:
             has_begun = False
             try:
-                for data in _painted(paint_redrawn(recording, phase, episode), start):
+                for data in _painted(paint_redrawn(recording, phase, episode, first=start)):
                     has_begun = True
                     yield data
             except (CannotRedo, EnvironmentDiffers) as error:
@@ -86,7 +86,7 @@ def encoded_pictures(
             yield from _painted(paint_observation(recording, phase, episode), start)
 
 
-def _painted(painted: Painted, start: int) -> Iterator[bytes]:
+def _painted(painted: Painted, start: int = 0) -> Iterator[bytes]:
     """Yield pictures as files, from number `start` on."""
     with closing(painted):
         for k, pixels in enumerate(painted):

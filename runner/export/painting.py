@@ -88,19 +88,23 @@ def _like(pixels: Pixels, before: Pixels | None) -> Pixels:
     return np.asarray(Image.fromarray(pixels).resize(before.shape[1::-1]))
 
 
-def paint_redrawn(recording: Recording, phase: str, episode: int, trust: bool = False) -> Painted:
-    """Draw each state by the environment; see `redrawn`."""
+def paint_redrawn(
+    recording: Recording, phase: str, episode: int, trust: bool = False, first: int = 0
+) -> Painted:
+    """Draw each state by the environment, from the one after `first` steps on; see `redrawn`."""
     shown: Pixels | None = None
-    with closing(redrawn(recording, phase, [episode], trust)) as found:
+    with closing(redrawn(recording, phase, [episode], trust, first)) as found:
         for _, _, frame in found:
             shown = _like(frame, shown)
             yield shown
 
 
 def redrawn(
-    recording: Recording, phase: str, episodes: Sequence[int], trust: bool = False
+    recording: Recording, phase: str, episodes: Sequence[int], trust: bool = False, draw_from: int = 0
 ) -> Generator[tuple[int, int, Pixels], None, None]:
     """Draw episodes by the environment, made again in a child process and compared with the recording.
+
+    With `draw_from`, the first steps of the only episode are taken without pictures.
 
     Yields:
         the number of an episode, how many of its steps were taken, and the picture after them.
@@ -109,12 +113,14 @@ def redrawn(
         CannotRedo: the environment cannot be made again, or draws no pictures.
         EnvironmentDiffers: it differs from the recording, of which no picture comes after that step.
     """
-    blocks: Any = redo_in_child(recording.path, phase, episodes, render=True, trust=trust)
-    waiting, episode, t = iter(episodes), episodes[0], 0
+    blocks: Any = redo_in_child(
+        recording.path, phase, episodes, render=True, trust=trust, draw_from=draw_from
+    )
+    waiting, episode, t = iter(episodes), episodes[0], draw_from
     with closing(blocks):
         for steps in blocks:
             differs = steps.difference
-            first = [start.frame for start in steps.starts if start.frame is not None]
+            first = [start.frame for start in steps.starts if start.frame is not None and not draw_from]
             if first:
                 episode, t = next(waiting), 0
             frames = [*first, *steps.frames]

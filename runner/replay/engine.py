@@ -64,7 +64,9 @@ class Replay:
         report: Report,
         render: bool,
         make: Callable[[], Any] | None = None,
+        draw_from: int = 0,
     ) -> None:
+        self._draw_from = draw_from
         self._recording, self._trust, self._tolerance, self._make = recording, trust, tolerance, make
         self._report, self.render = report, render
         self._steppers: dict[_Key, Stepper] = {}
@@ -119,15 +121,23 @@ class Replay:
             begin, resets = resets[known][0], resets[known:]
             self.skipped += begin * width
         stepper = self.stepper(phase, environment)
-        stepper.draws = draws
+        stepper.draws, first_drawn = False, 0
+        if draws:
+            first_drawn = int(np.searchsorted(rows["step"].astype(np.int64), self._draw_from)) // width
         end, stop = begin, len(rows) // width
         while end < stop or resets:
+            if draws and not stepper.draws and end >= first_drawn:
+                stepper.draws = True
+                if first_drawn:  # blocks were larger, and the first picture is to come at once
+                    self._max_rows = 1
             begin, end = end, min(end + max(self._max_rows // width, 1), stop)
+            if begin < first_drawn < end:
+                end = first_drawn
             here = [(row - begin, reset) for row, reset in resets if row < end or end == stop]
             resets, block = resets[len(here) :], rows[begin * width : end * width]
             started = time.monotonic()
             results = stepper.run(block, here)
-            self._adapt(time.monotonic() - started, draws)
+            self._adapt(time.monotonic() - started, stepper.draws)
             self.taken += results.done
             self._report(self.taken)
             parts = [_Part(environment, block, here, results)]

@@ -45,6 +45,7 @@ def redo(
     tolerance: float = 0.0,
     report: Report = lambda _: None,
     make: Callable[[], Any] | None = None,
+    draw_from: int = 0,
 ) -> Iterator[RedoneSteps]:
     """Do recorded episodes again; yield their steps in blocks of about 0.2 s, compared with the recording.
 
@@ -63,6 +64,7 @@ def redo(
         tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
         report: called with the number of steps taken so far, also of those before an episode.
         make: returns the environment, which is closed at the end, instead of making it as recorded.
+        draw_from: steps of an episode before its first picture.
 
     Raises:
         CannotRedo: the environment cannot be made again, or draws no pictures; the message is why.
@@ -78,7 +80,12 @@ def redo(
                     yield steps
         return
     for episode in episodes:
-        for steps in redo_episode(recording, phase or "train", episode, begin):
+        own = phase or "train"
+        if draw_from:
+            span = recording.episode_span(own, episode)
+            first = span[draw_from - 1] if draw_from <= len(span) else span.stop
+            begin = partial(begin, draw_from=first)
+        for steps in redo_episode(recording, own, episode, begin):
             yield steps
             if steps.difference is not None:
                 return
@@ -95,6 +102,7 @@ def redo_in_child(
     seconds: float = SECONDS,
     memory_bytes: int = MEMORY_BYTES,
     report: Report = lambda _: None,
+    draw_from: int = 0,
 ) -> Iterator[RedoneSteps]:
     """Do recorded episodes again in a child process, which ends with the iterator; see `redo`.
 
@@ -110,12 +118,13 @@ def redo_in_child(
         seconds: how long a block of steps may take, and making the environment.
         memory_bytes: how much the process may allocate.
         report: see `redo`.
+        draw_from: see `redo`.
 
     Raises:
         CannotRedo: see `redo`; or the environment hangs, crashes, or needs more memory.
         RecordingError: see `redo`.
     """
-    arguments = {"render": render, "trust": trust, "tolerance": tolerance}
+    arguments = {"render": render, "trust": trust, "tolerance": tolerance, "draw_from": draw_from}
     for found in stream_from_child(
         _redo_path, path, phase, episodes, seconds=seconds, memory_bytes=memory_bytes, **arguments
     ):
