@@ -1,6 +1,6 @@
 """Verify a loop by doing it again: its environment takes the recorded actions, and every result is compared.
 
-This shows that the recorded returns were really obtained, whoever or whatever chose the actions.
+This shows that the recorded returns were really obtained, whatever chose the actions.
 """
 
 from __future__ import annotations

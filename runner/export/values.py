@@ -15,7 +15,7 @@ from runner.recording.spaces import Leaf, leaves_of
 MAX_NUMBERS: Final = 64
 """Leaves of more numbers are not shown number by number."""
 FEW: Final = 8
-"""An array of at most so many numbers is written out in words."""
+"""Arrays of at most this number of numbers are written out in words."""
 _LEAST_SIDE: Final = 16
 """An array of bytes is an image if it has at least this height and width."""
 

@@ -217,8 +217,8 @@ def _made_by_function(name: str, render: bool) -> Any:
     parameters = inspect.signature(make).parameters.values()
     if not any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters):
         raise CannotRedo(
-            f"{name} makes environments that draw no pictures: let it take an argument render_mode, and "
-            "hand it to gymnasium.make."
+            f"{name} makes environments that draw no pictures: give it an argument render_mode, and "
+            "pass it to gymnasium.make."
         )
     return make(render_mode="rgb_array")
 

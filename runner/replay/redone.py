@@ -92,7 +92,7 @@ class RedoneSteps:
         return replace(self, **kept, recorded=self.recorded.since(at), got=self.got.since(at), starts=starts)
 
     def without_rows(self) -> RedoneSteps:
-        """Return the difference alone: it is in another episode than the one that was asked for."""
+        """Return the difference alone: it is in an episode before the requested one."""
         empty = {name: getattr(self, name)[:0] for name in ("step", "episode", "t", "actions")}
         recorded, got = self.recorded.first(0), self.got.first(0)
         return replace(self, **empty, recorded=recorded, got=got, starts=(), frames=())

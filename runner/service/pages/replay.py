@@ -271,14 +271,16 @@ async def _replay(
 def _branches(run: Run, catalogue: Catalogue) -> list[Link]:
     """Return links to the comparisons of a run with its parent, if it is a branch, and with its branches."""
 
-    def beside(parent: str, branch: str, at: str) -> str:
+    def comparison(parent: str, branch: str, at: str) -> str:
         return link("/compare/replay", {"run": [parent, branch], "at": at})
 
     own = origin_in(run.file.config)
-    parent = [] if own is None else [Link(f"Branch of {own.run} {own}", beside(own.run, run.run_id, own.at))]
+    parent = (
+        [] if own is None else [Link(f"Branch of {own.run} {own}", comparison(own.run, run.run_id, own.at))]
+    )
     branches = catalogue.read(lambda index: index.branches(run.run_id))
     return parent + [
-        Link(f"Branch {name} {origin}", beside(run.run_id, name, origin.at))
+        Link(f"Branch {name} {origin}", comparison(run.run_id, name, origin.at))
         for name, origin in islice(branches.items(), MAX_BRANCHES)
     ]
 
