@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from runner.recording.schema import PHASES
 from runner.util.values import is_whole
 
 ORIGIN: Final = "config.origin."
@@ -52,4 +51,6 @@ def parse_origin(found: Mapping[str, Any]) -> BranchOrigin | None:
     values: dict[str, Any] = {name: found.get(name) for name in BranchOrigin.__dataclass_fields__}
     are_numbers = all(is_whole(values[name], 0, _MAX_NUMBER) for name in ("episode", "t", "seed"))
     are_texts = all(isinstance(values[name], str) for name in ("run", "at", "action", "policy"))
-    return BranchOrigin(**values) if are_numbers and are_texts and values["phase"] in PHASES else None
+    return (
+        BranchOrigin(**values) if are_numbers and are_texts and values["phase"] in ("train", "eval") else None
+    )

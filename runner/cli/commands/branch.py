@@ -21,7 +21,12 @@ if TYPE_CHECKING:
 
 @click.command("branch", cls=Command)
 @run_argument
-@click.option("--at", type=STEP, metavar="STEP", help="The step: EPISODE:T, or eval:N:TRIAL:T.")
+@click.option(
+    "--at",
+    type=STEP,
+    metavar="STEP",
+    help="The step: EPISODE:T of training, or eval:N:TRIAL:T of an evaluation.",
+)
 @click.option(
     "--action",
     "actions",

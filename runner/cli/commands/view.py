@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     "step",
     type=STEP,
     metavar="EPISODE:T",
-    help="The step to show: EPISODE:T of training, or eval:N:TRIAL:T of an evaluation. "
-    "T and TRIAL default to 0.",
+    help="The step: EPISODE:T of training, or eval:N:TRIAL:T of an evaluation. T and TRIAL default to 0.",
 )
 @click.option("--web", is_flag=True, help="Serve the web viewer on 127.0.0.1 instead of opening a window.")
 @click.option(

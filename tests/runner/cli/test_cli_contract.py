@@ -233,6 +233,7 @@ OF_THE_COMMAND = (
     "name",
     "output",
     "phase",
+    "policy",
     "port",
     "ray",
     "seed",
