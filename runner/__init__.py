@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from runner.execution.verify import verify
     from runner.loops.branch import branch
     from runner.loops.env import record
-    from runner.loops.vector import record_parallel, record_vector
+    from runner.loops.parallel import record_parallel
+    from runner.loops.vector import record_vector
     from runner.recording.reader import Recording, open_recording
     from runner.runs.resolve import find_run
     from runner.runs.run import Run, label, list_runs
@@ -68,7 +69,7 @@ _HOME = {
     "list_runs": "runner.runs.run",
     "open_recording": "runner.recording.reader",
     "record": "runner.loops.env",
-    "record_parallel": "runner.loops.vector",
+    "record_parallel": "runner.loops.parallel",
     "record_vector": "runner.loops.vector",
     "rerecord": "runner.execution.rerecord",
     "resume": "runner.execution.resume",

@@ -6,14 +6,16 @@ import heapq
 from collections.abc import Iterator
 from typing import Any, Final
 
+import numpy as np
 import pyarrow as pa
 from blake3 import blake3
 
-from runner.archive.columns import Shape, checked_batch, merged, record_bytes, shape_of
+from runner.archive.columns import Shape, checked_batch, record_bytes, shape_of
 from runner.archive.layout import Records, Table
 from runner.archive.manifest import Entry
 from runner.archive.rows import message_payload, message_row
 from runner.errors import RecordingError
+from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS, Topic
@@ -79,7 +81,7 @@ class Batches:
     def blocks(self, table: Table) -> Iterator[tuple[Topic, Records, pa.RecordBatch]]:
         """Yield the messages of a fixed-width table: their topic, as records and as columns."""
         train, evaluation = table.topics
-        for topic, records in merged(self._recording, (train, evaluation)):
+        for topic, records in _merged(self._recording, (train, evaluation)):
             batch = checked_batch(topic, records, self.shape, self._where)
             self._count(topic, record_bytes(records), len(records))
             yield topic, records, batch
@@ -123,3 +125,23 @@ class Batches:
     def _count(self, topic: Topic, records: bytes | memoryview, count: int) -> None:
         self._hashes[topic.name].update(records)
         self._counts[topic.name] += count
+
+
+def _merged(recording: Recording, topics: tuple[Topic, Topic]) -> Iterator[tuple[Topic, Records]]:
+    """Yield the messages of two topics of one size, of training and evaluation, as they were recorded."""
+    heads = []
+    for topic in topics:
+        is_extra = topic.message is schema.EXTRA
+        blocks = recording.extras(topic.phase).blocks() if is_extra else recording.blocks(topic)
+        if (block := next(blocks, None)) is not None:
+            heads.append((topic, block, blocks))
+    while len(heads) == 2:
+        heads.sort(key=lambda head: int(head[1]["log_time"][0]))
+        (topic, block, blocks), (_, other, _) = heads
+        n = max(int(np.searchsorted(block["log_time"], other["log_time"][0])), 1)
+        yield topic, block[:n]
+        rest = block[n:] if n < len(block) else next(blocks, None)
+        heads[:1] = [] if rest is None else [(topic, rest, blocks)]
+    for topic, block, blocks in heads:
+        yield topic, block
+        yield from ((topic, further) for further in blocks)

@@ -23,7 +23,6 @@ from runner.recording import schema
 from runner.recording.blocks import Sizes, blank_records, record_dtype
 from runner.recording.extras import ExtraLayout
 from runner.recording.metadata import kind_of, sizes_of, spaces_of
-from runner.recording.reader import Recording
 from runner.recording.recorder import BLOCK_BYTES
 from runner.recording.schema import STEP_NANOSECONDS, MessageType, Topic
 
@@ -295,35 +294,6 @@ def shape_of(
         spaces=spaces,
         extras=extras,
     )
-
-
-def merged(recording: Recording, topics: tuple[Topic, Topic]) -> Iterator[tuple[Topic, Records]]:
-    """Yield the messages of a topic of training and one of evaluation in the order they were recorded.
-
-    Args:
-        recording: the recording.
-        topics: two fixed-width topics.
-    """
-    waiting = [
-        (
-            topic,
-            recording.extras(topic.phase).blocks()
-            if topic.message is schema.EXTRA
-            else recording.blocks(topic),
-        )
-        for topic in topics
-    ]
-    heads = [(topic, block, blocks) for topic, blocks in waiting if (block := next(blocks, None)) is not None]
-    while len(heads) == 2:
-        heads.sort(key=lambda head: int(head[1]["log_time"][0]))
-        (topic, block, blocks), (_, other, _) = heads
-        n = max(int(np.searchsorted(block["log_time"], other["log_time"][0])), 1)
-        yield topic, block[:n]
-        rest = block[n:] if n < len(block) else next(blocks, None)
-        heads[:1] = [] if rest is None else [(topic, rest, blocks)]
-    for topic, block, blocks in heads:
-        yield topic, block
-        yield from ((topic, further) for further in blocks)
 
 
 def batch_of(topic: Topic, records: Records, shape: Shape) -> pa.RecordBatch:

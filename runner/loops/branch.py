@@ -25,8 +25,8 @@ from runner.analysis.step_reference import StepRef
 from runner.errors import CannotRedo, ConfigError, RunnerError
 from runner.loops.actions import action_names, parsed_action
 from runner.loops.env import record
+from runner.loops.parallel import record_parallel
 from runner.loops.policies import Policy, from_policy, policy_named
-from runner.loops.vector import record_parallel
 from runner.recording.reader import Recording, open_recording
 from runner.replay.capabilities import why_not_redone
 from runner.replay.engine import BLOCK_SECONDS, Replay, Report

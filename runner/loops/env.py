@@ -15,12 +15,13 @@ from gymnasium.vector import VectorEnv
 from runner.errors import ConfigError
 from runner.loops.description import describe
 from runner.loops.generators import GeneratorWatch
-from runner.loops.loop import Loop, R, check_phase
+from runner.loops.loop import Loop, R
 from runner.loops.makers import checked_make, maker_of
 from runner.loops.messages import Messages
 from runner.loops.options import Options, options_of
 from runner.loops.rows import Rows
 from runner.loops.single_rows import ROWS
+from runner.loops.values import check_phase
 from runner.runs.run import Run
 
 

@@ -16,14 +16,14 @@ from blake3 import blake3
 
 from runner.client.outbox import Follower, connect, is_server, outbox_folder
 from runner.config.job import NOT_CONTENT
-from runner.errors import ConfigError, RunnerError, StorageError, truncated_message
+from runner.errors import RunnerError, StorageError, truncated_message
 from runner.loops.description import Described
 from runner.loops.extras import Extras
 from runner.loops.messages import Messages
 from runner.loops.options import Options
 from runner.loops.outcomes import Outcomes
 from runner.loops.rows import PhaseRows
-from runner.loops.values import warn_user
+from runner.loops.values import check_phase, warn_user
 from runner.recording import schema
 from runner.recording.gym_spaces import can_widen, widened
 from runner.recording.maker import EnvironmentMaker
@@ -92,8 +92,7 @@ class Loop(Generic[R]):
         self._rows: dict[str, R] = {}
         self.active: R | None = None
         """The rows of the last step; None before any, and when the loop is closed."""
-        self.described = described
-        self.options = options
+        self.described, self.options = described, options
         self.lock = threading.RLock()
         self.closed = False
         self.is_foreign = False
@@ -163,8 +162,8 @@ class Loop(Generic[R]):
         """Write what makes the recording self-contained, once; from then on dtypes are fixed."""
         if not self._is_described:
             self._is_described = self._is_settled = True
-            attachments = self.described.attachments()
-            write_description(self._file, self._facts, self._config, self._made_by, attachments, self._maker)
+            environment = self.described.attachments(), self._maker
+            write_description(self._file, self._facts, self._config, self._made_by, *environment)
 
     def _first_action(self, action: Any) -> None:
         """Record all actions in the dtype of the first one, if the space's own cannot hold it exactly."""
@@ -295,9 +294,8 @@ class Loop(Generic[R]):
     def _finish(self, status: str, error: str) -> dict[str, Any]:
         self._commit()
         self.extras.finish()
-        result = self._recorder.totals(self._recorder.drain())
+        result = self._recorder.totals(self._recorder.drain()) | self._outcomes.summary()
         result |= {"episodes": self._recorder.counts["/train/episode"], "steps_recorded": True}
-        result |= self._outcomes.summary()
         if self.described.mdp is not None:
             result["rewards_off_table"] = sum(rows.off_table for rows in self._rows.values())
         if error:
@@ -348,16 +346,6 @@ class Loop(Generic[R]):
         self._rows, self.extras = dict.fromkeys(schema.PHASES, ignored), ignored
         for view in list(self.views):
             view._detach()
-
-
-def check_phase(phase: str) -> None:
-    """Refuse what is not a phase.
-
-    Raises:
-        ConfigError: it is not.
-    """
-    if phase not in schema.PHASES:
-        raise ConfigError(f"phase: found {phase!r}, expected one of {', '.join(schema.PHASES)}")
 
 
 class _Flusher:

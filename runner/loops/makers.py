@@ -50,8 +50,8 @@ def maker_of(env: Any, make: str = "") -> EnvironmentMaker:
     base_spec = getattr(layers[-1], "spec", None)
     maker = EnvironmentMaker("gymnasium", make=make, wrappers=names)
     if not isinstance(base_spec, EnvSpec):
-        maker = replace(maker, reason=f"it was not made by gymnasium.make; {_NAME_MAKE}")
-        return _with_versions(maker, [_top(type(layers[-1]).__module__)])
+        top = _top(type(layers[-1]).__module__)
+        return _with_versions(maker, [top], "it was not made by gymnasium.make")
     assumed: list[str] = []
     try:
         entry_point = _entry_point(base_spec.entry_point)
@@ -65,8 +65,7 @@ def maker_of(env: Any, make: str = "") -> EnvironmentMaker:
         wrappers = [layer for layer in reversed(layers[:-1]) if not isinstance(layer, _SHOWS_ONLY)]
         spec = json.dumps(fields | _wrapping(wrappers, assumed), default=_plain_number)
     except _Unknown as reason:
-        maker = replace(maker, reason=f"{reason}; {_NAME_MAKE}")
-        return _with_versions(maker, [_top(type(layers[-1]).__module__)])
+        return _with_versions(maker, [_top(type(layers[-1]).__module__)], reason)
     top = _top(entry_point.partition(":")[0])
     maker = replace(maker, spec=spec, registered_by="" if top == "gymnasium" else top, assumed=tuple(assumed))
     return _with_versions(maker, [top, *(_top(name) for name in names)])
@@ -115,8 +114,8 @@ def _custom_vector(base: Any) -> EnvironmentMaker:
     """Return how a vector environment of its own class was made."""
     spec, top = getattr(base, "spec", None), _top(type(base).__module__)
     if not isinstance(spec, EnvSpec):
-        reason = f"{_class_name(base)} does not tell how it was made"
-        return _with_versions(EnvironmentMaker("vector", reason=f"{reason}; {_NAME_MAKE}"), [top])
+        reason = f"{_class_name(base)} does not state how it was made"
+        return _with_versions(EnvironmentMaker("vector"), [top], reason)
     try:
         entry_point = _entry_point(spec.vector_entry_point)
         fields: dict[str, Any] = {
@@ -128,8 +127,8 @@ def _custom_vector(base: Any) -> EnvironmentMaker:
             "additional_wrappers": [],
         }
         text = json.dumps(fields, default=_plain_number)
-    except _Unknown as reason:
-        return _with_versions(EnvironmentMaker("vector", reason=f"{reason}; {_NAME_MAKE}"), [top])
+    except _Unknown as unknown:
+        return _with_versions(EnvironmentMaker("vector"), [top], unknown)
     top = _top(entry_point.partition(":")[0])
     registered_by = "" if top == "gymnasium" else top
     return _with_versions(EnvironmentMaker("vector", spec=text, registered_by=registered_by), [top])
@@ -162,7 +161,7 @@ def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
         entry_point = f"{module}:parallel_env" if has_function else _entry_point(type(base))
         kwargs = _checked_kwargs(arguments or {}, f"the game {_class_name(base)}")
     except _Unknown as reason:
-        return _with_versions(replace(maker, reason=f"{reason}; {_NAME_MAKE}"), [top])
+        return _with_versions(maker, [top], reason)
     spec = json.dumps({"entry_point": entry_point, "kwargs": kwargs}, default=_plain_number)
     maker = replace(maker, spec=spec, registered_by=top, assumed=(_class_name(base),) if assumed else ())
     return _with_versions(maker, [top])
@@ -337,8 +336,10 @@ def _main_name() -> str | None:
     return name if is_same else None
 
 
-def _with_versions(maker: EnvironmentMaker, tops: Sequence[str]) -> EnvironmentMaker:
-    """Return a maker with the versions of the packages that matter, and the platform."""
+def _with_versions(maker: EnvironmentMaker, tops: Sequence[str], reason: object = "") -> EnvironmentMaker:
+    """Return a maker with the versions of the packages, the platform, and why it is incomplete."""
+    if reason:
+        maker = replace(maker, reason=f"{reason}; {_NAME_MAKE}")
     if len(maker.spec) > MAX_SPEC:
         maker = replace(maker, spec="", reason=f"its arguments take {len(maker.spec):,} bytes; {_NAME_MAKE}")
     return replace(maker, packages=package_versions(tops), platform=_platform(), machine=platform.machine())

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from runner.errors import CannotRedo, ConfigError, RecordingError, RunnerError
 from runner.export.minari_episodes import episodes_in
 from runner.loops.env import record
+from runner.loops.parallel import record_parallel
 from runner.loops.values import as_array
-from runner.loops.vector import record_parallel
 from runner.recording.gym_spaces import restore_space
 from runner.recording.reader import Recording, open_recording
 from runner.replay.makers import is_whole_vector, make_environment, why_not_made

@@ -13,6 +13,7 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from runner.errors import ConfigError, RecordingError
+from runner.recording import schema
 from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.util.jsonable import as_mapping
 from runner.util.values import is_utf8
@@ -111,6 +112,16 @@ def as_array(value: Any) -> NDArray[Any]:
     if values.dtype.kind == "V" and values.dtype.name.startswith(("bfloat16", "float8")):
         return values.astype(np.float32)
     return values
+
+
+def check_phase(phase: str) -> None:
+    """Refuse what is not a phase.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if phase not in schema.PHASES:
+        raise ConfigError(f"phase: found {phase!r}, expected one of {', '.join(schema.PHASES)}")
 
 
 def require_reset(resets: int, phase: str) -> None:

@@ -17,13 +17,13 @@ from runner.loops.description import Described
 from runner.loops.generators import States
 from runner.loops.rows import MAX_SEED
 from runner.loops.values import require_reset, warn_user
+from runner.loops.vector_counts import EpisodeCounts, Flags, counts_of
 from runner.recording import schema
 from runner.recording.gym_values import filler, leaves_of, put_chosen
 from runner.recording.recorder import Recorder
 from runner.recording.reset_states import ResetState
 from runner.recording.schema import Topic
 
-Flags = NDArray[np.bool_]
 _TRUE: Final = b"\1"
 _MAX_STEPS: Final = 2048
 """The most steps of the vector environment in a block; fewer if the recorder's blocks hold fewer records."""
@@ -37,23 +37,8 @@ class _Reset(NamedTuple):
     which: NDArray[np.intp]
     observation: NDArray[Any]
     seeds: Sequence[int | None]
-    states: States
-    """What it depended on, where that is to be recorded."""
-
-
-class _Counts(NamedTuple):
-    """What follows from the ends of episodes in a block; arrays are [rows, N] or [rows + 1, N]."""
-
-    over: Flags
-    only_reset: Flags
-    """Where no step was taken: the environment ignored its action and was reset."""
-    ended_before: NDArray[np.int64]
-    """Episodes that ended in the block before each row, and before its end."""
-    t: NDArray[np.int64]
-    length: NDArray[np.int64]
-    """Steps of the episode up to and including each row."""
-    returns: NDArray[np.float64]
-    """Sums of the episode's rewards up to and including each row."""
+    states: Sequence[ResetState | None]
+    """What each depended on, where that is to be recorded."""
 
 
 class VectorRows:
@@ -81,10 +66,9 @@ class VectorRows:
     ) -> None:
         self._recorder, self._phase, self._first_action = recorder, phase, first_action
         topics = {topic.name: topic for topic in schema.KINDS[described.kind]}
-        self._steps = topics[f"/{phase}/step"]
-        self._episodes = topics[f"/{phase}/episode"]
-        self._resets = topics[f"/{phase}/reset"]
-        self._reset_states = topics[f"/{phase}/reset_state"]
+        self._steps, self._episodes, self._resets, self._reset_states = (
+            topics[f"/{phase}/{name}"] for name in ("step", "episode", "reset", "reset_state")
+        )
         self._discrete = described.kind == "step"
         self._next_step = next_step
         self._state_start, self._action_start = (
@@ -96,11 +80,9 @@ class VectorRows:
         """The number of the episode in progress, or of the next one, in each environment."""
         self._length = np.zeros(n, np.int64)
         self._return = np.zeros(n)
-        self._ended = 0
-        self._reset_count = 0
+        self._ended = self._reset_count = 0
         self._observation_dtype = recorder.blank(self._resets, 1).dtype["observation"]
-        self._room = 0
-        self._filled = 0
+        self._room = self._filled = 0
         """Rows of the block that are in use, of `_room`."""
         self._over = np.zeros(n, np.bool_)
         self._state = np.full(n, -self._state_start)
@@ -131,8 +113,7 @@ class VectorRows:
         self._actions = np.empty((rows, n), action)
         self._observations = np.empty((rows, n), self._observation_dtype)
         self._rewards = np.empty((rows, n))
-        self._terminated = np.empty((rows, n), np.bool_)
-        self._truncated = np.empty((rows, n), np.bool_)
+        self._terminated, self._truncated = np.empty((2, rows, n), np.bool_)
         self._put_action = filler(self._action_leaves, self._actions, (n,))
         self._put_observation = filler(self._observation_leaves, self._observations, (n,))
 
@@ -216,7 +197,8 @@ class VectorRows:
             put_chosen(self._observation_leaves, final, last, which)
             self._finals.append((row, which, last[which]))
             after = self._observations[row, which]
-            self._block_resets.append(_Reset(row + 1, which, after, [None] * len(which), {}))
+            none = [None] * len(which)
+            self._block_resets.append(_Reset(row + 1, which, after, none, none))
         if states:
             self._autoreset_states[row] = states
         self._filled = row + 1
@@ -233,12 +215,13 @@ class VectorRows:
             states: what the reset depended on, if it is to be recorded.
         """
         chosen = np.flatnonzero(which)
-        own = [seeds[i] if len(seeds) else None for i in chosen.tolist()]
+        own_seeds = [seeds[i] if len(seeds) else None for i in chosen.tolist()]
+        own_states = [states.get(i) for i in chosen.tolist()]
         now = np.zeros(self._n, self._observation_dtype)
         filler(self._observation_leaves, now[np.newaxis], (self._n,))(0, observation)
         over = self.over
         if self._filled and over[chosen].all():
-            self._block_resets.append(_Reset(self._filled, chosen, now[chosen], own, states))
+            self._block_resets.append(_Reset(self._filled, chosen, now[chosen], own_seeds, own_states))
             return
         self.commit()
         self._abandon(chosen)
@@ -246,8 +229,7 @@ class VectorRows:
         if self._discrete:
             self._state[chosen] = now[chosen].astype(np.int64) - self._state_start
         steps = np.full(len(chosen), self._recorder.steps[self._phase])
-        own_states = [states.get(i) for i in chosen.tolist()]
-        self._put_resets(chosen, now[chosen], own, self._episode[chosen], steps, own_states)
+        self._put_resets(chosen, now[chosen], own_seeds, own_states, self._episode[chosen], steps)
 
     def _abandon(self, which: NDArray[np.intp]) -> None:
         """End the episodes in progress of these environments, neither terminated nor truncated."""
@@ -269,8 +251,7 @@ class VectorRows:
         if not rows:
             return
         first, over_after = self._recorder.steps[self._phase], self.over
-        counts = self._count()
-        self._put_records(counts, first)
+        self._put_records(counts := self._count(), first)
         self._recorder.steps[self._phase] += rows * n
         row, which = np.nonzero(counts.over)
         self._put_ends(
@@ -289,7 +270,7 @@ class VectorRows:
         self._filled = self._counted = self._ended_here = 0
         self._block_resets, self._finals, self._autoreset_states = [], [], {}
 
-    def _count(self) -> _Counts:
+    def _count(self) -> EpisodeCounts:
         rows, n = self._filled, self._n
         over = self._terminated[:rows] | self._truncated[:rows]
         only_reset = np.zeros((rows, n), np.bool_)
@@ -297,31 +278,9 @@ class VectorRows:
             only_reset[0], only_reset[1:] = self._over, over[:-1]
             for reset in self._block_resets:
                 only_reset[reset.row : reset.row + 1, reset.which] = False
-        ended_before = np.zeros((rows + 1, n), np.int64)
-        np.cumsum(over, axis=0, out=ended_before[1:])
-        taken = np.zeros((rows + 1, n), np.int64)
-        np.cumsum(~only_reset, axis=0, out=taken[1:])
-        # What `taken` was when the episode began; its steps before the block count as taken before it.
-        began = np.where(np.vstack([np.zeros(n, np.bool_), over]), taken, -self._length)
-        np.maximum.accumulate(began, axis=0, out=began)
-        t = np.where(only_reset, schema.RESET_ONLY, taken[:-1] - began[:-1])
-        returns = self._returns(over, only_reset)
-        return _Counts(over, only_reset, ended_before, t, taken[1:] - began[:-1], returns)
+        return counts_of(over, only_reset, self._rewards[:rows], self._length, self._return)
 
-    def _returns(self, over: Flags, only_reset: Flags) -> NDArray[np.float64]:
-        """Return each episode's rewards, added one after the other: other orders round otherwise."""
-        sums = np.where(only_reset, 0.0, self._rewards[: len(over)])
-        carried = np.where(only_reset[0], 0.0, self._return)
-        begin = 0
-        for end in [*np.flatnonzero(over[:-1].any(axis=1)).tolist(), len(over) - 1]:
-            part = sums[begin : end + 1]
-            part[0] += carried
-            np.add.accumulate(part, axis=0, out=part)
-            carried = np.where(over[end], 0.0, part[-1])
-            begin = end + 1
-        return sums
-
-    def _put_records(self, counts: _Counts, first: int) -> None:
+    def _put_records(self, counts: EpisodeCounts, first: int) -> None:
         """Fill the recorder's blocks with the records of the steps."""
         rows, n = self._filled, self._n
         terminated, truncated = self._terminated[:rows], self._truncated[:rows]
@@ -358,38 +317,26 @@ class VectorRows:
         self._state = states[-1].copy()
         return states[:-1]
 
-    def _put_block_resets(self, counts: _Counts, first: int) -> None:
+    def _put_block_resets(self, counts: EpisodeCounts, first: int) -> None:
         """Record the resets between and within the steps of the block, in their order."""
         # NEXT_STEP: resets in place of a step come after those that the user called before it.
         only_rows, only = np.nonzero(counts.only_reset)
+        own = zip(only_rows.tolist(), only.tolist(), strict=True)
+        own_states = [self._autoreset_states.get(row, {}).get(i) for row, i in own]
         observed = self._observations[only_rows, only]
-        resets = [*self._block_resets, _Reset(0, only, observed, [None] * len(only), {})]
+        resets = [*self._block_resets, _Reset(0, only, observed, [None] * len(only), own_states)]
         rows = np.concatenate(
             [*(np.full(len(reset.which), reset.row) for reset in self._block_resets), only_rows]
         )
+        if not len(rows):
+            return
         order = np.argsort(rows, kind="stable")
         which = np.concatenate([reset.which for reset in resets])[order]
-        seeds = [seed for reset in resets for seed in reset.seeds]
-        states = self._states_of(only_rows, only)
-        self._put_resets(
-            which,
-            np.concatenate([reset.observation for reset in resets])[order],
-            [seeds[i] for i in order.tolist()],
-            self._episode[which] + counts.ended_before[rows[order], which],
-            first + rows[order] * self._n,
-            [states[i] for i in order.tolist()] if states else (),
-        )
-
-    def _states_of(self, only_rows: NDArray[np.intp], only: NDArray[np.intp]) -> list[ResetState | None]:
-        """Return what each reset of the block depended on, in the order of `_put_block_resets`.
-
-        The list is empty if nothing of it is to be recorded.
-        """
-        if not self._autoreset_states and not any(reset.states for reset in self._block_resets):
-            return []
-        called = [reset.states.get(i) for reset in self._block_resets for i in reset.which.tolist()]
-        alone = zip(only_rows.tolist(), only.tolist(), strict=True)
-        return called + [self._autoreset_states.get(row, {}).get(i) for row, i in alone]
+        observation = np.concatenate([reset.observation for reset in resets])[order]
+        known = [pair for reset in resets for pair in zip(reset.seeds, reset.states, strict=True)]
+        seeds, states = zip(*(known[k] for k in order.tolist()), strict=True)
+        episode = self._episode[which] + counts.ended_before[rows[order], which]
+        self._put_resets(which, observation, seeds, states, episode, first + rows[order] * self._n)
 
     def _put_ends(
         self,
@@ -416,9 +363,9 @@ class VectorRows:
         which: NDArray[np.intp],
         observation: NDArray[Any],
         seeds: Sequence[int | None],
+        states: Sequence[ResetState | None],
         episode: NDArray[Any],
         steps: NDArray[Any],
-        states: Sequence[ResetState | None] = (),
     ) -> None:
         """Record resets in their order; `steps` are the steps of the phase before each."""
         valid = [seed if seed is not None and 0 <= seed <= MAX_SEED else None for seed in seeds]

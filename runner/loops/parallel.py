@@ -1,0 +1,164 @@
+"""`runner.record_parallel`: the games of PettingZoo, in which several agents act at once."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from numbers import Integral
+from typing import Any
+
+from gymnasium import spaces
+
+from runner.environments.mdp import MAX_AGENTS
+from runner.errors import ConfigError, EnvironmentNotUsable
+from runner.loops.description import Described, kind_of
+from runner.loops.env import Recorded, given, require_pictures
+from runner.loops.generators import GeneratorWatch
+from runner.loops.loop import Loop
+from runner.loops.makers import checked_make, game_maker_of
+from runner.loops.options import options_of
+from runner.loops.single_rows import AgentRows
+from runner.loops.vector import by_field, require_fixed
+
+
+class RecordedParallel(Recorded[AgentRows]):
+    """A PettingZoo parallel environment whose every reset and step is recorded; made by `record_parallel`.
+
+    Its other attributes are those of the environment: `agents`, `action_space`, ...
+    """
+
+    def __init__(self, env: Any, loop: Loop[AgentRows]) -> None:
+        self.env = env
+        self._watch = GeneratorWatch(env)
+        self._record_into(loop)
+        self._enter("train")
+
+    def _enter(self, phase: str) -> None:
+        super()._enter(phase)
+        self._watch.due = 0
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name == "env":
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    @property
+    def unwrapped(self) -> Any:
+        """The environment inside of all wrappers."""
+        return self.env.unwrapped
+
+    def step(
+        self, actions: Mapping[str, Any], extras: Mapping[str, Mapping[str, Any]] | None = None
+    ) -> tuple[Any, Any, Any, Any, Any]:
+        """Take a step of all agents, and record it, with values of your own by agent and name."""
+        result = self.env.step(actions)
+        observations, rewards, terminated, truncated, infos = result
+        with self._loop.lock:
+            self._loop.activate(self._rows)
+            over = not self.env.agents
+            self._rows.take_game(actions, observations, rewards, terminated, truncated, over)
+            if extras is not None:
+                self._take_extras(self._extras_by_name(extras))
+        if self._options.info:
+            self._messages.info(self._phase, by_field(infos))
+        if self._options.frames_every:
+            self._record_frame(is_over=over)
+        return result  # type: ignore[no-any-return]
+
+    def _extras_by_name(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the values of agents as `agent/name`."""
+        agents = self._loop.described.agents
+        for agent, own in values.items():
+            if agent not in agents or not isinstance(own, Mapping):
+                raise ConfigError(
+                    f"extras: found {agent!r}: {type(own).__name__}, expected the values of each agent by "
+                    f"name, such as {{{agents[0]!r}: {{'value': 0.5}}}}"
+                )
+        return {f"{agent}/{name}": value for agent, own in values.items() for name, value in own.items()}
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+        """Reset the environment, and record it."""
+        state = self._watch.before(self._rows.place[0]) if seed is None else None
+        result = self.env.reset(**given(seed=seed, options=options))
+        state = self._watch.after(state, seed)
+        with self._loop.lock:
+            self._loop.activate(self._rows)
+            self._rows.reset(result[0], seed)
+            if state is not None:
+                self._messages.reset_state(self._phase, state._replace(reset=self._rows.resets - 1))
+        self._messages.reset_info(self._phase, by_field(result[1]), options, seed)
+        self._record_frame(is_reset=True)
+        return result  # type: ignore[no-any-return]
+
+
+def record_parallel(
+    env: Any,
+    recordings: str | os.PathLike[str] | None = None,
+    *,
+    name: str | None = None,
+    seed: int | None = None,
+    config: object = None,
+    info: Sequence[str] = (),
+    frames_every: int = 0,
+    frame_format: str = "png",
+    make: str | Callable[[], Any] | None = None,
+    **packing: Any,
+) -> RecordedParallel:
+    """Return a PettingZoo parallel environment, with everything that a loop does with it recorded.
+
+    Each agent of `possible_agents` has its own reward column and its own part of observation and action. A
+    step records which agents acted and for which it was the last.
+
+    Args:
+        env: a `pettingzoo.ParallelEnv`; `pettingzoo.utils.aec_to_parallel` makes one of a game in turns.
+        recordings: as for `record`.
+        name: as for `record`.
+        seed: as for `record`.
+        config: as for `record`.
+        info: names of fields of the agents' infos to record, where they occur.
+        frames_every: as for `record`; a frame shows the whole game.
+        frame_format: as for `record`.
+        make: as for `record`.
+        packing: as for `record`.
+
+    Raises:
+        EnvironmentNotUsable: a space cannot be recorded, or there are more than 31 agents.
+        ConfigError: an argument cannot be used.
+        StorageError: the recordings folder cannot be written.
+    """
+    if hasattr(env, "agent_iter") and hasattr(env, "last"):
+        raise ConfigError(
+            f"found {type(env).__name__}, a game in turns (AECEnv), expected a PettingZoo ParallelEnv: "
+            "pettingzoo.utils.aec_to_parallel makes one of many games in turns."
+        )
+    if not all(hasattr(env, part) for part in ("possible_agents", "observation_space", "action_space")):
+        raise ConfigError(
+            f"found {type(env).__name__}, expected a PettingZoo ParallelEnv with possible_agents"
+        )
+    described = _game(env)
+    require_fixed(described)
+    if frames_every:
+        require_pictures(env)
+    options = options_of(recordings, name, seed, config, info, packing, frames_every, frame_format)
+    maker = game_maker_of(env, checked_make(make))
+    return RecordedParallel(env, Loop(described, options, maker, AgentRows))
+
+
+def _game(env: Any) -> Described:
+    """Return the description of a PettingZoo parallel environment."""
+    agents = tuple(env.possible_agents)
+    if not 1 <= len(agents) <= MAX_AGENTS:
+        raise EnvironmentNotUsable(f"found {len(agents)} possible agents, expected 1 to {MAX_AGENTS}.")
+    for agent in agents:
+        if not isinstance(agent, str | Integral):
+            raise EnvironmentNotUsable(f"found the agent {agent!r}, expected a name or a number for each.")
+    observation = spaces.Dict({agent: env.observation_space(agent) for agent in agents})
+    action = spaces.Dict({agent: env.action_space(agent) for agent in agents})
+    name = env.metadata.get("name") if isinstance(getattr(env, "metadata", None), Mapping) else None
+    return Described(
+        kind=kind_of(observation, action),
+        observation=observation,
+        action=action,
+        env_id=str(name or type(env).__name__),
+        agents=agents,
+    )

@@ -1,0 +1,64 @@
+"""What follows from the ends of episodes in some steps of a vector environment."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.recording import schema
+
+Flags = NDArray[np.bool_]
+
+
+class EpisodeCounts(NamedTuple):
+    """Numbers, lengths and returns of episodes along the rows of a block; [rows, N] or [rows + 1, N]."""
+
+    over: Flags
+    only_reset: Flags
+    """Where no step was taken: the environment ignored its action and was reset."""
+    ended_before: NDArray[np.int64]
+    """Episodes that ended in the block before each row, and before its end."""
+    t: NDArray[np.int64]
+    length: NDArray[np.int64]
+    """Steps of the episode up to and including each row."""
+    returns: NDArray[np.float64]
+    """Sums of the episode's rewards up to and including each row."""
+
+
+def counts_of(
+    over: Flags,
+    only_reset: Flags,
+    rewards: NDArray[np.float64],
+    length: NDArray[np.int64],
+    carried: NDArray[np.float64],
+) -> EpisodeCounts:
+    """Return the counts of a block.
+
+    Args:
+        over: [rows, N], whether the episode ended with the step.
+        only_reset: [rows, N], where no step was taken.
+        rewards: [rows, N].
+        length: [N], the steps before the block of the episode in progress.
+        carried: [N], its return before the block.
+    """
+    rows, n = over.shape
+    ended_before, taken = np.zeros((2, rows + 1, n), np.int64)
+    np.cumsum(over, axis=0, out=ended_before[1:])
+    np.cumsum(~only_reset, axis=0, out=taken[1:])
+    # What `taken` was when the episode began; its steps before the block count as taken before it.
+    began = np.where(np.vstack([np.zeros(n, np.bool_), over]), taken, -length)
+    np.maximum.accumulate(began, axis=0, out=began)
+    t = np.where(only_reset, schema.RESET_ONLY, taken[:-1] - began[:-1])
+    # Rewards are added one after the other: other orders round otherwise.
+    sums = np.where(only_reset, 0.0, rewards)
+    carried = np.where(only_reset[0], 0.0, carried)
+    begin = 0
+    for end in [*np.flatnonzero(over[:-1].any(axis=1)).tolist(), rows - 1]:
+        part = sums[begin : end + 1]
+        part[0] += carried
+        np.add.accumulate(part, axis=0, out=part)
+        carried = np.where(over[end], 0.0, part[-1])
+        begin = end + 1
+    return EpisodeCounts(over, only_reset, ended_before, t, taken[1:] - began[:-1], sums)
