@@ -6,7 +6,7 @@ episode of T steps has T + 1 frames.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -48,54 +48,16 @@ class Episode:
     """The number of all steps of the run that were executed after each step, [T]."""
     values: tuple[NDArray[np.float64], ...]
     """For each learner the Q-values in the first T states, [T, actions]; empty if they are unknown."""
-    names: tuple[str, ...] = ()
-    """Reasons for showing it, such as `best trial`."""
     first: int = 0
     """Steps of the episode before this part."""
     before: tuple[float, ...] = ()
     """Sum of each learner's rewards in them; empty if there are none."""
-
-    @property
-    def steps(self) -> int:
-        """Number of steps of this part."""
-        return len(self.actions)
-
-    def called(self, name: str) -> Episode:
-        """Return it with one more reason for showing it, such as `best trial`."""
-        return replace(self, names=(*self.names, name))
-
-    @property
-    def heading(self) -> str:
-        """Its reasons and its title: `best trial: trial 3 of ...`."""
-        names = " and ".join(self.names)
-        text = f"{names}: {self.title}" if names else self.title
-        return text[0].upper() + text[1:]
-
-    @property
-    def description(self) -> str:
-        """Length, end and return as text, and the number of steps if these are not all."""
-        part = "" if self.steps == self.length else f" Shown are the first {self.steps:,} steps."
-        return self.outcome + part
-
-    @property
-    def outcome(self) -> str:
-        """Length, end and return as text."""
-        return outcome_in_words(self.length, self.ended, self.total)
 
 
 def outcome_in_words(length: int, ended: str, total: float | None) -> str:
     """Return length, end and return of an episode as text; a return of None is unknown."""
     rewards = "" if total is None else f" Rewards sum to {total:g}."
     return f"{length:,} step{'s' if length != 1 else ''}, {ENDINGS[ended]}.{rewards}"
-
-
-def training_episode(recording: Recording, number: int, limit: int = MAX_STEPS, first: int = 0) -> Episode:
-    """Return at most `limit` steps of a training episode, counted from 0, even if it never ended.
-
-    Raises:
-        RecordingError: there is no such episode, or no steps.
-    """
-    return episode_at(recording, place_of(recording, (number,)), limit, first)
 
 
 def trial(recording: Recording, after: int, number: int, limit: int = MAX_STEPS, first: int = 0) -> Episode:

@@ -21,7 +21,7 @@ from runner.environments.naming import (
 )
 from runner.export.contents import ENDINGS, require_steps
 from runner.export.episodes import place_of
-from runner.export.reports.episode import MAX_STEPS, Episode, episode_at
+from runner.export.reports.episode import MAX_STEPS, Episode, episode_at, outcome_in_words
 from runner.export.reports.loop_playback import loop_playback
 from runner.export.reports.player_data import (
     Grid,
@@ -88,8 +88,8 @@ def tabular_playback(recording: Recording, episode: Episode) -> Playback:
     chosen = [agent_actions(mdp, action) for action in episode.actions.tolist()]
     time = frame_times(episode.times)
     return Playback(
-        title=episode.heading,
-        description=episode.outcome,
+        title=episode.title[0].upper() + episode.title[1:],
+        description=outcome_in_words(episode.length, episode.ended, episode.total),
         length=episode.length,
         first=episode.first,
         end=ENDINGS[episode.ended],
