@@ -12,10 +12,9 @@ import numpy as np
 
 from runner.errors import ConfigError
 from runner.loops.values import as_array
+from runner.runs.checkpoints import MAX_NAME_LENGTH, is_checkpoint_name
 from runner.util.extras import require
-from runner.util.values import is_utf8
 
-MAX_NAME_LENGTH: Final = 200
 _MAX_KEYS: Final = 1 << 20
 _MAX_NUMBER: Final = 8
 """Bytes of the widest number that safetensors have."""
@@ -33,8 +32,7 @@ def content_of(name: str, value: Any, pickle: bool) -> tuple[bytes | memoryview 
         ConfigError: name or value cannot be recorded.
         MissingExtra: safetensors is not installed.
     """
-    is_valid = isinstance(name, str) and 0 < len(name) <= MAX_NAME_LENGTH and is_utf8(name)
-    if not is_valid or "@" in name or not name.isprintable():
+    if not is_checkpoint_name(name):
         raise ConfigError(
             f"checkpoint: found the name {str(name)[:80]!r}, expected printable text of 1 to "
             f"{MAX_NAME_LENGTH} letters without @"

@@ -152,8 +152,7 @@ def _game(env: Any) -> Described:
     for agent in agents:
         if not isinstance(agent, str | Integral):
             raise EnvironmentNotUsable(f"found the agent {agent!r}, expected a name or a number for each.")
-    observation = spaces.Dict({agent: env.observation_space(agent) for agent in agents})
-    action = spaces.Dict({agent: env.action_space(agent) for agent in agents})
+    observation, action = game_spaces(env)
     name = env.metadata.get("name") if isinstance(getattr(env, "metadata", None), Mapping) else None
     return Described(
         kind=kind_of(observation, action),
@@ -162,3 +161,10 @@ def _game(env: Any) -> Described:
         env_id=str(name or type(env).__name__),
         agents=agents,
     )
+
+
+def game_spaces(env: Any) -> tuple[spaces.Dict, spaces.Dict]:
+    """Return the spaces of the observations and actions of all agents of a game."""
+    agents = env.possible_agents
+    observations = spaces.Dict({agent: env.observation_space(agent) for agent in agents})
+    return observations, spaces.Dict({agent: env.action_space(agent) for agent in agents})

@@ -20,15 +20,15 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from runner.errors import CannotRedo, ConfigError, RecordingError, RunnerError
 from runner.export.minari_episodes import episodes_in
 from runner.loops.env import record
-from runner.loops.parallel import record_parallel
+from runner.loops.parallel import game_spaces, record_parallel
 from runner.loops.values import as_array
 from runner.recording.gym_spaces import restore_space
+from runner.recording.gym_values import element_of
 from runner.recording.reader import Recording, open_recording
 from runner.replay.makers import is_whole_vector, make_environment, why_not_made
 from runner.runs.checkpoints import Checkpoint
@@ -106,7 +106,7 @@ def play_checkpoint(
     is_game = maker.kind == "pettingzoo"
     origin = {"run": run.run_id, "checkpoint": checkpoint.name, "step": checkpoint.step}
     settings = {"origin": origin | {"digest": checkpoint.digest}, "policy": policy}
-    own = _game_spaces(env) if is_game else (env.observation_space, env.action_space)
+    own = game_spaces(env) if is_game else (env.observation_space, env.action_space)
     try:
         with from_policy(policy):
             act = make(weights, *own)
@@ -131,12 +131,6 @@ def _play(rec: Any, act: Policy, seed: int, name: str, is_game: bool) -> None:
             action = act(observation)
         observation, _, terminated, truncated, _ = rec.step(action)
         over = not rec.agents if is_game else terminated or truncated
-
-
-def _game_spaces(env: Any) -> tuple[spaces.Dict, spaces.Dict]:
-    agents = env.possible_agents
-    observations = spaces.Dict({agent: env.observation_space(agent) for agent in agents})
-    return observations, spaces.Dict({agent: env.action_space(agent) for agent in agents})
 
 
 @dataclass(frozen=True)
@@ -187,7 +181,7 @@ def values_along(
     steps = len(found.rewards)
     for t in range(steps):
         with from_policy(policy):
-            thought = act(_element(found.observations, t))
+            thought = act(element_of(found.observations, t))
         for name, value in _named(thought).items():
             rows.setdefault(name, []).append(value)
     try:
@@ -219,15 +213,6 @@ def _named(value: Any) -> dict[str, NDArray[Any]]:
             )
         named[str(name)] = array
     return named
-
-
-def _element(values: Any, i: int) -> Any:
-    """Return one of many values that are nested as their space."""
-    if isinstance(values, Mapping):
-        return {name: _element(part, i) for name, part in values.items()}
-    if isinstance(values, tuple):
-        return tuple(_element(part, i) for part in values)
-    return values[i]
 
 
 @contextlib.contextmanager

@@ -204,13 +204,13 @@ def put_chosen(leaves: Sequence[Leaf], values: Any, into: NDArray[Any], which: N
     """
     put = filler(leaves, into)
     for i in which.tolist():
-        put(i, _element(values, i))
+        put(i, element_of(values, i))
 
 
-def _element(values: Any, i: int) -> Any:
-    """Return the value of one environment in a batch of a `Dict` or `Tuple` space."""
+def element_of(values: Any, i: int) -> Any:
+    """Return one of many values that are nested as their space."""
     if isinstance(values, Mapping):
-        return {key: _element(part, i) for key, part in values.items() if not str(key).startswith("_")}
+        return {key: element_of(part, i) for key, part in values.items()}
     if isinstance(values, tuple):
-        return tuple(_element(part, i) for part in values)
+        return tuple(element_of(part, i) for part in values)
     return values[i]

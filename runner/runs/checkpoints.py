@@ -27,6 +27,7 @@ from runner.runs.store import DIGEST, Store
 from runner.util.extras import require
 from runner.util.files import hash_of, open_regular
 
+MAX_NAME_LENGTH: Final = 200
 FORMATS: Final = ("bytes", "file", "safetensors", "pickle")
 MAX_CHECKPOINTS: Final = 1 << 17
 """The most checkpoints that are read of a recording."""
@@ -143,6 +144,12 @@ class Checkpoint:
         return {key: getattr(self, key) for key in keys} | {"here": self.is_here, "path": str(self.path)}
 
 
+def is_checkpoint_name(name: object) -> bool:
+    """Return whether a checkpoint may have this name: printable text without `@`."""
+    is_text = isinstance(name, str) and name.isprintable() and "@" not in name
+    return is_text and 0 < len(str(name)) <= MAX_NAME_LENGTH
+
+
 def read_checkpoints(recording: Recording, recordings: Path) -> list[Checkpoint]:
     """Return the checkpoints in a recording, in order; their contents are in a recordings folder's store.
 
@@ -156,8 +163,8 @@ def read_checkpoints(recording: Recording, recordings: Path) -> list[Checkpoint]
     for fields in recording.decoded(schema.CHECKPOINT_TOPIC, _MAX_MESSAGE):
         if not (
             DIGEST.fullmatch(fields["digest"])
-            and fields["name"]
-            and fields["size"] >= 0
+            and is_checkpoint_name(fields["name"])
+            and min(fields["size"], fields["step"], fields["episode"]) >= 0
             and fields["phase"] in schema.PHASES
             and fields["format"] in FORMATS
         ):

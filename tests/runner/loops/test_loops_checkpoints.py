@@ -215,6 +215,14 @@ def test_a_digest_that_is_a_path_leads_nowhere(tmp_path):
     assert [path for path in tmp_path.rglob("*") if path.name.startswith(".") and path.is_file()] == []
 
 
+def test_a_name_that_no_recorder_writes_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("runner.loops.checkpointing.is_checkpoint_name", lambda _: True)
+    with runner.record(make("CartPole-v1"), tmp_path) as rec:
+        rec.checkpoint("\x1b[2J", b"content")
+    with pytest.raises(RecordingError, match="invalid checkpoint"):
+        rec.run.checkpoints()
+
+
 def test_a_store_that_was_damaged_is_mended_by_the_same_content(tmp_path):
     store = Store(tmp_path)
     digest, size = store.put("run", b"content")
