@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -12,9 +14,12 @@ import numpy as np
 
 from runner.analysis.diff import RunDiff, diff
 from runner.analysis.diff.sections import sections
+from runner.analysis.diff.settings import changes_in
 from runner.errors import ConfigError
 from runner.export.reports.diff import render_diff
 from runner.loops.env import record
+from runner.loops.makers import maker_of
+from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import open_recording
 from runner.replay.environment import redo
 from runner.runs.run import Run
@@ -26,6 +31,7 @@ _TRIM: Final = 0.25
 _MAX_CHANGES: Final = 8
 _CIRCUMSTANCES: Final = frozenset({"command", "created", "directory", "host", "user"})
 """Entries of provenance that cannot explain a difference."""
+_NOT_SET: Final = "not set"
 
 
 @dataclass(frozen=True)
@@ -84,7 +90,7 @@ def record_environment(make: Callable[[], Any], episodes: int, max_steps: int, r
 
 
 def compare_environment(golden: Path, make: Callable[[], Any], tolerance: float) -> str:
-    """Return where an environment first differs from a golden run of it; empty if it does not.
+    """Return where an environment first differs from a golden run of it, and why; empty if it does not.
 
     Raises:
         RecordingError: the golden run cannot be read.
@@ -93,8 +99,25 @@ def compare_environment(golden: Path, make: Callable[[], Any], tolerance: float)
     with open_recording(golden) as recording:
         for steps in redo(recording, make=make, tolerance=tolerance):
             if steps.difference is not None:
-                return str(steps.difference)
+                with closing(make()) as env:
+                    here = maker_of(env)
+                return "\n".join([str(steps.difference), *_changes(recording.maker, here)])
     return ""
+
+
+def _changes(recorded: EnvironmentMaker | None, here: EnvironmentMaker) -> list[str]:
+    """Return what differs in how an environment was made: arguments, wrappers, versions."""
+    made = [
+        {"spec": json.loads(maker.spec or "{}"), "packages": dict(maker.packages), "platform": maker.platform}
+        for maker in (recorded, here)
+        if maker is not None
+    ]
+    changes = changes_in(*made) if len(made) == 2 else []
+    rows = [
+        [change.path, *(_NOT_SET if value is None else value for value in (change.a, change.b))]
+        for change in changes
+    ]
+    return [f"  {path}: recorded {then}, here {now}" for path, then, now in rows[:_MAX_CHANGES]]
 
 
 @dataclass(frozen=True)
