@@ -26,7 +26,7 @@ from runner.recording.reader import open_recording
 from runner.recording.run_file import Summary
 from runner.service.app import create_app
 from runner.service.settings import Settings
-from tests.runner.loops.making import Rooms, dualtaxi, make, play
+from tests.runner.loops.making import dualtaxi, make, play
 
 
 def test_ls_and_show_describe_loops(folder):
@@ -263,19 +263,6 @@ def test_a_loops_steps_are_exported_as_tables(folder, form, name, tmp_path):
     if name == "rooms":
         missions = [step["next_observation"]["mission"] for step in seen]
         assert steps["next_observation_mission"].fillna("").tolist() == missions
-
-
-def test_csv_lists_the_omitted_columns(tmp_path):
-    class Camera(Rooms):
-        def __init__(self):
-            super().__init__()
-            self.observation_space = gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
-
-    with runner.record(Camera(), tmp_path / "loops", name="camera") as rec:
-        list(play(rec, 20))
-    done = dualtaxi(tmp_path / "loops", "export", "csv", "camera", "-o", str(tmp_path / "tables"))
-    assert done.exit_code == 0
-    assert "Left out, as CSV cannot hold bytes: next_observation, observation" in done.output
 
 
 def test_a_killed_loop_is_listed_repaired_and_compared(folder, tmp_path):

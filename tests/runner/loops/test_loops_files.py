@@ -7,6 +7,7 @@ import subprocess
 from collections import Counter
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 import rerun_cli
@@ -20,7 +21,7 @@ from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from runner.recording.rewriting import rewrite
-from tests.runner.loops.making import make, play
+from tests.runner.loops.making import Rooms, dualtaxi, make, play
 
 KINDS = {"FrozenLake-v1": "step", "CartPole-v1": "transition", "Rooms": "transition", "RoomsText": "variable"}
 
@@ -158,3 +159,16 @@ def test_a_description_nested_without_end_is_refused(pole, tmp_path):
     made = altered(pole, tmp_path, spaces=f'{{"observation": {deep}, "action": {{}}}}')
     with pytest.raises(RecordingError, match="describes no space"), open_recording(made) as recording:
         _ = recording.dtypes
+
+
+def test_csv_lists_the_omitted_columns(tmp_path):
+    class Camera(Rooms):
+        def __init__(self):
+            super().__init__()
+            self.observation_space = gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
+
+    with runner.record(Camera(), tmp_path / "loops", name="camera") as rec:
+        list(play(rec, 20))
+    done = dualtaxi(tmp_path / "loops", "export", "csv", "camera", "-o", str(tmp_path / "tables"))
+    assert done.exit_code == 0
+    assert "Left out, as CSV cannot hold bytes: next_observation, observation" in done.output

@@ -19,11 +19,12 @@ from runner.archive.restoring import restore
 from runner.errors import CannotRedo, ConfigError
 from runner.export.encoded import encoded_pictures
 from runner.export.pictures import Source, pictures
+from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
 from tests.runner.archive.whole import archived, contents
 from tests.runner.loops.making import N_COUNTING as N
-from tests.runner.loops.making import Counting, counting, record_counting
+from tests.runner.loops.making import Counting, Rooms, counting, play, record_counting
 
 
 def shown_states(recording, phase, episode):
@@ -153,3 +154,21 @@ def test_frames_of_earlier_versions_have_their_places_too(tmp_path, monkeypatch)
             expected = [[0, number, t] for t in range(4)]
             assert shown_states(recording, "train", number) == expected
             assert encoded_states(tmp_path / "back.mcap", "train", number) == expected
+
+
+def test_frames_are_exact_and_carry_their_moment(tmp_path):
+    plain, expected, steps, since = Rooms(), [], 0, 0
+    for entry in play(plain, 40):
+        since = 4 if entry[0] == "reset" else since - 1
+        steps += entry[0] == "step"
+        if entry[0] == "reset" or since == 0 or entry[4] or entry[5]:
+            since = 4
+            expected.append((steps, plain.render()))
+    with runner.record(Rooms(), tmp_path, frames_every=4) as rec:
+        list(play(rec, 40))
+    with open_recording(rec.run.recording) as recording:
+        found = list(recording.decoded(schema.TRAIN_FRAME))
+    assert len(expected) > 12
+    for one, (moment, pixels) in zip(found, expected, strict=True):
+        assert one["log_time"] == moment * schema.STEP_NANOSECONDS
+        assert np.array_equal(np.asarray(Image.open(io.BytesIO(one["data"]))), pixels)

@@ -350,28 +350,6 @@ def test_nothing_is_recorded_after_the_end(tmp_path):
         env.log("x", 1)
 
 
-def test_frames_are_exact_and_carry_their_moment(tmp_path):
-    from io import BytesIO
-
-    from PIL import Image
-
-    plain, expected, steps, since = Rooms(), [], 0, 0
-    for entry in play(plain, 40):
-        since = 4 if entry[0] == "reset" else since - 1
-        steps += entry[0] == "step"
-        if entry[0] == "reset" or since == 0 or entry[4] or entry[5]:
-            since = 4
-            expected.append((steps, plain.render()))
-    with runner.record(Rooms(), tmp_path, frames_every=4) as rec:
-        list(play(rec, 40))
-    with open_recording(rec.run.recording) as recording:
-        found = list(recording.decoded(schema.TRAIN_FRAME))
-    assert len(expected) > 12
-    for one, (moment, pixels) in zip(found, expected, strict=True):
-        assert one["log_time"] == moment * schema.STEP_NANOSECONDS
-        assert np.array_equal(np.asarray(Image.open(BytesIO(one["data"]))), pixels)
-
-
 def test_a_run_names_its_origin(tmp_path):
     env = make("FrozenLake-v1")
     with runner.record(env, tmp_path, name="mine", seed=4, config={"lr": 0.1, "net": [8, 8]}) as rec:
