@@ -151,6 +151,11 @@ class Recorded(Generic[R]):
         self._rows = self._loop.rows(phase)
         self._take_extras = self._loop.extras.taker(phase, self._rows)
 
+    def _steps_so_far(self) -> int:
+        """Return the number of steps of the phase; another thread may be committing some of them."""
+        with self._loop.lock:
+            return self._rows.place[0]
+
     def _record_frame(self, is_reset: bool = False, is_over: bool = False) -> None:
         """Record a picture of the last step or reset, if the options include it."""
         self._until_frame -= 1
@@ -245,7 +250,7 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Reset the environment, and record it: the seed, the options, the observation."""
         before = dict(options) if options else None  # the environment may change them
-        state = self._watch.before(self._rows.place[0]) if seed is None else None
+        state = self._watch.before(self._steps_so_far()) if seed is None else None
         result = self.env.reset(**given(seed=seed, options=options))
         state = self._watch.after(state, seed)
         observation, info = result

@@ -78,7 +78,8 @@ class RecordedParallel(Recorded[AgentRows]):
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
         """Reset the environment, and record it."""
-        state = self._watch.before(self._rows.place[0]) if seed is None else None
+        before = dict(options) if options else None  # the environment may change them
+        state = self._watch.before(self._steps_so_far()) if seed is None else None
         result = self.env.reset(**given(seed=seed, options=options))
         state = self._watch.after(state, seed)
         with self._loop.lock:
@@ -86,7 +87,7 @@ class RecordedParallel(Recorded[AgentRows]):
             self._rows.reset(result[0], seed)
             if state is not None:
                 self._messages.reset_state(self._phase, state._replace(reset=self._rows.resets - 1))
-        self._messages.reset_info(self._phase, by_field(result[1]), options, seed)
+        self._messages.reset_info(self._phase, by_field(result[1]), before, seed)
         self._record_frame(is_reset=True)
         return result  # type: ignore[no-any-return]
 

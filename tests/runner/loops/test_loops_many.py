@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import gymnasium
@@ -301,3 +302,16 @@ def test_logged_values_have_the_place_of_their_step(tmp_path):
         logged = list(recording.decoded(schema.SCALAR_TOPIC))
     assert ended > 5
     assert [(one["step"], one["episode"]) for one in logged] == expected
+
+
+def test_options_are_recorded_as_they_were_before_a_game_took_them(tmp_path):
+    class Taking(Leaving):
+        def reset(self, seed=None, options=None):
+            options.clear()
+            return super().reset(seed)
+
+    with runner.record_parallel(Taking(), tmp_path) as rec:
+        rec.reset(options={"map": "small"})
+    with open_recording(rec.run.recording) as recording:
+        (info,) = recording.decoded(schema.TRAIN_INFO)
+    assert json.loads(info["json"])["reset"] == {"options": {"map": "small"}}
