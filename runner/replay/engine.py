@@ -128,7 +128,8 @@ class Replay:
         while end < stop or resets:
             if draws and not stepper.draws and end >= first_drawn:
                 stepper.draws = True
-                if first_drawn:  # blocks were larger, and the first picture is to come at once
+                if first_drawn or self._max_rows > _MAX_PICTURES:
+                    # Blocks without pictures are larger, and the first picture is to come at once.
                     self._max_rows = 1
             begin, end = end, min(end + max(self._max_rows // width, 1), stop)
             if begin < first_drawn < end:

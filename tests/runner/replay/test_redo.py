@@ -172,6 +172,18 @@ def test_evaluations_between_training_episodes_come_out_again(is_shared, tmp_pat
     assert redone(path, "train", [7])[1] is None
 
 
+def test_few_pictures_are_in_memory_after_episodes_that_are_not_drawn(tmp_path):
+    with runner.record(gymnasium.make("Pendulum-v1"), tmp_path, seed=0) as env:
+        env.reset(seed=0)
+        for _ in range(1000):
+            if any(env.step(np.zeros(1, np.float32))[2:4]):
+                env.reset()
+    with open_recording(env.run.recording) as recording:
+        blocks = [len(b.frames) for b in redo(recording, "train", [4], render=True)]
+    assert sum(blocks) == 200
+    assert max(blocks) <= 32
+
+
 def test_a_child_process_draws_the_pictures_of_an_episode(tmp_path):
     path = record(gymnasium.make("CartPole-v1"), tmp_path, 200)
     blocks = list(redo_in_child(path, "train", [3], render=True))
