@@ -178,7 +178,10 @@ def why_not_imported(module: str, trust: bool) -> str:
         found = root in sys.modules or importlib.util.find_spec(root) is not None
     except (ImportError, ValueError):
         found = False
-    return "" if found else f"The package {root}, which the environment needs, is not installed here."
+    if found:
+        return ""
+    hint = " If it is a file of yours, put its folder into PYTHONPATH." if root not in PACKAGES else ""
+    return f"The package {root}, which the environment needs, is not installed here.{hint}"
 
 
 @cache

@@ -219,6 +219,8 @@ def test_a_package_that_is_not_installed_is_named(maker):
         assert why_not_made(missing, trust) == (
             "The package miniworld, which the environment needs, is not installed here."
         )
+    own = dataclasses.replace(maker, make="not_on_the_path:make_env")
+    assert "PYTHONPATH" in why_not_made(own, trust=True)
 
 
 def test_an_environment_of_the_script_itself_cannot_be_made_again(tmp_path):
