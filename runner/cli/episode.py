@@ -76,7 +76,7 @@ class Episode:
         from rich.text import Text
 
         recording, phase, episode = self._recording, self._phase, self._number
-        show, describe = _state_drawer(recording, phase, episode), describer(recording)
+        show, describe = _state_drawer(recording, phase, episode), describer(recording, phase)
         returns = np.zeros(len(recording.agents))
         for t, row in enumerate(transitions_of(recording, phase, episode), 1):
             if t == 1:

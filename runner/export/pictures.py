@@ -33,7 +33,7 @@ from runner.export.painting import (
     paint_scene,
     paint_values,
 )
-from runner.export.values import Values, value_in_words
+from runner.export.values import Values, action_in_words
 from runner.recording.reader import Recording
 from runner.replay.capabilities import environments_with_frames, why_not_redone
 from runner.replay.steps import check_steps, environment_of, frames_every, transitions_of
@@ -121,7 +121,7 @@ class Pictures:
 
     def _generate(self) -> Generator[Picture, None, None]:
         recording, phase, episode = self._recording, self._phase, self._episode
-        describe, painted = describer(recording), self._painted
+        describe, painted = describer(recording, phase), self._painted
         returns = np.zeros(len(recording.agents))
         none = tuple(returns.tolist())
         pixels = next(painted)
@@ -207,7 +207,7 @@ def _resumed(first: Pixels, painted: Painted) -> Painted:
         painted.close()
 
 
-def describer(recording: Recording) -> Callable[[Any], tuple[str, str]]:
+def describer(recording: Recording, phase: str) -> Callable[[Any], tuple[str, str]]:
     """Return how to put a step's action, and what happened in it, in words."""
     if recording.tabular:
         mdp, learners = recording.mdp, recording.agents
@@ -221,17 +221,15 @@ def describer(recording: Recording) -> Callable[[Any], tuple[str, str]]:
             return deeds[row["action"]], ", ".join(filter(None, [events, explored]))
 
         return describe
-    if recording.kind == "step":
-        start = recording.spaces["action"].get("start")
-        first = start if isinstance(start, int) else 0
-        return lambda row: (f"action {int(row['action']) + first}", "")
+    in_words = action_in_words(recording, phase)
     texts, agents = Values(recording.spaces["observation"], "observation"), recording.agents
 
     def describe_values(row: Any) -> tuple[str, str]:
         action = row["action"]
         if len(agents) > 1:
             action = {agent: action[agent] for i, agent in enumerate(agents) if int(row["acted"]) >> i & 1}
-        words = value_in_words(action)
-        return f"action {words}" if words.isdecimal() else words, texts.texts_in(row["next_observation"])
+        words = in_words(action)
+        words = f"action {words}" if words.removeprefix("-").isdecimal() else words
+        return words, "" if recording.kind == "step" else texts.texts_in(row["next_observation"])
 
     return describe_values

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.drawing.raster import Pixels
+from runner.environments.naming import spoken
+from runner.recording.reader import Recording
 from runner.recording.spaces import Leaf, leaves_of
 
 MAX_NUMBERS: Final = 64
@@ -79,6 +81,22 @@ def value_in_words(value: Any, limit: int = FEW) -> str:
     if array.ndim:
         return f"[{' '.join(f'{number:.3g}' for number in array.ravel().tolist())}]"
     return f"{array.item():.3g}" if array.dtype.kind == "f" else f"{array.item()}"
+
+
+def action_in_words(recording: Recording, phase: str) -> Callable[[Any], str]:
+    """Return how to put an action of a step's record in words: `left`, or its value where it has no name."""
+    start = recording.spaces["action"].get("start")
+    least = start if isinstance(start, int) else 0
+    recorded_from = 0 if recording.kind == "step" else least
+    names = [spoken(name) for name in recording.action_names(phase)]
+
+    def in_words(action: Any) -> str:
+        if not names and recording.kind != "step":
+            return value_in_words(action)
+        index = int(action) - recorded_from
+        return names[index] if 0 <= index < len(names) else str(index + least)
+
+    return in_words
 
 
 def plain_value(value: Any) -> Any:

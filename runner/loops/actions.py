@@ -1,4 +1,4 @@
-"""An action that a user gives, as text or as a value, checked against the space of an environment."""
+"""The names of an environment's actions, and an action that a user gives, checked against its space."""
 
 from __future__ import annotations
 
@@ -8,27 +8,52 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from gymnasium import spaces
+from gymnasium import ActionWrapper, spaces
+from gymnasium.wrappers import StickyAction
 
-from runner.environments.naming import actions_in_words, spoken
+from runner.environments.naming import spoken
 from runner.errors import ConfigError, nearest
 from runner.recording.gym_spaces import Space
-from runner.recording.reader import Recording
+from runner.recording.maker import MAX_NAMES
+from runner.util.values import is_text
 
 _MAX_TEXT: Final = 200
+_KNOWN: Final = {
+    "AcrobotEnv": ("torque -1", "no torque", "torque 1"),
+    "BlackjackEnv": ("stick", "hit"),
+    "CarRacing": ("nothing", "steer right", "steer left", "gas", "brake"),
+    "CartPoleEnv": ("left", "right"),
+    "CartPoleVectorEnv": ("left", "right"),
+    "LunarLander": ("no engine", "left engine", "main engine", "right engine"),
+    "MountainCarEnv": ("left", "no push", "right"),
+}
+"""The actions of Gymnasium's own environments, by class, as its documentation names them."""
 
 
-def action_names(env: Any, recording: Recording) -> list[str]:
-    """Return the names of discrete actions: of a tabular environment, Atari's, MiniGrid's; else none."""
-    if recording.tabular:
-        return [str(name) for name in actions_in_words(recording.mdp)]
-    base = getattr(env, "unwrapped", env)
-    meanings = getattr(base, "get_action_meanings", None)
-    if callable(meanings):
-        return [str(name) for name in meanings()]
-    named: Any = getattr(base, "actions", None)
-    is_enum = isinstance(named, type) and issubclass(named, enum.IntEnum)
-    return [each.name for each in named] if is_enum else []
+def action_names(env: Any, space: Space) -> tuple[str, ...]:
+    """Return the names of an environment's discrete actions, the least action's first; empty if unknown.
+
+    Args:
+        env: a Gymnasium environment, or a vector environment without its wrappers.
+        space: of the actions as the user takes them: names are only returned if there is one for each.
+    """
+    layer, base = env, getattr(env, "unwrapped", env)
+    while layer is not base:
+        if isinstance(layer, ActionWrapper) and not isinstance(layer, StickyAction):  # has other actions
+            return ()
+        layer = getattr(layer, "env", base)
+    kinds = (kind for kind in type(base).__mro__ if kind.__module__.startswith("gymnasium.envs."))
+    names: Any = next((_KNOWN[kind.__name__] for kind in kinds if kind.__name__ in _KNOWN), ())
+    meanings, named = getattr(base, "get_action_meanings", None), getattr(base, "actions", None)
+    if callable(meanings):  # as ALE has
+        try:
+            names = tuple(map(str, meanings()))
+        except Exception:  # the user's own function, by the same name, may be another thing
+            names = ()
+    elif isinstance(named, type) and issubclass(named, enum.IntEnum):  # as MiniGrid has
+        names = tuple(each.name for each in named)
+    is_complete = isinstance(space, spaces.Discrete) and int(space.n) == len(names) <= MAX_NAMES
+    return names if is_complete and all(map(is_text, names)) else ()
 
 
 def parsed_action(space: Space, given: Any, recorded: Any, names: Sequence[str], is_game: bool) -> Any:

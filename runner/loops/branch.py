@@ -214,7 +214,7 @@ class _Player:
         self._is_game, self._actions = maker.kind == "pettingzoo", actions
         self._space = copy.deepcopy(stepper.action_space)
         self._space.seed(task.seed)
-        names = action_names(env, recording)
+        names = recording.action_names(self.phase) or action_names(env, self._space)
         self._action = parsed_action(self._space, task.action, next(actions), names, self._is_game)
         self.origin = BranchOrigin(
             recording.run_id,

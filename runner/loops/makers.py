@@ -21,12 +21,13 @@ from typing import Any, Final
 import numpy as np
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorActionWrapper, VectorEnv
 from gymnasium.wrappers import HumanRendering, OrderEnforcing, PassiveEnvChecker, RecordVideo, TimeLimit
 from gymnasium.wrappers.vector import HumanRendering as VectorHumanRendering
 from gymnasium.wrappers.vector import RecordVideo as VectorRecordVideo
 
 from runner.errors import ConfigError
+from runner.loops.actions import action_names
 from runner.recording.maker import FUNCTION_NAME, MAX_SPEC, EnvironmentMaker, VectorMaker
 from runner.util.values import MAX_TEXT
 
@@ -48,7 +49,8 @@ def maker_of(env: Any, make: str = "") -> EnvironmentMaker:
     layers = list(_layers(env))
     names = tuple(_class_name(layer) for layer in layers[:-1])
     base_spec = getattr(layers[-1], "spec", None)
-    maker = EnvironmentMaker("gymnasium", make=make, wrappers=names)
+    actions = action_names(env, env.action_space)
+    maker = EnvironmentMaker("gymnasium", make=make, wrappers=names, action_names=actions)
     if not isinstance(base_spec, EnvSpec):
         top = _top(type(layers[-1]).__module__)
         return _with_versions(maker, [top], "it was not made by gymnasium.make")
@@ -100,6 +102,7 @@ def vector_maker_of(
     except _Unknown as unknown:
         reason = reason or f"{unknown}; {_NAME_MAKE}"
     names = tuple(_class_name(layer) for layer in layers[:-1])
+    has_others = any(isinstance(layer, VectorActionWrapper) for layer in layers)
     return replace(
         maker,
         kind="vector",
@@ -107,6 +110,7 @@ def vector_maker_of(
         reason=maker.reason or reason,
         assumed=tuple(assumed),
         vector=VectorMaker(int(envs.num_envs), mode, autoreset.value, names, specs),
+        action_names=() if has_others else action_names(first, envs.single_action_space),
     )
 
 

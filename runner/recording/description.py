@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from runner.environments.mdp import Mdp
+from runner.environments.naming import action_names, actions_in_words
 from runner.errors import RecordingError, RunnerError
 from runner.recording import schema
 from runner.recording.maker import MAKER_RECORD, EnvironmentMaker, parse_maker
@@ -188,6 +189,24 @@ class RunDescription(ABC):
             RecordingError: it is damaged.
         """
         return self._maker(f"{MAKER_RECORD}/{phase}") or self.maker
+
+    def action_names(self, phase: str) -> tuple[str, ...]:
+        """Return the names of the discrete actions of a phase, the least action's first; empty if unknown.
+
+        Raises:
+            RecordingError: they are damaged.
+        """
+        if self.tabular:
+            return () if action_names(self.mdp) is None else tuple(map(str, actions_in_words(self.mdp)))
+        maker = self.maker_of(phase)
+        names = () if maker is None else maker.action_names
+        space = self.spaces["action"] if names else {}
+        if names and (space["type"], space.get("n")) != ("Discrete", len(names)):
+            raise RecordingError(
+                f"{self.path}: its {MAKER_RECORD} is damaged: found {len(names)} action_names, expected one "
+                f"for each action of a {space['type']} space of {space.get('n', 'no')} actions."
+            )
+        return names
 
     def has_own_maker(self, phase: str) -> bool:
         """Return whether a phase has its own environment, which was recorded into the run of another."""

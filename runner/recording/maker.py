@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 from runner.errors import RecordingError
-from runner.util.values import MAX_TEXT, is_too_deep, is_whole
+from runner.util.values import MAX_TEXT, is_text, is_too_deep, is_whole
 
 MAKER_RECORD: Final = "environment_maker"
 """The metadata record with the maker, as JSON."""
@@ -24,7 +24,8 @@ FUNCTION_NAME: Final = re.compile(rf"{MODULE_NAME.pattern}:{MODULE_NAME.pattern}
 """`module:function`, such as `train.envs:make_env`."""
 MAX_SPEC: Final = 1 << 20
 """The most characters of a specification."""
-_MAX_NAMES: Final = 100
+MAX_NAMES: Final = 100
+"""The most wrappers, packages and names of actions."""
 _MAX_REASON: Final = 2_000
 _MAX_ENVIRONMENTS: Final = 10**7 - 1
 
@@ -77,6 +78,8 @@ class EnvironmentMaker:
     """The versions of the distributions that determine what the environment does, by name."""
     platform: str = ""
     machine: str = ""
+    action_names: tuple[str, ...] = ()
+    """The names of the actions of a `Discrete` space, the least action's first; empty if unknown."""
 
     def to_metadata(self) -> dict[str, str]:
         """Return the entries of the metadata record."""
@@ -107,6 +110,7 @@ def parse_maker(values: Mapping[str, Any], where: str) -> EnvironmentMaker:
         packages=check.versions("packages"),
         platform=check.text("platform", MAX_TEXT),
         machine=check.text("machine", MAX_TEXT),
+        action_names=check.labels("action_names"),
     )
 
 
@@ -159,14 +163,20 @@ class _Check:
 
     def names(self, key: str) -> tuple[str, ...]:
         value = self.values.get(key)
-        self.require(key, isinstance(value, list) and len(value) <= _MAX_NAMES)
+        self.require(key, isinstance(value, list) and len(value) <= MAX_NAMES)
         names = tuple(self.values[key])
         self.require(key, all(isinstance(name, str) and len(name) <= MAX_TEXT for name in names))
         return names
 
+    def labels(self, key: str) -> tuple[str, ...]:
+        """Return texts that can be shown anywhere; none if the key is missing, as in earlier recordings."""
+        labels = self.names(key) if key in self.values else ()
+        self.require(key, all(map(is_text, labels)))
+        return labels
+
     def versions(self, key: str) -> dict[str, str]:
         value = self.values.get(key)
-        self.require(key, isinstance(value, Mapping) and len(value) <= _MAX_NAMES)
+        self.require(key, isinstance(value, Mapping) and len(value) <= MAX_NAMES)
         versions = dict(self.values[key])
         texts = [text for pair in versions.items() for text in pair]
         self.require(key, all(isinstance(text, str) and len(text) <= MAX_TEXT for text in texts))

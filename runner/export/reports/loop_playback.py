@@ -28,7 +28,7 @@ from runner.export.reports.player_data import (
     short_rows,
     words,
 )
-from runner.export.values import is_image, value_in_words
+from runner.export.values import action_in_words, is_image, value_in_words
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import leaves_of
@@ -185,11 +185,9 @@ class _Reader:
     def _actions(self, records: Any) -> dict[str, list[str]]:
         """Return the actions of each agent in words; a dash where it took no part."""
         agents = self._recording.agents
-        if self._recording.kind == "step":
-            start = self._recording.spaces["action"]["start"]
-            return {"": [str(int(action) + start) for action in records["action"]]}
         if len(agents) == 1:
-            return {"": [_short_text(value_in_words(record["action"])) for record in records]}
+            in_words = action_in_words(self._recording, self._phase)
+            return {"": [_short_text(in_words(record["action"])) for record in records]}
         return {
             agent: [
                 _short_text(value_in_words(record["action"][agent])) if int(record["acted"]) >> i & 1 else "–"

@@ -23,6 +23,7 @@ from runner.export.rerun.metrics import line_colours, phase_colours, series_line
 from runner.export.rerun.scene import scene_of
 from runner.export.rerun.selection import MAX_MEMBERS, Selection, Span
 from runner.export.rerun.steps import StepWriter
+from runner.export.values import FEW
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.steps import check_steps
@@ -314,6 +315,10 @@ class LoopExporter:
                 style = rr.SeriesPoints(names=lines, colors=colours, marker_sizes=[1.5])
             self._sender("").send_static(entity, style)
             tab, title = _OVERVIEW, quantity.removeprefix("extra/")
+            actions = self._recording.action_names(phase)
+            if quantity == "action" and 0 < len(actions) <= FEW:
+                least = self._recording.spaces["action"]["start"]
+                title = f"action: {', '.join(f'{i} {name}' for i, name in enumerate(actions, least))}"
             if member.name and len(names) > 1:
                 tab, title = title.capitalize(), _spaced(member.name, title)
             if member.number < MAX_MEMBERS:

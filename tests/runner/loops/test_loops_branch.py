@@ -119,6 +119,8 @@ def test_policies_recorded_constant_and_of_the_user(runs, tmp_path, monkeypatch)
     t = middle_of(run, 0)
     constant = runner.branch(run, at=f"0:{t}", action=1, policy="constant", recordings=tmp_path)
     assert (rows(constant.run, 0)["action"][t:] == 1).all()
+    named = runner.branch(run, at=f"0:{t}", action="Right", policy="constant", recordings=tmp_path)
+    assert rows(named.run, 0).tobytes() == rows(constant.run, 0).tobytes()
     balanced = runner.branch(run, at="0:2", policy="pole_agent:balance", recordings=tmp_path, max_steps=300)
     assert balanced.outcome.length == 302
     assert balanced.outcome.end == "stopped after 300 steps"

@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -199,6 +200,36 @@ def test_a_function_of_the_script_is_recorded_by_the_name_of_the_script(tmp_path
         assert recording.maker.make == "train:make_env"
 
 
+class Swapped(gymnasium.ActionWrapper):
+    """Takes 1 for left and 0 for right."""
+
+    def action(self, action: Any) -> Any:
+        return 1 - action
+
+
+@pytest.mark.parametrize(
+    ("env", "names"),
+    [
+        (make_pole, ("left", "right")),
+        (lambda: wrappers.StickyAction(make_pole(), 0.1), ("left", "right")),
+        (lambda: Swapped(make_pole()), ()),
+        (lambda: gymnasium.make("MountainCarContinuous-v0"), ()),
+    ],
+)
+def test_actions_are_named_as_long_as_they_are_the_environments_own(env, names, tmp_path):
+    with runner.record(env(), tmp_path) as rec:
+        pass
+    with open_recording(rec.run.recording) as recording:
+        assert recording.action_names("train") == names
+
+
+def test_the_environments_of_a_vector_have_names_of_actions(tmp_path):
+    envs = SyncVectorEnv([make_pole] * 2)
+    assert maker_of(runner.record_vector(envs, tmp_path)).action_names == ("left", "right")
+    swapped = wrappers.vector.TransformAction(SyncVectorEnv([make_pole] * 2), lambda actions: 1 - actions)
+    assert maker_of(runner.record_vector(swapped, tmp_path)).action_names == ()
+
+
 # --- what comes in ------------------------------------------------------------------------------------
 
 GOOD = EnvironmentMaker(
@@ -207,11 +238,18 @@ GOOD = EnvironmentMaker(
     registered_by="ale_py",
     vector=VectorMaker(2, "sync", "Disabled"),
     packages={"a": "1"},
+    action_names=("left", "right"),
 )
 
 
 def test_a_maker_comes_back():
     assert parse_maker(json_object(GOOD.to_metadata()["json"], "it"), "it") == GOOD
+
+
+def test_a_recording_made_before_actions_had_names_is_read():
+    values = json_object(GOOD.to_metadata()["json"], "it")
+    del values["action_names"]
+    assert parse_maker(values, "it") == replace(GOOD, action_names=())
 
 
 @pytest.mark.parametrize(
@@ -222,6 +260,8 @@ def test_a_maker_comes_back():
         *(("registered_by", "os; x"), ("make", "os.system"), ("make", "a:b:c"), ("reason", "x" * 3_000)),
         *(("wrappers", "abc"), ("wrappers", ["x"] * 200), ("wrappers", [3]), ("assumed", {})),
         *(("vector", 3), ("vector", {"number": 0}), ("packages", {"a": 1}), ("machine", "x" * 300)),
+        *(("action_names", "left"), ("action_names", ["x"] * 101), ("action_names", ["x" * 201])),
+        *(("action_names", [""]), ("action_names", ["\x1b[2J"]), ("action_names", [3])),
     ],
 )
 def test_a_maker_with_an_impossible_value_is_refused(key, value):

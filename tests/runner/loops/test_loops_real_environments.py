@@ -127,6 +127,10 @@ def test_the_recorded_specification_makes_the_same_environment(name, tmp_path):
     assert not maker.assumed or name == "MiniGrid"
     assert maker.registered_by == {"Pong": "ale_py", "MiniGrid": "minigrid"}.get(name, "")
     assert maker.packages["gymnasium"] == gymnasium.__version__
+    if name == "Pong":
+        assert maker.action_names == ("NOOP", "FIRE", "RIGHT", "LEFT", "RIGHTFIRE", "LEFTFIRE")
+    if name == "MiniGrid":
+        assert maker.action_names[:3] == ("left", "right", "forward")
     with gymnasium.make(EnvSpec.from_json(maker.spec)) as made:
         assert stack(made) == expected
         assert len(maker.wrappers) == len(expected) - 1
