@@ -101,14 +101,14 @@ def _typical_start(recording: Recording) -> int:
 def difference(a: Run, b: Run) -> bytes:
     """Return the difference of two runs as JSON.
 
-    Its keys: `lead`, `notes`, `first_step` (the first step that differs; may be null), `body` and `tables`.
+    Its keys: `lead`, `notes`, `first_frame` (of the replays, that differs; may be null), `body` and `tables`.
     """
     with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
         view = difference_view(without_ignored(with_seconds(diff(ours, theirs), a, b), ()), ours, theirs)
 
     def linked(shown: ShownDivergence) -> ShownDivergence:
         runs = [a.run_id, b.run_id]
-        both = link("/compare/replay", {"run": runs, "at": str(shown.step.outcome)})
+        both = link("/compare/replay", {"run": runs, "at": str(shown.frame)})
         viewers = [
             Link(f"{letter} in Rerun", link(f"/runs/{run}/rerun", {"at": str(place)}))
             for letter, run, place in zip("AB", runs, places_in([a, b], shown.step), strict=True)
@@ -121,7 +121,7 @@ def difference(a: Run, b: Run) -> bytes:
     found = {
         "lead": view.lead,
         "notes": view.notes,
-        "first_step": str(view.divergences[0].step) if view.divergences else None,
+        "first_frame": str(view.divergences[0].frame) if view.divergences else None,
         "body": "".join(body),
         "tables": shown.tables(view.tables, view.table_figures),
     }

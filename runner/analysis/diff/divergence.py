@@ -63,7 +63,18 @@ class Divergence:
     after: int | None = None
     """Training episodes before that evaluation; None in training."""
     trained: tuple[int, int] | None = None
-    """Training steps before that evaluation, in A and in B; None in training."""
+    """Training steps before that evaluation, in A and in B; None in training and of loops."""
+
+    @property
+    def reference(self) -> StepRef:
+        """The step."""
+        return StepRef(self.episode, self.t, self.after)
+
+    @property
+    def frame(self) -> StepRef:
+        """The first frame of a replay that differs: the one after the step, unless it began differently."""
+        began = self.field == "state" or self.field.startswith("reset.")
+        return self.reference if began else self.reference.outcome
 
 
 def first_difference(
@@ -220,6 +231,22 @@ def loop_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None
 
     If they diverge in what a reset observed, it is the step after it, and the field is `reset.observation`.
     """
+    found = _first_in_phase(a, b, phase)
+    if found is None or phase == "train":
+        return found
+    for recording in (a, b):
+        for one in evaluations_of(recording):
+            if one.start <= found.episode < one.stop:
+                return replace(
+                    found, episode=found.episode - one.start, evaluation=one.number, after=one.after
+                )
+    after = a.count(schema.TRAIN_EPISODE)  # the trial was not finished in either run, so it is after all
+    start = next((one.start for one in evaluations_of(a) if one.after == after), a.count(schema.EVAL_EPISODE))
+    return replace(found, episode=found.episode - start, after=after)
+
+
+def _first_in_phase(a: Recording, b: Recording, phase: str) -> Divergence | None:
+    """Return the same; the number of a trial is that among all evaluations."""
     topics = [recording.topic(f"/{phase}/step") for recording in (a, b)]
     if topics[0] not in a.dtypes:
         return _message_divergence(a, b, phase)

@@ -139,7 +139,7 @@ def _training(difference: RunDiff) -> Section:
         sentences += [f"They diverge {where_in_words(divergence)}: {cause.text}.", *updates_in_words(cause)]
         grids += _q_rows(cause)
     elif divergence is not None:
-        sentences.append(_loop_divergence(divergence))
+        sentences.append(": ".join(loop_divergence_in_words(divergence)) + ".")
     elif overlap is not None:
         sentences.append("Training is the same, step by step.")
     if divergence is not None:
@@ -180,19 +180,23 @@ def _evaluation(difference: RunDiff) -> Section:
     if divergence is None:
         return Section("Evaluation")
     if cause is None:
-        return Section("Evaluation", [_loop_divergence(divergence)])
+        return Section("Evaluation", [": ".join(loop_divergence_in_words(divergence)) + "."])
     where = f"They diverge {where_in_words(divergence)}: {cause.text}."
     return Section("Evaluation", [where, *evaluation_updates(difference, cause)], _q_rows(cause))
 
 
-def _loop_divergence(divergence: Divergence) -> str:
+def loop_divergence_in_words(divergence: Divergence) -> tuple[str, str]:
+    """Return where two loops diverge, and the values that differ there: sentences without full stops."""
     phase = "training" if divergence.phase == "train" else "evaluation"
-    where = f"at {phase} step {divergence.step:,}, of episode {divergence.episode:,} at time {divergence.t:,}"
+    episode = f"episode {divergence.episode:,}"
+    if divergence.after is not None:
+        episode = f"trial {divergence.episode:,} after {divergence.after:,} training episodes"
+    where = f"at {phase} step {divergence.step:,}, of {episode} at time {divergence.t:,}"
     field = divergence.field.removeprefix("reset.")
     if field != divergence.field:
-        where = f"in the reset before {phase} step {divergence.step:,}, of episode {divergence.episode:,}"
+        where = f"in the reset before {phase} step {divergence.step:,}, of {episode}"
     values = f"{_text(divergence.a)} in A, {_text(divergence.b)} in B"
-    return f"They diverge {where}: {spoken(field)} is {values}."
+    return f"They diverge {where}", f"{spoken(field)} is {values}"
 
 
 def evaluation_updates(difference: RunDiff, cause: Cause) -> list[str]:

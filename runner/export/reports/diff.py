@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final, NamedTuple
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from runner.analysis.diff import Cause, Divergence, Row, RunDiff
 from runner.analysis.diff.sections import (
     evaluation_updates,
+    loop_divergence_in_words,
     overlap_in_words,
     sections,
     summary,
@@ -54,6 +55,8 @@ class ShownDivergence:
 
     id: str
     step: StepRef
+    frame: StepRef
+    """The first frame of the replays that differs."""
     title: str
     where: str
     cause: str
@@ -135,9 +138,9 @@ def difference_view(
         divergences=[
             _divergence(difference, divergence, cause, a, b)
             for divergence, cause in pairs
-            if divergence is not None and cause is not None
+            if divergence is not None
         ],
-        training=_training(parts, difference),
+        training=overlap_in_words(difference),
         visits=visits_grids(difference),
         plots=list(plots),
         metrics_section=parts["Metrics"],
@@ -148,34 +151,33 @@ def difference_view(
     )
 
 
-def _training(parts: Mapping[str, Section], difference: RunDiff) -> list[str]:
-    """Return how much of training is the same, and where loops diverge, for which there is no picture."""
-    sentences = overlap_in_words(difference)
-    if difference.divergence is not None and difference.cause is None:
-        sentences += parts["Training"].sentences
-    if difference.evaluation_divergence is not None and difference.evaluation_cause is None:
-        sentences += parts["Evaluation"].sentences
-    return sentences
-
-
 def _divergence(
-    difference: RunDiff, divergence: Divergence, cause: Cause, a: Recording, b: Recording
+    difference: RunDiff, divergence: Divergence, cause: Cause | None, a: Recording, b: Recording
 ) -> ShownDivergence:
-    where, is_training = where_in_words(divergence), divergence.phase == "train"
+    is_training = divergence.phase == "train"
+    if cause is None:
+        where, why = loop_divergence_in_words(divergence)
+        updates: list[str] = []
+    else:
+        where, why = where_in_words(divergence), cause.text
+        updates = updates_in_words(cause) if is_training else evaluation_updates(difference, cause)
     return ShownDivergence(
         id=f"divergence-{divergence.phase}",
-        step=StepRef(divergence.episode, divergence.t, divergence.after),
+        step=divergence.reference,
+        frame=divergence.frame,
         title="Where training diverges" if is_training else "Where an evaluation diverges",
         where=where[0].upper() + where[1:],
-        cause=cause.text[0].upper() + cause.text[1:],
-        updates=updates_in_words(cause) if is_training else evaluation_updates(difference, cause),
+        cause=why[0].upper() + why[1:],
+        updates=updates,
         pictures=list(_pictures(divergence, a, b)),
-        rows=[_values(row) for row in cause.rows],
+        rows=[_values(row) for row in (() if cause is None else cause.rows)],
     )
 
 
 def _pictures(divergence: Divergence, a: Recording, b: Recording) -> Iterator[StepPicture]:
     """Yield the grid before the step, if that is the same in both runs, and after it in each."""
+    if not (a.tabular and b.tabular):
+        return
     same_scene = a.environment.get("scene") == b.environment.get("scene")
     steps = [step for step in (divergence.a_step, divergence.b_step) if step is not None]
     other_starts = len({int(step["state"]) for step in steps}) > 1

@@ -102,8 +102,7 @@ def locate_divergence(runs: Sequence[Run]) -> tuple[StepRef | None, str]:
             divergence = next(evaluation_divergences(a, b), None)
             if divergence is None:
                 return None, f"They never diverge: every step is the same{suffix}."
-    step = StepRef(divergence.episode, divergence.t, divergence.after)
-    return step, f"They diverge {where_in_words(divergence)}."
+    return divergence.reference, f"They diverge {where_in_words(divergence)}."
 
 
 def _default_time(recording: Recording, request: Request) -> int:

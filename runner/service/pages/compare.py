@@ -171,8 +171,8 @@ async def replay(
     if at:
         step = StepRef.parse(at)
     else:
-        first = (await _difference(runs, cache, processes))["first_step"]
-        step = StepRef.parse(first).outcome if first else StepRef(0)
+        first = (await _difference(runs, cache, processes))["first_frame"]
+        step = StepRef.parse(first) if first else StepRef(0)
     names, places = [each.run_id for each in runs], places_in(runs, step)
 
     def neighbour(by: int) -> str:

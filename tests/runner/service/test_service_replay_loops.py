@@ -490,6 +490,61 @@ def test_nothing_sticks_out_of_a_narrow_page(opened, name):
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory):
+    """Return recordings of loops that play alike but for one action, a seed, or the number of episodes."""
+    folder = tmp_path_factory.mktemp("pairs") / "recordings"
+
+    def record(name, seed=1, episodes=3, other=None):
+        with runner.record(gymnasium.make("CartPole-v1"), folder, name=name) as rec:
+            for phase in ("train", "eval"):
+                rng = np.random.default_rng(0)
+                with rec.phase(phase):
+                    for episode in range(episodes):
+                        rec.reset(seed=seed if episode == 0 else None)
+                        over, t = False, 0
+                        while not over:
+                            action = int(rng.integers(2)) ^ ((phase, episode, t) == other)
+                            *_, terminated, truncated, _ = rec.step(action)
+                            over, t = terminated or truncated, t + 1
+
+    record("first")
+    record("again")
+    record("seeded", seed=2)
+    record("trained", other=("train", 2, 5))
+    record("tried", other=("eval", 1, 3))
+    record("shorter", episodes=2)
+    for name in ("lake", "slipped"):
+        with runner.record(gymnasium.make("Taxi-v4"), folder, name=name) as rec:
+            rec.reset(seed=0)
+            for t in range(20):
+                rec.step(4 if (name, t) == ("slipped", 7) else t % 4)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "episode", "at"),
+    [
+        ("first", "again", "Training episode 0", "0:0"),
+        ("first", "seeded", "Training episode 0", "0:0"),
+        ("first", "trained", "Training episode 2", "2:6"),
+        ("trained", "first", "Training episode 2", "2:6"),
+        ("first", "tried", "Trial 1 of the evaluation after 3 episodes", "eval:3:1:4"),
+        ("shorter", "first", "Training episode 2", "2:1"),
+        ("lake", "slipped", "Training episode 0", "0:8"),
+    ],
+)
+def test_two_loops_are_compared_from_where_they_diverge(pairs, tmp_path, a, b, episode, at):
+    settings = Settings(recordings=(pairs,), tokens=tmp_path / "tokens.json")
+    with TestClient(create_app(settings), base_url="http://localhost") as client:
+        page = client.get(f"/compare/replay?run={a}&run={b}").text
+        assert f"<h2>{episode}</h2>" in page
+        assert f'name="at" value="{at}"' in page
+        where = client.get(f"/compare/divergence?run={a}&run={b}").text
+        assert ("Both replays at this step" in where) == (b != "again")
+        assert (f'at={at.replace(":", "%3A")}"' in where) == (b != "again")
+
+
 def test_a_branch_is_listed_by_its_parent_and_shown_next_to_it(tmp_path):
     folder = tmp_path / "recordings"
     play(gymnasium.make("CartPole-v1"), folder, "pole")
@@ -516,3 +571,6 @@ def test_a_branch_is_listed_by_its_parent_and_shown_next_to_it(tmp_path):
         assert "B is a branch of A, at 2:3, action 0, then constant" in divergence
         assert f"/runs/{run.run_id}/rerun?at=2%3A" in divergence
         assert f"/runs/{trained}/rerun?at=0%3A" in divergence
+        for branch, episode, t in ((trained, "2", 3), (tried, "eval:4:1", 2)):
+            unplaced = client.get(f"/compare/replay?run={run.run_id}&run={branch}").text
+            assert int(re.search(f'name="at" value="{episode}:([0-9]+)"', unplaced)[1]) > t
