@@ -136,7 +136,7 @@ def test_a_part_has_the_recorded_values_from_the_reset_on(client, folder, addres
     steps = steps_of(folder, "pole", phase, episode)
     whole = part(client, f"pole/replay/{address}")
     assert whole["length"] == len(steps) == len(whole["reward"])
-    assert taken(whole["actions"][0]) == [str(action) for action in steps["action"]]
+    assert taken(whole["actions"][0]) == [("left", "right")[action] for action in steps["action"]]
     with open_recording(find_run("pole", folder).recording) as recording:
         first = [reset["observation"].copy() for reset in recording.resets(phase)][episode]
     for k, series in enumerate(whole["series"]):
