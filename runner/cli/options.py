@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -253,10 +254,20 @@ accept_changes_option: Final = click.option(
     is_flag=True,
     help="Resume although code, environment, file or numerical libraries have changed.",
 )
+
+
+def _trusted(_context: click.Context, _option: click.Parameter, value: bool) -> bool:
+    """Find modules in the current folder too, as Python does for a script there."""
+    if value and str(Path.cwd()) not in sys.path:
+        sys.path.append(str(Path.cwd()))
+    return value
+
+
 trust_option: Final = click.option(
     "--trust",
     is_flag=True,
-    help="Import what the recording names to make its environment again: run code that you trust only.",
+    callback=_trusted,
+    help="Import what the recording names, also from the current folder: run code that you trust only.",
 )
 checkpoint_option: Final = click.option(
     "--checkpoint", metavar="[NAME]@STEP", help="The last checkpoint at or before this step, of this name."

@@ -45,6 +45,8 @@ class Redone:
     """Steps that were compared; all before the first difference were equal."""
     left_out: int = 0
     """Steps that could not be compared: the random generators' state at their beginning was not recorded."""
+    cut_off: int = 0
+    """Steps at the end that could not be compared: their resets were lost when the loop was killed."""
     difference: Difference | None = None
     """The first difference; of an impossible verdict that with which the environment was found out."""
     reason: str = ""
@@ -117,8 +119,12 @@ def _compare(path: Path, sample: int | None, tolerance: float, trust: bool) -> N
 
 def _compare_all(recording: Recording, tolerance: float, trust: bool) -> Redone:
     found = Redone("reproduced", tolerance=tolerance)
+    left = {phase: recording.count(recording.topic(f"/{phase}/step")) for phase in schema.PHASES}
     with closing(Replay(recording, trust, tolerance, report_progress, render=False)) as replay:
         for steps in replay.all():
+            if len(steps):
+                recorded = recording.count(recording.topic(f"/{steps.phase}/step"))
+                left[steps.phase] = min(left[steps.phase], recorded - 1 - int(steps.step[-1]))
             found = replace(
                 found,
                 episodes=found.episodes + int(np.count_nonzero(steps.t == 0)),
@@ -126,6 +132,8 @@ def _compare_all(recording: Recording, tolerance: float, trust: bool) -> Redone:
                 difference=steps.difference,
             )
         found = replace(found, left_out=replay.skipped)
+    if found.difference is None and "content_digest" not in recording.result:
+        found = replace(found, cut_off=sum(left.values()))
     if found.difference is not None:
         return replace(found, verdict="differs")
     if not found.steps:

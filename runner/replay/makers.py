@@ -215,12 +215,16 @@ def _made_by_function(name: str, render: bool) -> Any:
     if not render:
         return make()
     parameters = inspect.signature(make).parameters.values()
-    if not any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters):
+    if any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters):
+        return make(render_mode="rgb_array")
+    env = make()
+    if getattr(env, "render_mode", None) != "rgb_array":
+        env.close()
         raise CannotRedo(
             f"{name} makes environments that draw no pictures: give it an argument render_mode, and "
             "pass it to gymnasium.make."
         )
-    return make(render_mode="rgb_array")
+    return env
 
 
 def _wrapper(entry_point: str, base: type) -> Any:

@@ -180,7 +180,11 @@ def why_not_imported(module: str, trust: bool) -> str:
         found = False
     if found:
         return ""
-    hint = " If it is a file of yours, put its folder into PYTHONPATH." if root not in PACKAGES else ""
+    hint = (
+        " If it is a file of yours, run the command in its folder, or put that into PYTHONPATH."
+        if root not in PACKAGES
+        else ""
+    )
     return f"The package {root}, which the environment needs, is not installed here.{hint}"
 
 

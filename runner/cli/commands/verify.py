@@ -120,6 +120,8 @@ def _redone(redone: Redone) -> dict[str, str]:
         notes.append(
             f"{redone.left_out:,} steps were left out: the random generators before them are not known"
         )
+    if redone.cut_off:
+        notes.append(f"the last {redone.cut_off:,} steps were left out: their resets were lost in the kill")
     rows["done again"] = "\n".join(notes)
     if redone.verdict != "reproduced":
         rows["differs"] = "\n".join(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import gymnasium
 import pytest
@@ -99,3 +101,37 @@ def test_damage_is_reported_and_nothing_is_done_again(recordings, tmp_path):
     assert code == 1
     assert "wrong" in output
     assert "reproduced" not in output
+
+
+OWN = """
+import sys
+
+import gymnasium
+
+import runner
+
+def make_env():
+    env = gymnasium.make("CartPole-v1", render_mode="rgb_array")
+    return gymnasium.wrappers.TransformReward(env, lambda reward: 2 * reward)
+
+if __name__ == "__main__":
+    with runner.record(make_env(), "recordings", name="own", make="own_pole:make_env") as env:
+        env.reset(seed=0)
+        while not any(env.step(0)[2:4]):
+            pass
+"""
+
+
+def test_a_function_of_a_file_in_the_current_folder_makes_the_environment_of_a_trusted_recording(tmp_path):
+    (tmp_path / "own_pole.py").write_text(OWN)
+
+    def run(*words):
+        return subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    done = run(sys.executable, "own_pole.py")
+    assert done.returncode == 0, done.stderr
+    command = (sys.executable, "-P", "-m", "runner")  # without the current folder, as `dualtaxi`
+    assert "--trust" in run(*command, "verify", "own").stdout
+    assert "reproduced: 1 episodes" in run(*command, "verify", "own", "--trust").stdout
+    done = run(*command, "export", "film", "own", "--episode", "0", "--trust", "-o", "own.gif")
+    assert "pictures drawn again" in done.stdout + done.stderr
