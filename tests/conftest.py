@@ -1,4 +1,4 @@
-"""What all tests share: a cache folder of their own, and drawing without a display."""
+"""What all tests share: a cache folder of their own, drawing without a display, properties without deadlines."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import os
 import sys
 from collections.abc import Iterator
 
+import hypothesis
 import pytest
 
+hypothesis.settings.register_profile("untimed", deadline=None)  # a loaded machine is no reason to fail
+hypothesis.settings.load_profile("untimed")
 if sys.platform == "linux":
     os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported
 

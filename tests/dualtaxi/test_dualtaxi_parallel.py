@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -11,7 +12,10 @@ from gymnasium.error import ResetNeeded
 
 pytest.importorskip("pettingzoo")
 
-from pettingzoo.test import parallel_api_test, parallel_seed_test, seed_test
+with warnings.catch_warnings(
+    action="ignore", category=DeprecationWarning
+):  # PettingZoo's own, about its games
+    from pettingzoo.test import parallel_api_test, parallel_seed_test, seed_test
 from pettingzoo.utils import parallel_to_aec
 
 from dualtaxi import DualTaxiEnv

@@ -64,7 +64,7 @@ def test_environments_in_parallel_are_distinguished():
         assert recording.environments == 3
         steps = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
         assert len(steps) == 80 * 3
-        assert (steps["t"] == schema.NEVER).any()
+        assert (steps["t"] == schema.RESET_ONLY).any()
     with open_recording(DATA / "game.mcap") as recording:
         played = list(recording.transitions("train"))
         assert [int(one["acted"]) for one in played[:3]] == [0b111, 0b110, 0b100]
