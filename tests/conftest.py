@@ -1,4 +1,4 @@
-"""What all tests share: a cache folder of their own, drawing without a display, properties without deadlines."""
+"""What all tests share: an own cache folder, drawing without a display, properties without deadlines."""
 
 from __future__ import annotations
 
