@@ -132,7 +132,7 @@ class Evaluation:
 
 def evaluations_of(recording: Recording) -> list[Evaluation]:
     """Return a run's evaluations: those with metrics; of a loop, its trials between training episodes."""
-    if recording.is_job:
+    if recording.has_reports:
         return [
             Evaluation(
                 after=int(metrics["episode"]),
@@ -180,7 +180,7 @@ def evaluation_records(recording: Recording) -> list[EvaluationRecord]:
     finite are left out of their means.
     """
     agents, events = recording.agents, recording.event_names
-    if recording.is_job:
+    if recording.has_reports:
         return [evaluation_record(metrics, agents, events) for metrics in recording.metrics("eval")]
     trials = recording.episodes("eval")
     return [_loop_record(recording, one, trials[one.start : one.stop]) for one in evaluations_of(recording)]

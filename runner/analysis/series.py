@@ -164,7 +164,7 @@ def read_series(recording: Recording) -> RunSeries:
     not_finite: Counter[str] = Counter()
     evaluations = evaluation_records(recording)
     config = recording.config
-    if recording.is_job:
+    if recording.has_reports:
         agents = recording.agents
         exact = {each["evaluation"]: exact_readings(each, agents) for each in recording.optimality()}
         readings = [evaluation_readings(each) | exact.get(each.number, {}) for each in evaluations]

@@ -137,7 +137,7 @@ def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> Ru
                         for measures in recording.optimality()
                     ),
                     training=tuple(training_records(recording)),
-                    loop=None if recording.is_job else loop_summary(recording),
+                    loop=None if recording.has_reports else loop_summary(recording),
                     extras=_extras(recording),
                     checkpoints=tuple(read_checkpoints(recording, run.folder.parent)),
                 )
@@ -163,7 +163,7 @@ def random_policy_sentence(recording: Recording) -> str:
     """
     from runner.planning import random_baseline
 
-    if not recording.is_job or recording.config["algorithm"] == "random":
+    if not recording.has_tables or recording.config["algorithm"] == "random":
         return ""
     baseline = random_baseline(recording.mdp)
     return baseline.sentence if baseline else ""
@@ -180,7 +180,7 @@ def _loop_as_json(loop: Summary) -> dict[str, Any]:
 
 def _tables(recording: Recording) -> tuple[TableFill, ...]:
     """Return the fill of each table; nothing of a loop, whose learning is its own."""
-    if not recording.is_job:
+    if not recording.has_tables:
         return ()
     reports = [*recording.metrics("train"), *recording.metrics("eval")]
     last = max(reports, key=lambda report: report["step"], default=None)

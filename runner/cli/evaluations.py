@@ -75,13 +75,13 @@ def _events(names: Iterable[str], success_events: Sequence[str]) -> list[_Event]
 def _measures(records: Sequence[EvaluationRecord]) -> Columns:
     """Return the columns of the metrics; of a loop also the returns, and only the metrics that it has."""
     columns = {"episode": [f"{record.episode:,}" for record in records]}
-    is_job = all(record.training for record in records)
-    if not is_job:
+    has_reports = all(record.training for record in records)
+    if not has_reports:
         columns["trials"] = [f"{record.trials:,}" for record in records]
     for metric in METRICS:
         values = [record.values[metric.name].values() for record in records]
         is_known = any(value is not None for own in values for value in own)
-        if not metric.per_agent if is_job else metric.per_agent or is_known:
+        if not metric.per_agent if has_reports else metric.per_agent or is_known:
             columns[metric.heading] = ["/".join(map(number, own)) for own in values]
     return columns
 

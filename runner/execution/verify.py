@@ -71,8 +71,8 @@ class Verification:
     """The differences between the recording's provenance and this process's."""
     not_compared: str = ""
     """What of the recording was not compared."""
-    is_loop: bool = False
-    """Whether it is of a user's own loop, whose steps `runner.execution.redo` does again."""
+    needs_redo: bool = False
+    """Whether its steps are compared with their environment by `runner.execution.redo` only."""
     nothing_yet: bool = False
     """Whether the run was interrupted before it recorded anything."""
 
@@ -172,7 +172,7 @@ def _verify_content(recording: Recording, rerun: bool, report: Report) -> Verifi
         )
         finding = f"{recording.path}: {holes}: lost in a repair. `dualtaxi resume` runs the job again."
         return replace(found, finding=finding)
-    if not recording.is_job:
+    if not recording.can_train_again:
         return _verify_loop(recording)
     job = Job(from_mapping(recording.config), recording.seed or 0)
     if recording.job != job.identity:
@@ -279,7 +279,7 @@ def _verify_loop(recording: Recording) -> Verification:
         train_steps=recording.count(schema.TRAIN_STEP),
         eval_steps=recording.count(schema.EVAL_STEP),
         not_compared=LOOP_NOT_COMPARED,
-        is_loop=True,
+        needs_redo=True,
     )
     try:
         _compare_names(recording)

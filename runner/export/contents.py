@@ -29,7 +29,7 @@ def shortcomings(recording: Recording) -> list[str]:
     sentences, status = [], recording.status
     if status != "finished":
         recorded = "its loop is recorded up to its last step"
-        if recording.is_job:
+        if recording.can_train_again:
             planned = recording.config.get("episodes")
             of = f" of {planned:,}" if is_whole(planned, 0, 2**63) else ""
             recorded = f"there are {recording.count(schema.TRAIN_EPISODE):,}{of} training episodes"

@@ -152,7 +152,7 @@ def _log_metrics(client: Any, run_id: str, recording: Recording, names: dict[str
     from mlflow.entities import Metric
 
     end = began = created(recording)
-    phases = () if recording.is_job else ("train", "eval")
+    phases = () if recording.has_reports else ("train", "eval")
     moments = chain(measures(recording), *(episodes(recording, phase) for phase in phases))
     metrics = (
         Metric(_name(name, names), value, round((began + moment.seconds) * 1000), moment.step)

@@ -171,7 +171,7 @@ def source_of(
     is_complete = recorded is Source.RECORDED and frames_every(recording) == 1
     if recorded is Source.SCENE or is_complete:
         return recorded, ""
-    if recording.is_job:
+    if recording.can_train_again:
         return recorded, "The environment has no scene."
     reason = why_not_redone(recording, trust)
     return (recorded, reason) if reason else (Source.REDRAWN, "")

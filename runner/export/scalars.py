@@ -84,7 +84,7 @@ def measures(recording: Recording) -> Iterator[Measures]:
             yield _measures(phase, row, values)
     for row in recording.optimality():
         yield _measures("eval", row, _named(row, exact_values, agents))
-    if not recording.is_job:
+    if not recording.has_reports:
         for scalar in recording.decoded(SCALAR_TOPIC):
             if math.isfinite(scalar["value"]):
                 position, phase = scalar["log_time"] // STEP_NANOSECONDS, scalar["phase"]

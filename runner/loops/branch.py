@@ -167,7 +167,7 @@ def _record_branch(path: Path, folder: Path, task: _Task) -> None:
     """Record a branch; report the steps taken, then its run id, its origin, and why it stopped early."""
     os.chdir(task.user_folder)
     with open_recording(path) as recording:
-        if recording.is_job:
+        if recording.can_train_again:
             raise RunnerError(
                 f"run {recording.run_id} was trained here; only episodes of loops are branched: runs whose "
                 "environment runner.record wrapped."

@@ -147,6 +147,21 @@ class RunDescription(ABC):
         return kind_of(self.run)
 
     @property
+    def has_tables(self) -> bool:
+        """Whether the Q-tables at any step are known: each update of them follows from the recorded steps."""
+        return self.kind == "job"
+
+    @property
+    def has_reports(self) -> bool:
+        """Whether training and evaluations are reported in messages; else they follow from the episodes."""
+        return self.kind == "job"
+
+    @property
+    def can_train_again(self) -> bool:
+        """Whether training the configuration again gives the same content."""
+        return self.kind == "job"
+
+    @property
     def is_job(self) -> bool:
         """Whether the runner itself learned it, from a configuration; else it was recorded from a loop."""
         return self.kind == "job"

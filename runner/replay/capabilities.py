@@ -19,7 +19,7 @@ def environments_with_frames(recording: Recording, phase: str) -> Sequence[int]:
 
 def why_not_redone(recording: Recording, trust: bool = False) -> str:
     """Return why the recorded actions cannot be repeated in the environment; empty if it can be tried."""
-    if recording.is_job:
+    if recording.can_train_again:
         return "The run was trained here: `dualtaxi verify` trains it again instead."
     if not recording.has_steps:
         return "No steps were recorded."

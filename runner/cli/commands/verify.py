@@ -88,11 +88,11 @@ def verify_command(
     with job_progress("verifying", episodes) as (report, _):
         found = verify(path, bool(rerun), report, damage)
     redone = None
-    if found.is_loop and found.sound and not found.nothing_yet and rerun is not False:
+    if found.needs_redo and found.sound and not found.nothing_yet and rerun is not False:
         steps = found.train_steps + found.eval_steps
         with count_line("steps done again", 0 if sample else steps) as count:
             redone = verify_by_redoing(path, sample, tolerance, trust, count)
-    with_installed = bool(rerun) and not found.is_loop
+    with_installed = bool(rerun) and not found.needs_redo
     if as_json:
         print_json(_verification_as_json(found, with_installed) | (_redone_as_json(redone) if redone else {}))
     else:

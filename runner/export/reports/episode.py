@@ -115,7 +115,7 @@ def _values(
     recording: Recording, steps: NDArray[np.void], table_step: int
 ) -> tuple[NDArray[np.float64], ...]:
     """Return each learner's Q-values in the states of steps; empty if they are unknown."""
-    if not recording.is_job:
+    if not recording.has_tables:
         return ()
     try:
         if table_step >= 0:

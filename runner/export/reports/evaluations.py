@@ -21,22 +21,22 @@ class EvaluationTable:
 
 
 def evaluation_table(
-    records: Sequence[EvaluationRecord], agents: Sequence[str], event_names: Sequence[str], is_job: bool
+    records: Sequence[EvaluationRecord], agents: Sequence[str], event_names: Sequence[str], has_reports: bool
 ) -> EvaluationTable:
     """Return records of evaluations as a table; one of a loop leaves out metrics that it does not know."""
     metrics = [
         metric
         for metric in METRICS
-        if is_job or any(record.value(metric.name) is not None for record in records)
+        if has_reports or any(record.value(metric.name) is not None for record in records)
     ]
-    headings = ["episode"] if is_job else ["episode", "trials"]
+    headings = ["episode"] if has_reports else ["episode", "trials"]
     for metric in metrics:
         whose = [f" {spoken(agent)}" for agent in agents] if metric.per_agent and len(agents) > 1 else [""]
         headings += [f"{metric.heading}{agent}" for agent in whose]
     headings += [_event_heading(name) for name in event_names]
     rows = []
     for record in records:
-        cells = [f"{record.episode:,}"] if is_job else [f"{record.episode:,}", f"{record.trials:,}"]
+        cells = [f"{record.episode:,}"] if has_reports else [f"{record.episode:,}", f"{record.trials:,}"]
         for metric in metrics:
             cells += map(humanize.number, record.values[metric.name].values())
         cells += [f"{count:,}" for count in record.events.values()]
@@ -46,11 +46,11 @@ def evaluation_table(
     explanation = (
         f"Each row: {records[0].trials} trials with the greedy policy after that number of training "
         "episodes. Events are counted over all trials."
-        if is_job
+        if has_reports
         else "Each row: the evaluation episodes of the loop after that number of training episodes. Events "
         "are counted over all of them."
     )
-    return EvaluationTable(explanation, Grid((*headings, *(["filled %"] if is_job else [])), rows))
+    return EvaluationTable(explanation, Grid((*headings, *(["filled %"] if has_reports else [])), rows))
 
 
 def _event_heading(event: str) -> str:

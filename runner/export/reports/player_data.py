@@ -146,7 +146,7 @@ def logged_near(recording: Recording, phase: str, time: Sequence[int]) -> list[L
         one.at.append(log_time // tick)
         one.values.append(value)
 
-    if recording.is_job:
+    if recording.has_reports:
         for report in recording.decoded(schema.TRAIN_METRICS_TOPIC, times=times):
             for name in ("epsilon", "step_size", "mean_length"):
                 add(name.replace("_", " "), report["log_time"], short(report[name]))

@@ -79,7 +79,7 @@ class ReportedRun:
     notes: list[str]
     maps: list[MapRow]
     replay: Replay | None
-    is_job: bool
+    has_tables: bool
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def render_report(
     columns = [
         metric
         for metric in METRICS
-        if not (metric.per_agent and any(run.is_job for run in runs))
+        if not (metric.per_agent and any(run.has_tables for run in runs))
         and any(run.last is not None and run.last.value(metric.name) is not None for run in runs)
     ]
     page = render(_ReportView(_title(runs), runs, plots_of(groups), legend, footnote(groups), columns))
@@ -163,8 +163,8 @@ def _run(
     episodes = _episodes(recording, chosen)
     replay = _replay(recording, episodes, progress)
     drawing = None if environment["scene"] is None else svg.Drawing(environment["scene"])
-    events, is_job = environment["event_names"], recording.is_job
-    table = evaluation_table(evaluations, recording.agents, events, is_job) if evaluations else None
+    events, has_reports = environment["event_names"], recording.has_reports
+    table = evaluation_table(evaluations, recording.agents, events, has_reports) if evaluations else None
     return ReportedRun(
         number=number,
         id=recording.run_id,
@@ -174,8 +174,8 @@ def _run(
         status=recording.status,
         environment=environment["env_id"].rpartition(":")[2],
         agents=[spoken(agent) for agent in environment["agents"]],
-        is_random=is_job and recording.config["algorithm"] == "random",
-        made_by="" if is_job else recording.config["made_by"],
+        is_random=recording.has_tables and recording.config["algorithm"] == "random",
+        made_by="" if recording.can_train_again else recording.config["made_by"],
         last=evaluations[-1] if evaluations else None,
         random_policy=random_policy_sentence(recording),
         has_steps=recording.has_steps,
@@ -187,7 +187,7 @@ def _run(
         notes=_notes(recording),
         maps=_maps(recording, next(iter(episodes), None)),
         replay=replay,
-        is_job=is_job,
+        has_tables=recording.has_tables,
     )
 
 
@@ -208,7 +208,7 @@ def _facts(recording: Recording) -> dict[str, str]:
     episodes, steps, trial_steps = map(
         recording.count, (schema.TRAIN_EPISODE, schema.TRAIN_STEP, schema.EVAL_STEP)
     )
-    if recording.is_job:
+    if recording.can_train_again:
         facts = {
             "Environment": config["env"]["id"],
             "Algorithm": spoken(config["algorithm"]),
@@ -261,7 +261,7 @@ def _episodes(recording: Recording, chosen: Sequence[Choice]) -> dict[tuple[int,
 
 def _maps(recording: Recording, episode: tuple[int, ...] | None) -> list[MapRow]:
     """Return the maps, for the situation in which an episode begins."""
-    if not recording.is_job:
+    if not recording.has_tables:
         return []
     mdp = recording.mdp
     start = int(mdp.start.argmax())

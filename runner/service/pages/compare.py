@@ -22,7 +22,7 @@ from runner.service.addresses import link, places_in
 from runner.service.api.comparing import found_runs
 from runner.service.api.replay import LONG
 from runner.service.dependencies import CacheOf, CatalogueOf, ProcessesOf, timed_recording_state
-from runner.service.pages.frame import RunHead, head_of, is_loop, last_evaluation
+from runner.service.pages.frame import RunHead, has_tables, head_of, last_evaluation
 from runner.service.pages.panels import Panel, panel_of
 from runner.service.pages.rendering import page
 from runner.util import humanize
@@ -233,7 +233,7 @@ def _compared(runs: list[Run], here: str) -> Compared:
         ComparedRun(head_of(each), each.recording, letter, f"{letter}: {each.name}", i % 7)
         for i, (each, letter) in enumerate(zip(runs, letters, strict=True))
     ]
-    if all(map(is_loop, runs)):
+    if not any(map(has_tables, runs)):
         tabs = [tab for tab in tabs if tab[0] != "/tables"]
     return Compared(compared, tabs if len(runs) == 2 else [], here)
 
@@ -248,7 +248,7 @@ def _results(runs: list[Run]) -> Rows:
     metrics = [
         metric
         for metric in METRICS
-        if not (metric.per_agent and not any(map(is_loop, runs)))
+        if not (metric.per_agent and all(map(has_tables, runs)))
         and any(each.values.get(metric.name) is not None for each in last)
     ]
     digests = [str(each.summary.content_digest or humanize.UNKNOWN)[:16] for each in runs]

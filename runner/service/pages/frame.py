@@ -56,13 +56,13 @@ def head_of(run: Run) -> RunHead:
         created=run.created.isoformat(),
         tags=run.tags,
         note=run.note,
-        tabs=tuple(tab for tab in TABS if str(tab[0]) != "learned" or not is_loop(run)),
+        tabs=tuple(tab for tab in TABS if str(tab[0]) != "learned" or has_tables(run)),
     )
 
 
-def is_loop(run: Run) -> bool:
-    """Return whether a run was recorded from a loop."""
-    return "made_by" in run.file.config
+def has_tables(run: Run) -> bool:
+    """Return whether the Q-tables of a run are known, without opening its recording."""
+    return "made_by" not in run.file.config
 
 
 def loop_results(run: Run) -> Summary:
@@ -76,6 +76,6 @@ def loop_results(run: Run) -> Summary:
 
 def last_evaluation(run: Run) -> EvaluationMetrics:
     """Return the measures of the last evaluation of a run; all unknown without one."""
-    if is_loop(run):
+    if not has_tables(run):
         return loop_results(run).last_evaluation or EvaluationMetrics()
     return run.summary.last_evaluation or EvaluationMetrics()

@@ -40,7 +40,7 @@ from runner.service.dependencies import (
     SettingsOf,
     recording_state,
 )
-from runner.service.pages.frame import RunView, head_of, is_loop, loop_results
+from runner.service.pages.frame import RunView, has_tables, head_of, loop_results
 from runner.service.pages.rendering import Form, message_of, page
 from runner.util import humanize
 
@@ -180,7 +180,7 @@ def status(
 def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) -> Response:
     """Show the last evaluations."""
     agents, events = recording.agents, recording.event_names
-    if recording.is_job:
+    if recording.has_reports:
         last = deque(recording.iter_metrics("eval"), MAX_EVALUATIONS)
         records = [evaluation_record(metrics, agents, events) for metrics in last]
         total = recording.count(recording.topic("/eval/metrics"))
@@ -188,7 +188,7 @@ def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) ->
         every = evaluation_records(recording)
         records, total = every[-MAX_EVALUATIONS:], len(every)
     links = [f"/runs/{run.run_id}/replay/eval/{record.episode}/0" for record in records]
-    table = evaluation_table(records, agents, events, recording.is_job) if records else None
+    table = evaluation_table(records, agents, events, recording.has_reports) if records else None
     return page(request, _EvaluationsView(head_of(run), "evaluations", table, links, total))
 
 
@@ -276,7 +276,7 @@ def _results(run: Run, last: EvaluationMetrics) -> dict[str, str]:
             for name in names
         }
 
-    if not is_loop(run):
+    if has_tables(run):
         return of_evaluation(last, [metric.name for metric in METRICS if not metric.per_agent])
     results = loop_results(run)
     recent = results.recent_training or RecentTraining(episodes=0)
