@@ -103,6 +103,7 @@ def vector_maker_of(
         reason = reason or f"{unknown}; {_NAME_MAKE}"
     names = tuple(_class_name(layer) for layer in layers[:-1])
     has_others = any(isinstance(layer, VectorActionWrapper) for layer in layers)
+    space = getattr(envs, "single_action_space", envs.action_space)  # SuperSuit's have the latter only
     return replace(
         maker,
         kind="vector",
@@ -110,7 +111,7 @@ def vector_maker_of(
         reason=maker.reason or reason,
         assumed=tuple(assumed),
         vector=VectorMaker(int(envs.num_envs), mode, autoreset.value, names, specs),
-        action_names=() if has_others else action_names(first, envs.single_action_space),
+        action_names=() if has_others else action_names(first, space),
     )
 
 
