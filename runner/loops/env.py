@@ -7,7 +7,7 @@ import os
 import sys
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Generic, Literal, Self
+from typing import Any, Generic, Literal, Self, TypeVar
 
 import gymnasium
 from gymnasium.vector import VectorEnv
@@ -23,6 +23,8 @@ from runner.loops.rows import Rows
 from runner.loops.single_rows import ROWS
 from runner.loops.values import check_phase
 from runner.runs.run import Run
+
+S = TypeVar("S", bound=Rows)
 
 
 class Recorded(Generic[R]):
@@ -151,19 +153,6 @@ class Recorded(Generic[R]):
         self._rows = self._loop.rows(phase)
         self._take_extras = self._loop.extras.taker(phase, self._rows)
 
-    def _steps_so_far(self) -> int:
-        """Return the number of steps of the phase; another thread may be committing some of them."""
-        with self._loop.lock:
-            return self._rows.place[0]
-
-    def _record_frame(self, is_reset: bool = False, is_over: bool = False) -> None:
-        """Record a picture of the last step or reset, if the options include it."""
-        self._until_frame -= 1
-        every = self._options.frames_every
-        if every and (is_reset or is_over or self._until_frame <= 0):
-            self._until_frame = every
-            self._messages.frame(self._phase, self.env.render(), is_reset)
-
     def _record_into(self, loop: Loop[R], is_owner: bool = True) -> None:
         """Record into a loop; its owner closes it when the process ends, if not before."""
         self._loop, self._messages, self._options = loop, loop.messages, loop.options
@@ -200,7 +189,49 @@ def given(**arguments: Any) -> dict[str, Any]:
     return {name: value for name, value in arguments.items() if value is not None}
 
 
-class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
+class RecordedAlone(Recorded[S]):
+    """What a recorded environment has that steps alone, not in a vector: an environment or a game."""
+
+    _watch: GeneratorWatch
+
+    def _enter(self, phase: str) -> None:
+        super()._enter(phase)
+        self._watch.due = 0
+
+    def _steps_so_far(self) -> int:
+        """Return the number of steps of the phase; another thread may be committing some of them."""
+        with self._loop.lock:
+            return self._rows.place[0]
+
+    def _record_frame(self, is_reset: bool = False, is_over: bool = False) -> None:
+        """Record a picture of the last step or reset, if the options include it."""
+        self._until_frame -= 1
+        every = self._options.frames_every
+        if every and (is_reset or is_over or self._until_frame <= 0):
+            self._until_frame = every
+            self._messages.frame(self._phase, self.env.render(), is_reset)
+
+    def _recorded_reset(self, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, Any]:
+        """Reset the environment, and record it: the seed, the options, the observation."""
+        before = dict(options) if options else None  # the environment may change them
+        state = self._watch.before(self._steps_so_far()) if seed is None else None
+        result: tuple[Any, Any] = self.env.reset(**given(seed=seed, options=options))
+        state = self._watch.after(state, seed)
+        observation, info = result
+        with self._loop.lock:
+            self._loop.activate(self._rows)
+            self._rows.reset(observation, seed)
+            if state is not None:
+                self._messages.reset_state(self._phase, state._replace(reset=self._rows.resets - 1))
+        self._messages.reset_info(self._phase, self._info_by_field(info), before, seed)
+        self._record_frame(is_reset=True)
+        return result
+
+    def _info_by_field(self, info: Mapping[str, Any]) -> Mapping[str, Any]:
+        return info
+
+
+class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
     """A Gymnasium environment whose every reset and step is recorded; made by `record`."""
 
     env: gymnasium.Env[Any, Any]
@@ -222,7 +253,6 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _enter(self, phase: str) -> None:
         super()._enter(phase)
-        self._watch.due = 0
         self._take = self._rows.take
         self._lock = self._loop.lock
 
@@ -249,19 +279,7 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Reset the environment, and record it: the seed, the options, the observation."""
-        before = dict(options) if options else None  # the environment may change them
-        state = self._watch.before(self._steps_so_far()) if seed is None else None
-        result = self.env.reset(**given(seed=seed, options=options))
-        state = self._watch.after(state, seed)
-        observation, info = result
-        with self._lock:
-            self._loop.activate(self._rows)
-            self._rows.reset(observation, seed)
-            if state is not None:
-                self._messages.reset_state(self._phase, state._replace(reset=self._rows.resets - 1))
-        self._messages.reset_info(self._phase, info, before, seed)
-        self._record_frame(is_reset=True)
-        return result
+        return self._recorded_reset(seed, options)
 
     def _record_messages(self, info: Mapping[str, Any], over: bool) -> None:
         """Record info and frame of the step that was just put down, where the options include them."""

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from runner.environments.mdp import MAX_AGENTS
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, kind_of
-from runner.loops.env import Recorded, given, require_pictures
+from runner.loops.env import RecordedAlone, require_pictures
 from runner.loops.generators import GeneratorWatch
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, game_maker_of
@@ -21,7 +21,7 @@ from runner.loops.single_rows import AgentRows
 from runner.loops.vector import by_field, require_fixed
 
 
-class RecordedParallel(Recorded[AgentRows]):
+class RecordedParallel(RecordedAlone[AgentRows]):
     """A PettingZoo parallel environment whose every reset and step is recorded; made by `record_parallel`.
 
     Its other attributes are those of the environment: `agents`, `action_space`, ...
@@ -32,10 +32,6 @@ class RecordedParallel(Recorded[AgentRows]):
         self._watch = GeneratorWatch(env)
         self._record_into(loop)
         self._enter("train")
-
-    def _enter(self, phase: str) -> None:
-        super()._enter(phase)
-        self._watch.due = 0
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_") or name == "env":
@@ -60,7 +56,7 @@ class RecordedParallel(Recorded[AgentRows]):
             if extras is not None:
                 self._take_extras(self._extras_by_name(extras))
         if self._options.info:
-            self._messages.info(self._phase, by_field(infos))
+            self._messages.info(self._phase, self._info_by_field(infos))
         if self._options.frames_every:
             self._record_frame(is_over=over)
         return result  # type: ignore[no-any-return]
@@ -78,18 +74,10 @@ class RecordedParallel(Recorded[AgentRows]):
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
         """Reset the environment, and record it."""
-        before = dict(options) if options else None  # the environment may change them
-        state = self._watch.before(self._steps_so_far()) if seed is None else None
-        result = self.env.reset(**given(seed=seed, options=options))
-        state = self._watch.after(state, seed)
-        with self._loop.lock:
-            self._loop.activate(self._rows)
-            self._rows.reset(result[0], seed)
-            if state is not None:
-                self._messages.reset_state(self._phase, state._replace(reset=self._rows.resets - 1))
-        self._messages.reset_info(self._phase, by_field(result[1]), before, seed)
-        self._record_frame(is_reset=True)
-        return result  # type: ignore[no-any-return]
+        return self._recorded_reset(seed, options)
+
+    def _info_by_field(self, info: Mapping[str, Any]) -> Mapping[str, Any]:
+        return by_field(info)
 
 
 def record_parallel(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from runner.errors import CannotRedo
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.replay.comparing import Difference, differing_value, first_differing_row
+from runner.replay.comparison import Comparison, Part, parts_of
 from runner.replay.makers import is_whole_vector, make_environment, make_vector
 from runner.replay.recorded import Piece, RecordedReset, pieces
-from runner.replay.redone import RedoneStart, RedoneSteps, Values
-from runner.replay.stepping import EnvironmentStepper, GameStepper, Results, Stepper
+from runner.replay.redone import RedoneSteps
+from runner.replay.stepping import EnvironmentStepper, GameStepper, Stepper
 from runner.replay.stepping_vector import VectorStepper
 
 BLOCK_SECONDS: Final = 0.2
@@ -32,16 +32,6 @@ ALL: Final = -1
 """The number that stands for all environments of a vector."""
 Report = Callable[[int], None]
 _Key = tuple[str, int]
-
-
-class _Part(NamedTuple):
-    """Steps of one environment, or of all, and what came of them."""
-
-    environment: int
-    rows: NDArray[np.void]
-    resets: Sequence[tuple[int, RecordedReset]]
-    """Row and reset, in order; each comes before its row."""
-    results: Results
 
 
 class Replay:
@@ -67,7 +57,8 @@ class Replay:
         draw_from: int = 0,
     ) -> None:
         self._draw_from = draw_from
-        self._recording, self._trust, self._tolerance, self._make = recording, trust, tolerance, make
+        self._recording, self._trust, self._make = recording, trust, make
+        self._comparison = Comparison(recording, tolerance)
         self._report, self.render = report, render
         self._steppers: dict[_Key, Stepper] = {}
         self._known: set[_Key] = set()
@@ -141,9 +132,9 @@ class Replay:
             self._adapt(time.monotonic() - started, stepper.draws)
             self.taken += results.done
             self._report(self.taken)
-            parts = [_Part(environment, block, here, results)]
-            for part in _parts(parts[0], width) if environment == ALL else parts:
-                steps = self._compared(phase, part)
+            whole = Part(phase, environment, block, here, results)
+            for part in parts_of(whole, width) if environment == ALL else [whole]:
+                steps = self._comparison.of(part)
                 yield steps
                 if steps.difference is not None:
                     return
@@ -197,143 +188,6 @@ class Replay:
             return make_vector(self._makers[phase], self._trust)
         return make_environment(self._makers[phase], self._trust, self.render)
 
-    # --- comparing ------------------------------------------------------------------------------------
-
-    def _compared(self, phase: str, part: _Part) -> RedoneSteps:
-        """Return steps that were done again, up to the first difference."""
-        environment, rows, resets, results = part
-        recorded = _recorded_values(rows)
-        done, resets_done = results.done, results.resets_done
-        place = self._first_row(rows, recorded, results)
-        failed_reset = self._first_reset(resets, results)
-        if place is not None and (failed_reset is None or resets[failed_reset][0] > place[0]):
-            done = place[0] + 1
-            resets_done = sum(row < done for row, _ in resets[:resets_done])
-            difference = self._row_difference(phase, environment, rows, recorded, results, *place)
-        elif failed_reset is not None:
-            done, reset = resets[failed_reset]
-            first = differing_value(
-                reset.observation,
-                results.first_observations[failed_reset],
-                self._recording.spaces["observation"],
-                self._tolerance,
-            )
-            difference = self._difference(
-                phase, environment, reset.episode, 0, reset.step, f"first observation{first[0]}", *first[1:]
-            )
-            resets_done = failed_reset + 1
-        elif results.error is not None:
-            difference = self._failure(phase, part, results.error)
-        else:
-            difference = None
-        starts = [
-            RedoneStart(
-                row,
-                reset.episode,
-                reset.seed,
-                reset.observation,
-                results.first_observations[k],
-                results.first_frames[k] if results.first_frames else None,
-            )
-            for k, (row, reset) in enumerate(resets[:resets_done])
-        ]
-        return RedoneSteps(
-            phase=phase,
-            environment=environment,
-            step=rows["step"][:done].astype(np.int64),
-            episode=rows["episode"][:done].astype(np.int64),
-            t=rows["t"][:done].astype(np.int64),
-            actions=rows["action"][:done],
-            recorded=recorded.first(done),
-            got=results.values.first(done),
-            starts=tuple(starts),
-            frames=results.frames[:done],
-            difference=difference,
-        )
-
-    def _failure(self, phase: str, part: _Part, error: Exception) -> Difference:
-        """Return the difference that the environment raised an error where the recorded one did not."""
-        environment, rows, resets, results = part
-        got = f"{type(error).__name__}: {error}"
-        waiting = resets[results.resets_done :]
-        if waiting and (waiting[0][0] <= results.done or results.done >= len(rows)):
-            reset = waiting[0][1]
-            return self._difference(phase, environment, reset.episode, 0, reset.step, "error", None, got)
-        if not len(rows):  # another environment of the vector raised it
-            raise CannotRedo(f"The vector environment fails: {got}")
-        row = rows[min(results.done, len(rows) - 1)]
-        episode, t, step = (int(row[name]) for name in ("episode", "t", "step"))
-        return self._difference(phase, environment, episode, t, step, "error", None, got)
-
-    def _first_row(
-        self, rows: NDArray[np.void], recorded: Values, results: Results
-    ) -> tuple[int, str] | None:
-        """Return the first row that differs, and the first field of it that does; None if none does."""
-        done, found = results.done, []
-        for name in ("observations", "rewards", "terminated", "truncated"):
-            was, got = getattr(recorded, name)[:done], getattr(results, name)[:done]
-            if (row := first_differing_row(was, got, self._tolerance)) is not None:
-                found.append((row, name))
-        for name in ("agents_terminated", "agents_truncated"):
-            got = getattr(results, name)[:done]
-            if len(got) and (rows[name][:done] != got).any():
-                found.append((int(np.argmax(rows[name][:done] != got)), name))
-        return min(found, key=lambda place: place[0]) if found else None
-
-    def _first_reset(self, resets: Sequence[tuple[int, RecordedReset]], results: Results) -> int | None:
-        """Return the number of the first reset whose observation differs; None if none does."""
-        done = results.resets_done
-        recorded = np.empty_like(results.first_observations[:done])
-        for k, (_, reset) in enumerate(resets[:done]):
-            recorded[k] = reset.observation
-        return first_differing_row(recorded, results.first_observations[:done], self._tolerance)
-
-    def _row_difference(
-        self,
-        phase: str,
-        environment: int,
-        rows: NDArray[np.void],
-        recorded: Values,
-        results: Results,
-        row: int,
-        name: str,
-    ) -> Difference:
-        """Return the difference in a field of a row."""
-        was, got = (
-            (rows[name][row], getattr(results, name)[row])
-            if name.startswith("agents_")
-            else (getattr(recorded, name)[row], getattr(results, name)[row])
-        )
-        if name == "observations":
-            place, was, got = differing_value(
-                was, got, self._recording.spaces["observation"], self._tolerance
-            )
-            field = f"observation{place}"
-        elif name == "rewards":
-            agent = int(np.argmax(was != got)) if len(was) > 1 else 0
-            field = f"reward[{self._recording.agents[agent]!r}]" if len(was) > 1 else "reward"
-            was, got = float(was[agent]), float(got[agent])
-        else:
-            field, was, got = name, was.item(), got.item()
-        episode, t, step = (int(rows[row][each]) for each in ("episode", "t", "step"))
-        return self._difference(phase, environment, episode, t, step, field, was, got)
-
-    def _difference(
-        self,
-        phase: str,
-        environment: int,
-        episode: int,
-        t: int,
-        step: int,
-        field: str,
-        recorded: Any,
-        got: Any,
-    ) -> Difference:
-        number: int | None = episode
-        if self._recording.environments > 1:
-            number = _ended_episode(self._recording, phase, environment, step)
-        return Difference(phase, number, t, step, environment, field, recorded, got)
-
 
 def _are_separate(recording: Recording) -> bool:
     """Return whether training and evaluation have environments of their own.
@@ -373,29 +227,3 @@ def own_steps(
             before = np.concatenate([[0], np.cumsum(taken)])
             at, rows = before[at].tolist(), rows[taken]
     return rows, list(zip(at, own, strict=True))
-
-
-def _parts(whole: _Part, n: int) -> Iterator[_Part]:
-    """Yield the steps of each of the n environments of a vector."""
-    for environment in range(n):
-        rows = whole.rows[environment::n]
-        taken = rows["t"] != schema.RESET_ONLY
-        before = np.concatenate([[0], np.cumsum(taken)])
-        here = [k for k, (_, reset) in enumerate(whole.resets) if reset.environment == environment]
-        resets = [(int(before[whole.resets[k][0]]), whole.resets[k][1]) for k in here]
-        yield _Part(environment, rows[taken], resets, whole.results.part(environment, n, taken, here))
-
-
-def _recorded_values(rows: NDArray[np.void]) -> Values:
-    names = rows.dtype.names or ()
-    observations = rows["next_state" if "next_state" in names else "next_observation"]
-    return Values(observations, rows["rewards"], rows["terminated"], rows["truncated"])
-
-
-def _ended_episode(recording: Recording, phase: str, environment: int, step: int) -> int | None:
-    """Return the number of the episode that a step of an environment belongs to; None if it never ended."""
-    for block in recording.blocks(recording.topic(f"/{phase}/episode")):
-        own = (block["last_step"] >= step) & (block["last_step"] % recording.environments == environment)
-        if own.any():
-            return int(block["episode"][np.argmax(own)])
-    return None

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.replay.comparing import Difference
+from runner.replay.differences import Difference
 
 Frame = NDArray[np.uint8]
 """A picture, [height, width, 3]."""

@@ -29,9 +29,9 @@ CONFIG = {
 }
 SWEEP = {
     "name": "small",
-    "base": CONFIG | {"episodes": 300, "name": "base"},
+    "base": CONFIG | {"episodes": 10_000, "name": "base"},  # half a second, which a kill cannot miss
     "strategy": "tpe",
-    "trials": 4,
+    "trials": 8,
     "batch": 2,
     "parameters": {"step_size": {"low": 0.1, "high": 1.0}},
     "seeds": [0],
@@ -179,7 +179,7 @@ def test_a_killed_sweep_ends_as_if_it_never_was(tmp_path):
         server.kill()
         server.start()  # at once, while the old sweep still closes its recordings
         server.until(are_finished)
-    assert len(list_runs(killed)) == len(tried(calm)) == 4
+    assert len(list_runs(killed)) == len(tried(calm)) == 8
     assert tried(killed) == tried(calm)
 
 
