@@ -32,7 +32,8 @@ from runner.service.processes import ProcessPool
 from runner.service.response_cache import ResponseCache
 from runner.service.settings import Settings
 from runner.service.tokens import Sessions, Tokens
-from runner.service.uploads import Upload, Uploads
+from runner.service.upload import Upload
+from runner.service.uploads import Uploads
 from runner.sweep import sweeps_in
 from runner.util.version import __version__
 

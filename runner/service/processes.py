@@ -44,6 +44,8 @@ PRELOADED: Final = (
 
 Most environments draw by pygame, whose import takes as long as all else until their first picture.
 """
+NICENESS: Final = 5
+"""Processes that train or verify yield to the server, whose users are waiting."""
 
 
 class ProcessPool:

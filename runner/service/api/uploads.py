@@ -18,7 +18,7 @@ from runner.service.dependencies import UploadsOf
 from runner.service.errors import Refused
 from runner.service.problems import error_docs
 from runner.service.tokens import Token
-from runner.service.uploads import Announcement, Completion
+from runner.service.upload import Announcement, Completion
 
 router = APIRouter(tags=["uploads"])
 

@@ -27,13 +27,12 @@ from runner.service.jobs.channel import (
     wait_for_owners,
 )
 from runner.service.jobs.sweeps import run_sweep_job
+from runner.service.processes import NICENESS
 from runner.service.settings import without_folders
 from runner.sweep.cluster import RayActor, connect, start_actor
 
 MAX_TEXT: Final = 4000
 """The length of a log line."""
-NICENESS: Final = 5
-"""Training yields to the server, whose users are waiting."""
 
 
 def work(pipe: Connection, spec: JobSpec) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from loop_replays import record_loops, serving
 from starlette.testclient import TestClient
 
 import runner
@@ -26,6 +27,21 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for seed, name in enumerate(("first", "second")):
         runner.run(config | {"name": name}, seed=seed, overrides=["evaluation.every=10"], recordings=folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def loops(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a recordings folder with the loops of `record_loops`, not to be changed."""
+    folder = tmp_path_factory.mktemp("loops") / "recordings"
+    record_loops(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def loops_client(loops: Path) -> Iterator[TestClient]:
+    """Return a client of a service for those loops."""
+    with serving(loops) as client:
+        yield client
 
 
 @pytest.fixture

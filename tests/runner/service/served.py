@@ -7,11 +7,14 @@ import random
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self
 
 import httpx2
 import psutil
+from selenium.webdriver.remote.webdriver import WebDriver
+from selenium.webdriver.support.ui import WebDriverWait
 
 from tests.waiting import until
 
@@ -22,6 +25,11 @@ def free_port() -> int:
         port = random.randrange(10_000, 32_768)
         with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", port)):
             return port
+
+
+def wait(browser: WebDriver, is_so: Callable[[], Any], seconds: float = 60) -> Any:
+    """Wait until a page is so, and return what was found."""
+    return WebDriverWait(browser, seconds, poll_frequency=0.05).until(lambda _: is_so())
 
 
 class Served:

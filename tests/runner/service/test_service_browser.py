@@ -11,8 +11,7 @@ import pytest
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
-from selenium.webdriver.support.ui import WebDriverWait
-from served import Served
+from served import Served, wait
 
 import runner
 from runner.drawing.svg import Drawing, transform
@@ -75,10 +74,6 @@ def page(browser, served):
         r'"url":"(\w+://[^"/]+)', " ".join(e["message"] for e in browser.get_log("performance"))
     )
     assert {address for address in requested if address.startswith(("http", "ws"))} <= {served}
-
-
-def wait(browser, done, seconds=60):
-    return WebDriverWait(browser, seconds, poll_frequency=0.1).until(lambda _: done())
 
 
 def text_of(browser, selector):

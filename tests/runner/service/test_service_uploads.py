@@ -24,7 +24,8 @@ from runner.runs.resolve import find_run
 from runner.runs.run import create_run, list_runs
 from runner.service.errors import TooManyUploads, UploadConflict, UploadTooLarge
 from runner.service.settings import Limits
-from runner.service.uploads import FOLDER, Announcement, Completion, Uploads
+from runner.service.upload import Announcement, Completion
+from runner.service.uploads import FOLDER, Uploads
 from tests.runner.recording.making import TAXIS, experiment, make_run, stopping_after, with_id
 from tests.waiting import until
 

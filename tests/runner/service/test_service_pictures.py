@@ -1,0 +1,158 @@
+"""Pictures of the episodes of loops: recorded or drawn, streamed, limited, and missing with a reason."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import time
+from functools import partial
+
+import gymnasium
+import numpy as np
+import pytest
+from loop_replays import pictures, serving, steps_of
+from PIL import Image
+
+from runner.recording.reader import open_recording
+from runner.replay.environment import redo_in_child
+from runner.runs.resolve import find_run
+from runner.service.errors import Busy
+from runner.service.pictures import MAX_STREAMS, PictureStreams
+
+
+def test_recorded_frames_are_passed_on_as_they_are(loops_client, loops, monkeypatch):
+    monkeypatch.setattr("runner.export.pictures.why_not_redone", lambda *_: "It is not installed.")
+    length = len(steps_of(loops, "framed", "train", 1))
+    with open_recording(find_run("framed", loops).recording) as recording:
+        recorded = [frame["data"] for frame in recording.decoded(recording.topic("/train/frame"))]
+    found, problem = pictures(loops_client, "framed/replay/train/1", steps=1000)
+    assert problem == ""
+    assert len(found) == length + 1
+    assert {data for data in found if data} <= set(recorded)
+    due = [k % 3 == 0 or k == length for k in range(length + 1)]
+    assert [bool(data) for data in found] == due
+    later, _ = pictures(loops_client, "framed/replay/train/1", start=4, steps=3)
+    assert later == [found[3], b"", found[6]]
+
+
+def test_pictures_that_were_not_recorded_are_those_that_the_environment_draws(loops_client, loops):
+    env = gymnasium.make("CartPole-v1", render_mode="rgb_array")
+    env.reset(seed=102)
+    drawn = [env.render()]
+    for action in steps_of(loops, "pole", "eval", 2)["action"].tolist():
+        env.step(action)
+        drawn.append(env.render())
+    found, problem = pictures(loops_client, "pole/replay/eval/4/2", steps=1000)
+    assert problem == ""
+    assert len(found) == len(drawn)
+    for data, expected in zip(found, drawn, strict=True):
+        shown = np.asarray(Image.open(io.BytesIO(data)), np.float64)
+        assert np.abs(shown - expected).mean() < 2
+    for start in (1, 5, len(drawn) - 1):
+        again, _ = pictures(loops_client, "pole/replay/eval/4/2", start=start, steps=2)
+        assert again == found[start : start + 2]
+
+
+def test_pictures_after_the_end_are_none(loops_client):
+    assert pictures(loops_client, "pole/replay/train/0", start=10**6) == ([], "")
+
+
+def test_an_environment_that_takes_too_long_is_given_up_with_a_reason(loops_client, monkeypatch):
+    monkeypatch.setattr("runner.export.painting.redo_in_child", partial(redo_in_child, seconds=1e-3))
+    found, problem = pictures(loops_client, "pole/replay/train/2")
+    assert found == []
+    assert "took longer than 0.001 s" in problem
+
+
+def test_where_an_environment_cannot_draw_the_recorded_frames_are_shown_with_the_reason(
+    loops_client, monkeypatch
+):
+    monkeypatch.setattr("runner.export.painting.redo_in_child", partial(redo_in_child, seconds=1e-3))
+    notes = []
+    found, problem = pictures(loops_client, "framed/replay/train/2", notes, steps=1000)
+    assert found[0].startswith(b"\x89PNG")
+    assert found[1:4] == [b"", b"", found[3]]
+    assert "took longer than 0.001 s" in notes[0]
+    assert problem == ""
+
+
+def test_a_damaged_recording_ends_the_pictures_with_a_reason(loops, tmp_path, monkeypatch):
+    monkeypatch.setattr("runner.export.pictures.why_not_redone", lambda *_: "It is not installed.")
+    data = bytearray(find_run("framed", loops).recording.read_bytes())
+    place = data.rindex(b"\x89PNG")  # frames are stored as they are, in chunks with a checksum
+    data[place + 100] ^= 255
+    run = tmp_path / "recordings" / "framed"
+    run.mkdir(parents=True)
+    for file in find_run("framed", loops).folder.iterdir():
+        (run / file.name).write_bytes(data if file.suffix == ".mcap" else file.read_bytes())
+    with serving(run.parent) as client:
+        for address in ("train/3", "eval/4/2"):
+            answer = client.get(f"/api/v1/runs/framed/replay/{address}/pictures?steps=1000")
+            assert answer.status_code in (200, 409)
+        assert "checksum" in answer.text or "damaged" in answer.text
+
+
+# --- streams ------------------------------------------------------------------------------------------
+
+
+def endless(closed, begins=0.0):
+    def make(start):
+        try:
+            time.sleep(begins)
+            while True:
+                yield str(start).encode()
+                start += 1
+        finally:
+            closed.append(start)
+
+    return make
+
+
+async def read(streams, stream, start, stop):
+    return [record[4:] async for record in streams.send(stream, start, stop)]
+
+
+def test_a_stream_continues_for_the_next_request_and_begins_again_for_an_earlier_step():
+    async def run():
+        streams, closed = PictureStreams(), []
+        first = streams.open("a", endless(closed), 3)
+        assert await read(streams, first, 3, 5) == [b"3", b"4"]
+        second = streams.open("a", endless(closed), 7)
+        assert second is first
+        assert await read(streams, second, 7, 9) == [b"7", b"8"]
+        third = streams.open("a", endless(closed), 2)
+        assert third is not first
+        assert await read(streams, third, 2, 3) == [b"2"]
+        await until(lambda: len(closed) == 1)
+        streams.close()
+        await until(lambda: len(closed) == 2)
+
+    asyncio.run(run())
+
+
+def test_streams_are_limited_kept_ones_give_way_and_are_closed_when_nobody_comes_back(monkeypatch):
+    monkeypatch.setattr("runner.service.pictures.IDLE_SECONDS", 0.3)
+
+    async def run():
+        streams, closed = PictureStreams(), []
+        opened = [streams.open(number, endless(closed), 0) for number in range(MAX_STREAMS)]
+        with pytest.raises(Busy):
+            streams.open("another", endless(closed), 0)
+        await read(streams, opened[0], 0, 1)
+        opened.append(streams.open("another", endless(closed), 0))
+        await until(lambda: len(closed) == 1)
+        for stream in opened[1:]:
+            await read(streams, stream, 0, 1)
+        await until(lambda: len(closed) == MAX_STREAMS + 1)
+
+    asyncio.run(run())
+
+
+async def until(holds):
+    end = time.monotonic() + 20
+    while not holds():
+        assert time.monotonic() < end
+        await asyncio.sleep(0.02)
+
+
+# --- in a browser -------------------------------------------------------------------------------------
