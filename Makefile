@@ -8,10 +8,10 @@ BIN := $(VENV)/bin
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help run serve test lint bench soak fuzz damage clean
+.PHONY: help run serve test test-integrations lint bench soak fuzz damage clean
 
 help:  ## list the targets
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-8s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-17s %s\n", $$1, $$2}'
 
 run: $(VENV)/.installed  ## train the tutorial's cooperative job, every step recorded
 	$(BIN)/dualtaxi run configs/tutorial_cooperative.yaml
@@ -22,6 +22,9 @@ serve: $(VENV)/.installed-service  ## open the runs in the browser
 
 test: $(VENV)/.installed-dev  ## run all tests
 	$(BIN)/python -m pytest -n 2
+
+test-integrations: $(VENV)-integrations/.installed  ## test the adapters against the real libraries (8 GB of them)
+	$(VENV)-integrations/$(notdir $(BIN))/python -m pytest tests/integrations
 
 lint: $(VENV)/.installed-dev  ## formatting, style, strict types and wording
 	$(BIN)/ruff format --check .
@@ -44,7 +47,7 @@ damage: $(VENV)/.installed-dev  ## change 10,000 single bytes, each to be found 
 	$(BIN)/python -m tests.reliability.damage
 
 clean:  ## remove the environment and caches; recordings stay
-	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(VENV)-integrations build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -64,3 +67,10 @@ $(VENV)/.installed-dev: pyproject.toml constraints.txt
 	@echo 'Installing dualtaxi with all that the tests need into $(VENV): a few minutes, once.'
 	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev]'
 	touch $@ $(VENV)/.installed $(VENV)/.installed-service
+
+$(VENV)-integrations/.installed: pyproject.toml constraints-integrations.txt
+	$(PYTHON) -m venv $(VENV)-integrations
+	@echo 'Installing PyTorch, Ray, JAX and others into $(VENV)-integrations: ten minutes or more, once.'
+	$(VENV)-integrations/$(notdir $(BIN))/python -m pip install \
+		--constraint constraints-integrations.txt --editable '.[integrations]'
+	touch $@

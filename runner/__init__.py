@@ -20,6 +20,7 @@ from runner.util.version import __version__
 
 if TYPE_CHECKING:
     import runner.analysis.frames as frames  # noqa: PLR0402
+    import runner.integrations as integrations  # noqa: PLR0402
     from runner.api import run, run_all
     from runner.config import ExperimentConfig
     from runner.errors import RunnerError
@@ -44,6 +45,7 @@ __all__ = [
     "evaluate",
     "find_run",
     "frames",
+    "integrations",
     "label",
     "list_runs",
     "open_recording",
@@ -83,6 +85,8 @@ _HOME = {
 def __getattr__(name: str) -> Any:
     if name == "frames":
         return importlib.import_module("runner.analysis.frames")
+    if name == "integrations":
+        return importlib.import_module("runner.integrations")
     if name in _HOME:
         return getattr(importlib.import_module(_HOME[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

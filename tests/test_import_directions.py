@@ -29,6 +29,7 @@ ORDER = """
     sweep
     client
     loops
+    integrations
     golden
     service
     api

@@ -27,6 +27,7 @@ def test_the_public_names():
         "evaluate",
         "find_run",
         "frames",
+        "integrations",
         "label",
         "list_runs",
         "open_recording",

@@ -1,0 +1,24 @@
+"""Tests with real libraries, which warn of many things of their own; warnings of this project stay errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.path.is_relative_to(HERE):
+            item.add_marker(pytest.mark.filterwarnings("ignore"), append=False)
+            item.add_marker(pytest.mark.filterwarnings("error::RuntimeWarning:tests"))
+
+
+@pytest.fixture
+def recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder with an empty recordings folder in it, the current folder of the test."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DUALTAXI_RECORDINGS", str(tmp_path / "recordings"))
+    return tmp_path / "recordings"
