@@ -32,8 +32,9 @@ if TYPE_CHECKING:
     from runner.loops.parallel import record_parallel
     from runner.loops.vector import record_vector
     from runner.recording.reader import Recording, open_recording
+    from runner.runs.listing import list_runs
     from runner.runs.resolve import find_run
-    from runner.runs.run import Run, label, list_runs
+    from runner.runs.run import Run, label
 
 __all__ = [
     "ExperimentConfig",
@@ -68,7 +69,7 @@ _HOME = {
     "evaluate": "runner.execution.rerecord",
     "find_run": "runner.runs.resolve",
     "label": "runner.runs.run",
-    "list_runs": "runner.runs.run",
+    "list_runs": "runner.runs.listing",
     "open_recording": "runner.recording.reader",
     "record": "runner.loops.env",
     "record_parallel": "runner.loops.parallel",

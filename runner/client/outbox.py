@@ -20,8 +20,9 @@ from platformdirs import user_state_path
 from runner.client.client import Client, UploadStatus
 from runner.client.connection import Report, ServerUnavailable, find_token
 from runner.errors import RunnerError
+from runner.runs.listing import list_runs
 from runner.runs.locking import locked
-from runner.runs.run import Run, list_runs
+from runner.runs.run import Run
 from runner.runs.store import Store
 from runner.util.files import read_object, write_object
 

@@ -43,9 +43,10 @@ from runner.recording.reader import Recording, open_recording
 from runner.recording.records import Contents
 from runner.recording.reference import Reference
 from runner.recording.writer import RecordingFile, storage_error
+from runner.runs.listing import run_at
 from runner.runs.locking import locked
 from runner.runs.provenance import Differences, differing_provenance, provenance
-from runner.runs.run import RECORDING_FILE, Run, run_at
+from runner.runs.run import RECORDING_FILE, Run
 from runner.util.files import storage_errors
 
 DECISIVE: Final = (

@@ -35,7 +35,8 @@ from runner.replay.episodes import episode_at
 from runner.replay.stepping import RowStepper
 from runner.replay.steps import transitions_of
 from runner.runs.branches import BranchOrigin
-from runner.runs.run import Run, recordings_folder, run_at
+from runner.runs.listing import run_at
+from runner.runs.run import Run, recordings_folder
 from runner.util.files import storage_errors
 from runner.util.jsonable import as_json
 from runner.util.processes import report_progress

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from runner.errors import RunnerError
-from runner.runs.run import Run, run_at
+from runner.runs.listing import run_at
+from runner.runs.run import Run
 from runner.util.files import storage_errors
 
 if TYPE_CHECKING:

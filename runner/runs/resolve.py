@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from runner.errors import RunNotFound, nearest
 from runner.recording.run_file import RUN_ID, run_title
-from runner.runs.run import Run, recordings_folder, run_at, run_in
+from runner.runs.listing import run_at, run_in
+from runner.runs.run import Run, recordings_folder
 from runner.util.values import RUN_NAME_PATTERN
 
 if TYPE_CHECKING:

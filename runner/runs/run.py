@@ -22,11 +22,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
+from runner.errors import RunnerError, StorageError
 from runner.recording.labels import LABELS_FILE, Labels, as_json, change_labels, read_labels
 from runner.recording.liveness import is_alive, owner
-from runner.recording.run_file import RUN_ID, ArchiveReference, RunFile, Summary, parse_run_file, run_title
-from runner.util.files import read_object, storage_errors, write_object
+from runner.recording.run_file import ArchiveReference, RunFile, Summary, parse_run_file, run_title
+from runner.util.files import storage_errors, write_object
 from runner.util.values import as_utf8, checked_run_name, is_utf8
 
 if TYPE_CHECKING:  # listing runs must be quick
@@ -35,7 +35,6 @@ if TYPE_CHECKING:  # listing runs must be quick
 
 RUN_FILE: Final = "run.json"
 RECORDING_FILE: Final = "recording.mcap"
-MAX_RUN_FILE_BYTES: Final = 8 << 20
 MADE_BY: Final = ("host", "git", "dualtaxi")
 """The provenance in `run.json`; the recording has all of it."""
 RECORDINGS_VARIABLE: Final = "DUALTAXI_RECORDINGS"
@@ -297,65 +296,6 @@ def check_folder_name(recordings: str | os.PathLike[str]) -> None:
         )
 
 
-def list_runs(recordings: str | os.PathLike[str] | None = None) -> list[Run]:
-    """Return the runs of a recordings folder, the newest first.
-
-    Args:
-        recordings: the folder: $DUALTAXI_RECORDINGS, or ./recordings, by default.
-
-    Raises:
-        StorageError: the folder is there and cannot be read.
-    """
-    folder = recordings_folder(recordings)
-    runs = [run for entry in run_entries(folder) if (run := run_in(folder / entry))]
-    return sorted(runs, key=lambda run: (run.created, run.run_id), reverse=True)
-
-
-def run_entries(recordings: Path) -> list[str]:
-    """Return the names of the folders that may have a run: all but the hidden ones.
-
-    Raises:
-        StorageError: the recordings folder is there and cannot be read.
-    """
-    try:
-        with os.scandir(recordings) as entries:
-            return [entry.name for entry in entries if entry.name[0] != "." and entry.is_dir()]
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        raise StorageError(f"{recordings}: cannot be read as a folder of runs ({error.strerror}).") from error
-
-
-def run_at(path: Path) -> Run:
-    """Return the run in a folder, or of a recording outside a run's folder.
-
-    Raises:
-        RunNotFound: there is none.
-        RecordingError: the recording cannot be read.
-    """
-    if path.is_dir():
-        if run := run_in(path):
-            return run
-        raise RunNotFound(f"{path}: found a folder without {RUN_FILE} or {RECORDING_FILE}, expected a run.")
-    if not path.is_file():
-        raise RunNotFound(f"{path}: no such file or folder.")
-    if path.name == RECORDING_FILE and (path.parent / RUN_FILE).is_file():
-        return run_at(path.parent)
-    return _from_recording(path)
-
-
-def run_in(folder: Path) -> Run | None:
-    """Return the run in a folder, from its recording when `run.json` is gone; None if there is none."""
-    with contextlib.suppress(OSError, ValueError):
-        facts = read_object(folder / RUN_FILE, MAX_RUN_FILE_BYTES)
-        if _is_run(facts):
-            return Run(folder, facts)
-    if (folder / RECORDING_FILE).is_file():
-        with contextlib.suppress(RecordingError):
-            return _from_recording(folder / RECORDING_FILE)
-    return None
-
-
 def label(
     run: Run,
     name: str | None = None,
@@ -390,23 +330,3 @@ def label(
         )
 
     return change_labels(run.folder, change)
-
-
-def _is_run(facts: dict[str, Any]) -> bool:
-    """Return whether facts have the id of a run; the others may be damaged."""
-    run_id = facts.get("run_id")
-    return isinstance(run_id, str) and RUN_ID.fullmatch(run_id) is not None and run_id.strip(".") != ""
-
-
-def _from_recording(path: Path) -> Run:
-    """Return the run that a recording describes."""
-    from runner.recording.reader import open_recording
-
-    with open_recording(path) as recording:
-        facts = {**recording.run_facts(), "recording": path.name}
-        with contextlib.suppress(RecordingError):
-            made_by = recording.provenance
-            facts["provenance"] = {key: made_by[key] for key in MADE_BY if key in made_by}
-    if not _is_run(facts):
-        raise RecordingError(f"{path}: is damaged: its description of the run is invalid.")
-    return Run(path.parent, facts)

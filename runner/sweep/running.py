@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Final
 
 from runner.recording.labels import Labels
-from runner.runs.run import new_run, run_in
+from runner.runs.listing import run_in
+from runner.runs.run import new_run
 from runner.sweep import tag_of
 from runner.sweep.local import Workers
 from runner.sweep.model import Sweep

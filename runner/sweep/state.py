@@ -16,8 +16,9 @@ from runner.config.job import identity_of
 from runner.config.loading import read_text
 from runner.errors import ConfigError, RunnerError, nearest
 from runner.execution.resume import require_same_makers
+from runner.runs.listing import list_runs
 from runner.runs.locking import acquired
-from runner.runs.run import Run, list_runs
+from runner.runs.run import Run
 from runner.sweep import FILE, folder_of, sweeps_in, tag_of
 from runner.sweep.loading import from_values
 from runner.sweep.model import Sweep

@@ -25,7 +25,8 @@ from runner.cli.output import aligned, console, draw, print_json, printable, say
 from runner.cli.runs import find
 from runner.errors import RunnerError
 from runner.runs.catalogue.columns import STATUSES
-from runner.runs.run import recordings_folder, run_in
+from runner.runs.listing import run_in
+from runner.runs.run import recordings_folder
 from runner.util.humanize import UNKNOWN, age, number, size
 
 if TYPE_CHECKING:

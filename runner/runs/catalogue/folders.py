@@ -19,7 +19,8 @@ from peewee import SqliteDatabase, chunked
 from runner.recording.labels import LABELS_FILE
 from runner.runs.catalogue.database import tuples_of, write_rows
 from runner.runs.catalogue.rows import Row, row_of
-from runner.runs.run import RECORDING_FILE, RUN_FILE, run_entries, run_in
+from runner.runs.listing import run_entries, run_in
+from runner.runs.run import RECORDING_FILE, RUN_FILE
 
 _STABLE_NS: Final = 2 * 10**9
 """Files that changed this recently may change again with the same time: they are read again next time."""

@@ -14,7 +14,8 @@ from typing import Any, Final, Literal, Protocol
 
 from runner.client.jobs import JobProgress, LogEvent, RunEvent
 from runner.errors import RunnerError
-from runner.runs.run import Run, run_at
+from runner.runs.listing import run_at
+from runner.runs.run import Run
 
 REPORT_SECONDS: Final = 0.25
 OTHER_OWNER_SECONDS: Final = 60.0

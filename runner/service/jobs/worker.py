@@ -17,7 +17,8 @@ from runner.errors import RunnerError
 from runner.execution.resume import resume
 from runner.execution.session import Progress, evaluation_brief, run_job
 from runner.learning.numba_cache import MESSAGE, announced
-from runner.runs.run import Run, create_run, run_at
+from runner.runs.listing import run_at
+from runner.runs.run import Run, create_run
 from runner.service.jobs.channel import (
     REPORT_SECONDS,
     JobChannel,

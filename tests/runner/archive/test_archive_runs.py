@@ -17,8 +17,9 @@ from runner.cli import cli
 from runner.recording import schema
 from runner.recording.liveness import owner as this_process
 from runner.recording.reader import open_recording
+from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import create_run, list_runs
+from runner.runs.run import create_run
 from tests.runner.recording.making import TAXIS, experiment, make_run
 
 

@@ -19,7 +19,8 @@ from runner.recording.integrity import survey
 from runner.recording.liveness import owner
 from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
-from runner.runs.run import Run, list_runs
+from runner.runs.listing import list_runs
+from runner.runs.run import Run
 from tests.runner.altering import altered
 
 COMMANDS = ("resume", "rerecord", "evaluate", "verify", "repair", "qtable")

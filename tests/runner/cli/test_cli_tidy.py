@@ -18,8 +18,9 @@ import pytest
 from runner.cli.commands import remove
 from runner.config import from_mapping
 from runner.recording.labels import LABELS_FILE
+from runner.runs.listing import list_runs
 from runner.runs.locking import locked
-from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run, list_runs
+from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run
 
 CONFIG = from_mapping({"name": "some", "episodes": 5})
 

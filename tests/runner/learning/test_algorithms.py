@@ -19,7 +19,7 @@ from runner.recording import schema
 from runner.recording.blocks import blank_records, topic_sizes
 from runner.recording.reader import open_recording
 from runner.replay.tables import TableReplay, held_at, tables_at
-from runner.runs.run import list_runs
+from runner.runs.listing import list_runs
 from tests.runner.killing import LONG, kill_when, posix, start
 from tests.runner.learning import harness
 from tests.runner.recording.making import SAMPLED, TAXIS, experiment, make_run

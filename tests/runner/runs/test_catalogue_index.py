@@ -24,8 +24,9 @@ from runner.runs.catalogue.database import index_path, open_index
 from runner.runs.catalogue.filters import Filter, parse
 from runner.runs.catalogue.folders import Folders
 from runner.runs.catalogue.index import look
+from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run, list_runs
+from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run
 
 CONFIG = from_mapping({"name": "some", "episodes": 5})
 ALL = Filter(None)

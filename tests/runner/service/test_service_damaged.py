@@ -13,7 +13,8 @@ from runner.errors import RecordingError
 from runner.execution.verify import verify
 from runner.recording.reader import open_recording
 from runner.runs.importing import import_recording
-from runner.runs.run import RUN_FILE, list_runs
+from runner.runs.listing import list_runs
+from runner.runs.run import RUN_FILE
 from tests.runner.altering import altered
 
 

@@ -12,7 +12,7 @@ from submitted import ENDLESS, ICY
 
 import runner
 from runner.config import from_mapping
-from runner.runs.run import list_runs
+from runner.runs.listing import list_runs
 from runner.service.jobs import queue, workers
 from runner.service.jobs.queue import JobQueue
 from tests.waiting import until

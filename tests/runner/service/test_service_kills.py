@@ -12,7 +12,7 @@ import pytest
 from served import Served
 
 import runner
-from runner.runs.run import list_runs
+from runner.runs.listing import list_runs
 from runner.service.jobs.store import JobStore
 from runner.sweep import state
 from runner.sweep.loading import from_values

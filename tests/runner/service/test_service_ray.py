@@ -9,7 +9,7 @@ from submitted import ENDLESS, ICY
 
 import runner
 from runner.recording.reader import open_recording
-from runner.runs.run import list_runs
+from runner.runs.listing import list_runs
 from runner.service.jobs.checking import check
 from runner.service.jobs.queue import JobQueue
 from tests.waiting import until

@@ -20,8 +20,9 @@ from runner.execution.resume import resume
 from runner.execution.session import run_job
 from runner.export.mcap import export_mcap
 from runner.recording.labels import Labels, change_labels
+from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import create_run, list_runs
+from runner.runs.run import create_run
 from runner.service.errors import TooManyUploads, UploadConflict, UploadTooLarge
 from runner.service.settings import Limits
 from runner.service.upload import Announcement, Completion

@@ -13,7 +13,7 @@ from runner.client.client import Client
 from runner.client.connection import ServerError
 from runner.client.jobs import BestTrial, JobEvent, LogEvent, RemoteJob, SweepProgress, parse_events
 from runner.errors import RunnerError
-from runner.runs.run import list_runs
+from runner.runs.listing import list_runs
 
 CONFIG = {"name": "quick", "episodes": 600, "mode": "cooperative", "evaluation": {"every": 50, "trials": 400}}
 

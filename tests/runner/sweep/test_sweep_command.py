@@ -10,7 +10,7 @@ from sweeping import Here
 
 from runner.cli import cli
 from runner.config import load
-from runner.runs.run import list_runs
+from runner.runs.listing import list_runs
 from runner.sweep import cluster, plan
 
 

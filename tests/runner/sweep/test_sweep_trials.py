@@ -15,8 +15,9 @@ from runner.execution.rerecord import rerecord
 from runner.execution.session import run_job
 from runner.recording.labels import read_labels
 from runner.runs import provenance
+from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import create_run, list_runs
+from runner.runs.run import create_run
 from runner.sweep import local, state
 from runner.sweep.loading import from_values
 from runner.sweep.local import LocalWorkers
