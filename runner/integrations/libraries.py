@@ -10,7 +10,7 @@ from runner.loops.values import warn_user
 from runner.util.extras import require
 
 
-def tested_library(module: str, extra: str, tested: tuple[str, str]) -> Any:
+def require_tested(module: str, extra: str, tested: tuple[str, str]) -> Any:
     """Import the library of an adapter; warn if its version is not one of those that were tested.
 
     Args:

@@ -12,11 +12,11 @@ from gymnasium import spaces
 from runner.environments.mdp import MAX_AGENTS
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, kind_of
-from runner.loops.env import RecordedAlone, require_pictures
 from runner.loops.generators import GeneratorWatch
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, game_maker_of
 from runner.loops.options import options_of
+from runner.loops.recorded import RecordedAlone, require_pictures
 from runner.loops.single_rows import AgentRows
 from runner.loops.vector import by_field, require_fixed
 

@@ -15,11 +15,11 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWra
 
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, describe
-from runner.loops.env import Recorded, given, require_pictures
 from runner.loops.generators import VectorWatch
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, vector_maker_of
 from runner.loops.options import options_of
+from runner.loops.recorded import Recorded, given, require_pictures
 from runner.loops.vector_rows import VectorRows
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import runner
 from runner.errors import MissingExtra
-from runner.integrations.libraries import tested_library
+from runner.integrations.libraries import require_tested
 
 
 def test_no_library_is_imported_before_it_is_needed():
@@ -27,17 +27,17 @@ def test_an_adapter_that_does_not_exist_is_an_attribute_error():
 
 def test_a_library_that_is_not_installed_names_its_extra():
     with pytest.raises(MissingExtra, match=r"runner\.integrations\.sb3 needs absent_library.*\[sb3\]"):
-        tested_library("absent_library", "sb3", ("1.0", "2.0"))
+        require_tested("absent_library", "sb3", ("1.0", "2.0"))
 
 
 @pytest.mark.parametrize("version", ["1.9.9", "2.0.0", "2.1.7", "2.1rc1"])
 def test_versions_in_the_tested_range_give_no_warning(version, monkeypatch):
     monkeypatch.setattr(metadata, "version", lambda name: version)
-    assert tested_library("numpy", "sb3", ("1.9", "2.1")).ndarray
+    assert require_tested("numpy", "sb3", ("1.9", "2.1")).ndarray
 
 
 @pytest.mark.parametrize("version", ["1.8.9", "2.2.0", "3.0"])
 def test_other_versions_give_a_warning_with_the_range(version, monkeypatch):
     monkeypatch.setattr(metadata, "version", lambda name: version)
     with pytest.warns(RuntimeWarning, match=rf"numpy {version}, tested are 1\.9 to 2\.1"):
-        tested_library("numpy", "sb3", ("1.9", "2.1"))
+        require_tested("numpy", "sb3", ("1.9", "2.1"))

@@ -1,0 +1,237 @@
+"""What every recorded environment has: its run, the calls that record more than steps, its end."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import weakref
+from collections.abc import Iterator, Mapping
+from typing import Any, Generic, Literal, Self, TypeVar
+
+from runner.errors import ConfigError
+from runner.loops.generators import GeneratorWatch
+from runner.loops.loop import Loop, R
+from runner.loops.messages import Messages
+from runner.loops.options import Options
+from runner.loops.rows import Rows
+from runner.runs.run import Run
+
+S = TypeVar("S", bound=Rows)
+
+
+class Recorded(Generic[R]):
+    """What every recorded environment has besides the environment; a context manager."""
+
+    env: Any
+    _loop: Loop[R]
+    _messages: Messages
+    _options: Options
+    _until_frame = 0
+    """Steps up to the next frame."""
+    _owner: Recorded[R] | None = None
+    """The recorded environment that closes the recording, if it is another; this one keeps it alive."""
+    _phase: str
+    _rows: R
+
+    @property
+    def run(self) -> Run:
+        """The run that is recorded; it has a `summary` once it is closed."""
+        return self._loop.run
+
+    def log(self, name: str | Mapping[str, Any], value: Any = None) -> None:
+        """Record a number or a text under a name: `rec.log("loss", loss)`, `rec.log({"loss": loss})`.
+
+        Raises:
+            ConfigError: it is neither.
+        """
+        if isinstance(name, str):
+            self._messages.log(self._phase, name, value)
+            return
+        if not isinstance(name, Mapping) or value is not None:
+            raise ConfigError(f"log: found {name!r}, expected a name and a value, or a mapping of them")
+        for key, own in name.items():
+            if isinstance(own, Mapping):
+                self.log({f"{key}/{inner}": part for inner, part in own.items()})
+            else:
+                self._messages.log(self._phase, key, own)
+
+    def snapshot(self, name: str, array: Any) -> None:
+        """Record an array of numbers, or each of a mapping of arrays, as it is now: `rec.snapshot("q", q)`.
+
+        Tensors of PyTorch and JAX are accepted too; their short floats, such as bfloat16, become float32.
+        The arrays of a mapping, such as a `state_dict`, are named `name/key`.
+
+        Raises:
+            ConfigError: it holds something else, or an array is larger than 64 MB.
+        """
+        self._messages.snapshot(self._phase, name, array)
+
+    def checkpoint(self, name: str, value: Any, *, pickle: bool = False) -> str:
+        """Keep the agent's parameters as they are now: `rec.checkpoint("policy", model.state_dict())`.
+
+        The content goes into a store next to the runs, once for equal contents; the recording has its digest,
+        with the step.
+
+        Args:
+            name: its name, without `@`.
+            value: bytes, the path of a file, or a mapping of arrays or tensors, which becomes safetensors.
+            pickle: record any object by pickling it; it can be loaded only by those who trust it.
+
+        Returns:
+            The digest of the content, in hexadecimal.
+
+        Raises:
+            ConfigError: the name or the value cannot be recorded.
+            MissingExtra: a mapping needs safetensors, which is not installed.
+            StorageError: the file cannot be read, or the store cannot be written.
+        """
+        return self._messages.checkpoint(self._phase, name, value, pickle)
+
+    def note_step(self, values: Mapping[str, Any] | None = None, /, **more: Any) -> None:
+        """Record values with the last step, as `step(action, extras={...})` does.
+
+            rec.note_step(td_error=error)
+            rec.note_step({"td error": error})
+
+        A name keeps the dtype and the shape of its first value. Of a vector environment a value is an array
+        [N, ...]; of several agents it is a mapping of names for each agent.
+
+        Raises:
+            ConfigError: a name or a value cannot be recorded.
+            RunnerError: no step of this phase was taken since the last step of the other phase.
+        """
+        self._loop.note(self._phase, self._rows, self._extras_by_name({**(values or {}), **more}))
+
+    def _extras_by_name(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        return values
+
+    @contextlib.contextmanager
+    def phase(self, name: str) -> Iterator[Self]:
+        """Record what happens in the block in this phase, `train` or `eval`: `with rec.phase("eval"):`.
+
+        Each phase has its own episodes, so begin and end it with `reset()`.
+
+        Raises:
+            ConfigError: there is no such phase.
+        """
+        before = self._phase
+        self._enter(name)
+        try:
+            yield self
+        finally:
+            self._enter(before)
+
+    def close(self, **kwargs: Any) -> None:
+        """Close the environment, and the recording as finished unless it belongs to another environment."""
+        try:
+            self.env.close(**kwargs)
+        finally:
+            if self._owner is None:
+                self._loop.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: Any) -> Literal[False]:
+        try:
+            self.env.close()
+        finally:
+            if self._owner is None:
+                self._loop.close(*_ending(raised[1]))
+        return False
+
+    def _enter(self, phase: str) -> None:
+        self._phase = phase
+        self._rows = self._loop.rows(phase)
+        self._take_extras = self._loop.extras.taker(phase, self._rows)
+
+    def _record_into(self, loop: Loop[R], is_owner: bool = True) -> None:
+        """Record into a loop; its owner closes it when the process ends, if not before."""
+        self._loop, self._messages, self._options = loop, loop.messages, loop.options
+        loop.views.add(self)
+        if is_owner:
+            weakref.finalize(self, _close_abandoned, loop)
+
+    def _detach(self) -> None:
+        """Record nothing more: this process was forked from the one that records."""
+        self._enter(self._phase)
+
+
+def _ending(error: BaseException | None) -> tuple[str, str]:
+    """Return the status of a run that ended with this error, and the text of the error."""
+    if error is None:
+        return "finished", ""
+    if isinstance(error, KeyboardInterrupt) or (isinstance(error, SystemExit) and not error.code):
+        return "interrupted", ""
+    return "failed", f"{type(error).__name__}: {error}"
+
+
+def _close_abandoned(loop: Loop[Any]) -> None:
+    """Close a recording that was not closed: as failed if an uncaught exception ended the process.
+
+    Python keeps such an exception in `sys.last_value`; an interactive session continues after it.
+    """
+    error = getattr(sys, "last_value", None)
+    is_interactive = bool(sys.flags.interactive) or hasattr(sys, "ps1")
+    loop.close(*(("interrupted", "") if error is None or is_interactive else _ending(error)))
+
+
+def given(**arguments: Any) -> dict[str, Any]:
+    """Return the arguments that are not None: an environment's `reset` may not have the others."""
+    return {name: value for name, value in arguments.items() if value is not None}
+
+
+class RecordedAlone(Recorded[S]):
+    """What a recorded environment has that steps alone, not in a vector: an environment or a game."""
+
+    _watch: GeneratorWatch
+
+    def _enter(self, phase: str) -> None:
+        super()._enter(phase)
+        self._watch.due = 0
+
+    def _steps_so_far(self) -> int:
+        """Return the number of steps of the phase; another thread may be committing some of them."""
+        with self._loop.lock:
+            return self._rows.place[0]
+
+    def _record_frame(self, is_reset: bool = False, is_over: bool = False) -> None:
+        """Record a picture of the last step or reset, if the options include it."""
+        self._until_frame -= 1
+        every = self._options.frames_every
+        if every and (is_reset or is_over or self._until_frame <= 0):
+            self._until_frame = every
+            self._messages.frame(self._phase, self.env.render(), is_reset)
+
+    def _recorded_reset(self, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, Any]:
+        """Reset the environment, and record it: the seed, the options, the observation."""
+        before = dict(options) if options else None  # the environment may change them
+        state = self._watch.before(self._steps_so_far()) if seed is None else None
+        result: tuple[Any, Any] = self.env.reset(**given(seed=seed, options=options))
+        state = self._watch.after(state, seed)
+        observation, info = result
+        with self._loop.lock:
+            self._loop.activate(self._rows)
+            self._rows.reset(observation, seed)
+            if state is not None:
+                self._messages.reset_state(self._phase, state._replace(reset=self._rows.resets - 1))
+        self._messages.reset_info(self._phase, self._info_by_field(info), before, seed)
+        self._record_frame(is_reset=True)
+        return result
+
+    def _info_by_field(self, info: Mapping[str, Any]) -> Mapping[str, Any]:
+        return info
+
+
+def require_pictures(env: Any) -> None:
+    """Refuse an environment that renders no pictures, in a run with frames.
+
+    Raises:
+        ConfigError: it is made with another `render_mode` than "rgb_array".
+    """
+    mode = getattr(env, "render_mode", None)
+    if mode != "rgb_array":
+        raise ConfigError(
+            f"frames_every: found an environment with render_mode={mode!r}, expected "
+            "'rgb_array': make it with render_mode=\"rgb_array\"."
+        )
