@@ -6,6 +6,7 @@ row waits for `note_step` until the next step is taken.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
@@ -27,10 +28,12 @@ _MAX_BYTES: Final = 4 << 20
 """The most rows, and bytes of them, that wait for the recorder."""
 _MAX_DIMENSIONS: Final = 8
 _PYTHON: Final = {bool: "?", int: "<i8", float: "<f8"}
+_CODES: Final = {"b": "?", "i": "bhiq", "u": "BHIQ", "f": " efd"}
+"""The codes of `struct` by the kind of a dtype, from 1 byte to 8."""
 _TOPICS: Final = {"train": schema.TRAIN_EXTRA, "eval": schema.EVAL_EXTRA}
 
-Put = Callable[[int, Any], None]
-"""Puts a value into a row of its column."""
+Put = Callable[[Any], None]
+"""Adds a value to its column, or raises `ConfigError`."""
 
 
 class Extras:
@@ -48,10 +51,11 @@ class Extras:
         self._dtypes: dict[str, np.dtype[Any]] = {}
         self._is_described = False
         """Whether the recording has the names and dtypes."""
-        self._columns: dict[str, NDArray[Any]] = {}
-        """By name, [rows, *batch, *shape]."""
-        self._put: dict[str, Put] = {}
-        self._room = 0
+        self._columns: dict[str, list[bytes]] = {}
+        """By name, the bytes of [*batch, *shape] in each row; zeros where there is no value."""
+        self._fast: dict[str, tuple[np.dtype[Any], tuple[int, ...], Callable[[bytes], None], Put]] = {}
+        """By name, dtype and shape of the usual values, which are appended, and what takes all others."""
+        self._max_rows = 0
         self._phase = ""
         self._steps: list[int] = []
         """The number of the step of each row; of several environments, that of the first."""
@@ -72,7 +76,7 @@ class Extras:
         Raises:
             ConfigError: (from the returned function) a name or a value cannot be recorded.
         """
-        steps, put, partial, taken, n = self._steps, self._put, self._partial, self._taken, self._n
+        steps, fast, taken, n, array = self._steps, self._fast, self._taken, self._n, np.ndarray
 
         def take(values: Mapping[str, Any]) -> None:
             if not values:
@@ -80,14 +84,28 @@ class Extras:
             row = len(steps)
             try:
                 for name, value in values.items():
-                    put[name](row, value)
-            except (AttributeError, IndexError, KeyError):  # no mapping, no room, or a new name
-                row = self._put_new(row, values)
+                    dtype, shape, append, put = fast[name]
+                    if value.__class__ is array and value.dtype is dtype and value.shape == shape:
+                        append(value.tobytes())
+                    else:
+                        put(value)
+            except (AttributeError, KeyError):  # no mapping, or a new name
+                self._cut(row)
+                self._grow(row, values)
+                take(values)
+                return
+            except ConfigError:
+                self._cut(row)
+                raise
             if not row:
                 self._phase = phase
             steps.append(taken[phase] + rows.filled - n)
-            if len(values) != len(put):
-                partial[row] = set(values)
+            if len(values) != len(fast):
+                self._partial[row] = set(values)
+                for name in self._columns.keys() - values.keys():
+                    self._columns[name].append(self._zeros(name))
+            if row >= self._max_rows:
+                self._write(row)
 
         return take
 
@@ -112,26 +130,36 @@ class Extras:
         if not self._steps or self._steps[-1] != step:
             self.taker(phase, rows)(values)
             return
-        row = self._put_new(len(self._steps) - 1, values)
-        if row in self._partial:
-            self._partial[row].update(values)
+        self._grow(len(self._steps) - 1, values)
+        n = len(self._steps)
+        try:
+            for name, value in values.items():
+                self._fast[name][-1](value)
+        except ConfigError:
+            self._cut(n)
+            raise
+        for name in values:
+            del self._columns[name][-2]
+        if n - 1 in self._partial:
+            self._partial[n - 1].update(values)
 
-    def _put_new(self, row: int, values: Mapping[str, Any]) -> int:
-        """Put down values of which some may have new names; return the row that they have then."""
+    def _cut(self, rows: int) -> None:
+        """Remove what was put down of a row after these."""
+        for column in self._columns.values():
+            del column[rows:]
+
+    def _zeros(self, name: str) -> bytes:
+        return bytes(self._dtypes[name].itemsize * self._n)
+
+    def _grow(self, row: int, values: Mapping[str, Any]) -> None:
+        """Add the names that are new, of which rows before this one have no values."""
         if not isinstance(values, Mapping):
             raise ConfigError(f"extras: found {type(values).__name__}, expected values by name")
-        if row == self._room:
-            self._write(row)
-            row = 0
-        fresh = {name: self._dtype_of(name, value) for name, value in values.items() if name not in self._put}
-        if fresh:
-            row = self._grow(row, fresh)
-        for name, value in values.items():
-            self._put[name](row, value)
-        return row
-
-    def _grow(self, row: int, fresh: dict[str, np.dtype[Any]]) -> int:
-        """Add names, of which rows before this one have no values; return the row that it is now."""
+        fresh = {
+            name: self._dtype_of(name, value) for name, value in values.items() if name not in self._fast
+        }
+        if not fresh:
+            return
         dtypes = self._dtypes | fresh
         if len(dtypes) > MAX_NAMES:
             raise ConfigError(f"extras: found more than {MAX_NAMES} names, the last {list(dtypes)[-1]!r}")
@@ -143,15 +171,12 @@ class Extras:
         self._write(row)
         if self._steps:
             self._partial.setdefault(0, set(self._dtypes))
-        self._room = max(1, min(_MAX_ROWS, _MAX_BYTES // (size * self._n)))
-        before, self._columns = self._columns, {}
-        for name, dtype in dtypes.items():
-            column = np.zeros((self._room, *self._batch, *dtype.shape), dtype.base.str)
-            if name in before:
-                column[:1] = before[name][:1]
-            self._columns[name], self._put[name] = column, _filler(name, column)
+        self._max_rows = min(_MAX_ROWS, _MAX_BYTES // (size * self._n))
         self._dtypes, self._is_described = dtypes, False
-        return 0
+        for name, dtype in fresh.items():
+            self._columns[name] = column = [self._zeros(name)] * len(self._steps)
+            base, shape = np.dtype(dtype.base.str), (*self._batch, *dtype.shape)
+            self._fast[name] = base, shape, column.append, _putter(name, base, shape, column)
 
     def _dtype_of(self, name: Any, value: Any) -> np.dtype[Any]:
         """Return the dtype, with the shape, that a name gets by its first value."""
@@ -197,61 +222,56 @@ class Extras:
             recorder.resize(dict.fromkeys(_TOPICS.values(), layout.sizes))
             self._is_described = True
         given = self._given(n)
+        columns = {
+            name: np.frombuffer(b"".join(column[:n]), self._dtypes[name])
+            for name, column in self._columns.items()
+        }
         steps = np.add.outer(np.array(self._steps[:n]), np.arange(self._n)).ravel()
         done = 0
         while done < len(steps):
             block = recorder.block(topic)[: len(steps) - done]
             part = slice(done, done + len(block))
             block["step"] = steps[part]
-            for name, column in self._columns.items():
-                values = column[:n].reshape(len(steps), *self._dtypes[name].shape)
+            for name, values in columns.items():
                 block["values"][name] = values[part]
                 block["given"][name] = given[name][part]
             recorder.take(topic, (steps[part] + first).astype(np.uint64))
             done += len(block)
         self._final[self._phase] = int(steps[-1])
-        self._keep_from(n)
+        del self._steps[:n]
+        for column in self._columns.values():
+            del column[:n]
+        self._partial = {row - n: names for row, names in self._partial.items() if row >= n}
 
     def _given(self, n: int) -> dict[str, NDArray[np.bool_]]:
-        """Return whether each environment's step has a value, by name, in n rows; clear the rest."""
+        """Return whether each environment's step has a value, by name, in n rows."""
         given = {name: np.ones(n, np.bool_) for name in self._dtypes}
         for row, names in self._partial.items():
             for name in given.keys() - names if row < n else ():
                 given[name][row] = False
-                self._columns[name][row] = 0
         return {name: np.repeat(flags, self._n) for name, flags in given.items()}
 
-    def _keep_from(self, n: int) -> None:
-        """Remove the first n rows; at most one remains."""
-        del self._steps[:n]
-        if self._steps:
-            for column in self._columns.values():
-                column[0] = column[n]
-        left = {row - n: names for row, names in self._partial.items() if row >= n}
-        self._partial.clear()
-        self._partial.update(left)
 
-
-def _filler(name: str, column: NDArray[Any]) -> Put:
-    """Return a function that puts a value of a name into a row of its column.
+def _putter(name: str, base: np.dtype[Any], shape: tuple[int, ...], column: list[bytes]) -> Put:
+    """Return a function that adds a value of a name to its column, which is of this dtype and shape.
 
     Raises:
         ConfigError: (from the returned function) it has another shape or dtype than the first one.
     """
-    base, shape, array = column.dtype, column.shape[1:], np.ndarray
-    exact = {kind for kind in SCALARS if np.can_cast(kind, base)}
+    exact = {
+        kind for kind in SCALARS if np.can_cast(kind, base) and (kind is not np.bool_ or base.kind == "b")
+    }
     exact |= {kind for kind, held in _PYTHON.items() if np.dtype(held) == base}
     scalars = frozenset(() if shape else exact)
+    pack, append = struct.Struct("<" + _CODES[base.kind][base.itemsize.bit_length() - 1]).pack, column.append
 
-    def put(row: int, value: Any) -> None:
-        if value.__class__ is array and value.dtype is base and value.shape == shape:
-            column[row] = value
-            return
+    def put(value: Any) -> None:
         if value.__class__ not in scalars:
-            value = _fitting(name, value, base, shape)
+            append(_fitting(name, value, base, shape).astype(base).tobytes())
+            return
         try:
-            column[row] = value
-        except OverflowError as error:
+            append(pack(value))
+        except struct.error as error:
             raise ConfigError(f"extras: found {value} for {name!r}, which {base} cannot hold") from error
 
     return put

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
-from runner.recording.schema import TOPIC_OF, UNIFORM_TOPICS, Topic
+from runner.recording.schema import EXTRA, TOPIC_OF, UNIFORM_TOPICS, Topic
 from runner.util.packing import MAX_CHUNK_STEPS, Packing
 
 MAX_CHUNK_BYTES: Final = 64 << 20
@@ -70,8 +70,17 @@ def encode_chunk(
     head = CHUNK_HEAD.pack(start, end, size, zlib.crc32(records), len(name)) + name.encode()
     head += _DATA_LENGTH.pack(len(data))
     record = b"".join((RECORD_HEAD.pack(Opcode.CHUNK, len(head) + len(data)), head, data))
-    index = message_index(topic.channel, log_times, offsets) if packing.index == "message" else b""
+    indexed = has_message_index(topic, packing.index == "message")
+    index = message_index(topic.channel, log_times, offsets) if indexed else b""
     return Chunk(record, index, name, len(data), size, start, end, len(log_times))
+
+
+def has_message_index(topic: Topic, indexed: bool) -> bool:
+    """Return whether message indexes are written for a topic, in a recording that has them or not.
+
+    Those of extras would be as large as the extras; they are found by their chunks.
+    """
+    return indexed and topic.message is not EXTRA
 
 
 def message_index(channel: int, log_times: NDArray[np.uint64], offsets: NDArray[np.uint64]) -> bytes:

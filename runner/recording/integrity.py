@@ -22,7 +22,7 @@ from mcap.writer import MCAP0_MAGIC
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import RECORD_HEAD
-from runner.recording.chunks import MAX_CHUNK_BYTES, message_index
+from runner.recording.chunks import MAX_CHUNK_BYTES, has_message_index, message_index
 from runner.recording.records import (
     MAX_NAME_BYTES,
     MAX_NAMED,
@@ -195,22 +195,24 @@ def _take_records(stream: BinaryIO, contents: Contents, keep_result: bool, repor
     Raises:
         RecordingError: one is damaged, or the file ends before the data section does.
     """
-    indexed, chunk = True, None
-    """Whether each chunk has a message index; the chunk before its index."""
+    indexed, is_taken = True, False
+    chunk: ReadChunk | None = None
+    """The last chunk, if an index may follow; `is_taken` if it need not."""
     for opcode, at, body in walk(stream, contents.size):
         if opcode == Opcode.DATA_END:
             return
         report(at, contents.size)
         try:
-            if chunk is not None:
+            if chunk is not None and (opcode == Opcode.MESSAGE_INDEX or not is_taken):
                 _take_index(contents, chunk, opcode, at, body)
                 chunk = None
             elif opcode == Opcode.CHUNK:
                 chunk = _checked_chunk(body, at)
-                if indexed:
+                is_taken = not has_message_index(schema.TOPIC_OF[chunk.summary.channel], indexed)
+                if not is_taken:
                     continue
                 contents.chunks.append(chunk.summary)
-                chunk = None
+                chunk = chunk if indexed else None  # earlier versions wrote an index of extras too
             elif opcode == Opcode.METADATA:
                 name, entries = metadata_of(body)
                 if name == "result" and not keep_result:
@@ -248,7 +250,7 @@ def _checked_chunk(body: bytes, at: int) -> ReadChunk:
 
 
 def _take_index(contents: Contents, chunk: ReadChunk, opcode: int, at: int, body: bytes) -> None:
-    """Compare a message index with the chunk before it, and note the chunk."""
+    """Compare a message index with the chunk before it, and note both."""
     index = chunk.summary.index
     if opcode != Opcode.MESSAGE_INDEX:
         raise RecordingError(f"chunk at {index.chunk_start_offset}: has no message index")
@@ -256,7 +258,8 @@ def _take_index(contents: Contents, chunk: ReadChunk, opcode: int, at: int, body
         raise RecordingError(f"the message index at {at} does not lead to the chunk's messages")
     index.message_index_offsets[chunk.summary.channel] = at
     index.message_index_length = RECORD_HEAD.size + len(body)
-    contents.chunks.append(chunk.summary)
+    if not contents.chunks or contents.chunks[-1] is not chunk.summary:
+        contents.chunks.append(chunk.summary)
 
 
 def _note(entries: list[N], entry: N) -> None:

@@ -26,6 +26,7 @@ from runner.recording.chunks import (
     MAX_CHUNK_BYTES,
     Chunk,
     chunk_head,
+    has_message_index,
     message_index,
     unpack_chunk,
 )
@@ -215,10 +216,11 @@ def copied_chunk(chunk: ReadChunk, body: bytes, indexed: bool) -> Chunk:
     Args:
         chunk: the chunk.
         body: its record after the head.
-        indexed: whether a message index follows it.
+        indexed: whether the recording has message indexes.
     """
     summary, start, end = chunk.summary, int(chunk.times[0]), int(chunk.times[-1])
     body = _CHUNK_TIMES.pack(start, end) + body[_CHUNK_TIMES.size :]  # no checksum covers them
+    indexed = has_message_index(schema.TOPIC_OF[summary.channel], indexed)
     return Chunk(
         record=RECORD_HEAD.pack(Opcode.CHUNK, len(body)) + body,
         index=message_index(summary.channel, chunk.times, chunk.offsets) if indexed else b"",

@@ -15,7 +15,7 @@ from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
 from runner.recording.index import ChunkEntry, ChunkTable, Index
 from runner.recording.record_store import RecordStore
-from runner.recording.schema import ALL_TOPICS, STEP_NANOSECONDS, Topic
+from runner.recording.schema import ALL_TOPICS, EXTRA_TOPICS, STEP_NANOSECONDS, Topic
 
 _MANY: Final = 32
 """The least number of chunks of one size whose topic is inferred instead of unpacking them."""
@@ -26,7 +26,7 @@ def chunks_by_topic(
 ) -> dict[Topic, NDArray[np.intp]]:
     """Return which chunks of a file hold each topic's messages, in order.
 
-    Without message indexes the topic of a chunk stands only in the chunk itself. Unpacking the beginning of
+    Without a message index the topic of a chunk stands only in the chunk itself. Unpacking the beginning of
     every chunk takes seconds in a long recording, so most topics are inferred if the summary determines them.
 
     Args:
@@ -40,7 +40,10 @@ def chunks_by_topic(
     """
     table = index.chunks
     channels = table.columns["channel"].copy() if table else np.empty(0, np.uint16)
-    if index.message_counts and np.count_nonzero(channels == 0) >= _MANY:
+    if channels.any():  # only extras are without message indexes
+        counted = [topic.channel for topic in EXTRA_TOPICS if index.message_counts.get(topic.channel)]
+        channels[channels == 0] = counted[0] if len(counted) == 1 else 0
+    elif index.message_counts and np.count_nonzero(channels == 0) >= _MANY:
         channels = _with_inferred(index, store, dtypes, channels)
     _probe(np.flatnonzero(channels == 0), table, store, channels)
     for k in np.flatnonzero(~np.isin(channels, list(index.channels))).tolist():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -11,6 +12,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
 from rerun.chunk import RrdReader
 
 import runner
@@ -21,11 +24,12 @@ from runner.export.rerun.selection import Request
 from runner.export.rerun.writing import export
 from runner.recording import schema
 from runner.recording.blocks import message_record
-from runner.recording.chunks import encode_chunk
+from runner.recording.chunks import encode_chunk, message_index
 from runner.recording.integrity import survey
 from runner.recording.messages import encode
-from runner.recording.records import copied_chunk, metadata_of, read_chunk, walk
+from runner.recording.records import attachment_of, copied_chunk, metadata_of, read_chunk, walk
 from runner.recording.writer import RecordingFile
+from runner.util.files import open_regular
 from runner.util.packing import Packing
 from tests.runner.loops.making import Leaving, dualtaxi, make, play
 
@@ -281,6 +285,38 @@ def test_a_killed_loop_keeps_its_extras_and_a_repair_too(tmp_path):
         found = np.concatenate([block["values"]["k"] for block in blocks])
         assert found.tolist() == list(range(len(found)))
         assert len(found) >= 3000
+
+
+def test_recordings_with_message_indexes_of_extras_are_read_as_those_without(tmp_path):
+    """Versions before wrote them."""
+    run, _ = record_pole(tmp_path, 9000)
+    earlier = Path(tmp_path, "earlier.mcap")
+    with open_regular(run.recording) as stream, RecordingFile(earlier, schema.KINDS["transition"]) as file:
+        for opcode, offset, body in walk(stream, run.recording.stat().st_size):
+            if opcode == Opcode.METADATA and (metadata := metadata_of(body))[0] != "result":
+                file.add_metadata(*metadata)
+            elif opcode == Opcode.ATTACHMENT:
+                file.add_attachment(*attachment_of(body, offset))
+            elif opcode == Opcode.CHUNK:
+                chunk = read_chunk(body, offset)
+                index = message_index(chunk.summary.channel, chunk.times, chunk.offsets)
+                new = replace(copied_chunk(chunk, body, indexed=True), index=index)
+                file.add_chunk(schema.TOPIC_OF[chunk.summary.channel], new)
+        with runner.open_recording(run.recording) as recording:
+            file.finish("result", recording.metadata("result"))
+    assert earlier.stat().st_size > run.recording.stat().st_size + 9000 * 16
+    verdicts = [verify(path) for path in (earlier, run.recording)]
+    assert verdicts[0].finding == verdicts[1].finding == ""
+    with runner.open_recording(earlier) as old, runner.open_recording(run.recording) as new:
+        for phase in ("train", "eval"):
+            pairs = zip(old.extras(phase).blocks(), new.extras(phase).blocks(), strict=True)
+            assert all((a.tobytes() == b.tobytes()) for a, b in pairs)
+    with run.recording.open("rb") as stream:
+        reader = make_reader(stream)
+        assert sum(1 for _ in reader.iter_messages(topics=["/train/extra"])) == 9000
+    (tmp_path / "cut.mcap").write_bytes(run.recording.read_bytes()[:-9000])  # without its summary
+    with runner.open_recording(tmp_path / "cut.mcap") as recording:
+        assert len(recording.extras("train")) == 3
 
 
 def test_forged_names_are_refused(tmp_path):
