@@ -8,7 +8,7 @@ import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
@@ -22,8 +22,13 @@ from runner.loops.options import options_of
 from runner.loops.recorded import Recorded, given, require_pictures
 from runner.loops.vector_rows import VectorRows
 
+if TYPE_CHECKING:
+    _Wrapper = VectorWrapper[Any, Any, Any, Any, Any]
+else:
+    _Wrapper = VectorWrapper  # it takes no parameters before Gymnasium 1.3
 
-class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any]):
+
+class RecordedVector(Recorded[VectorRows], _Wrapper):
     """A vector environment whose every reset and step is recorded; made by `record_vector`."""
 
     env: VectorEnv[Any, Any, Any]
