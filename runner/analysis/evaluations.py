@@ -53,6 +53,8 @@ class EvaluationRecord:
     number: int
     episode: int
     """Training episodes before it."""
+    step: int
+    """Training steps before it."""
     trials: int
     successes: int | None
     """None if the environment does not define success."""
@@ -81,11 +83,12 @@ class EvaluationRecord:
     def as_json(self) -> dict[str, Any]:
         """Return the record as JSON can hold it, each metric under its `key`."""
         training = self.training.as_json() if self.training else {}
-        position = {"episode": self.episode} | ({"step": training.pop("step")} if training else {})
-        training.pop("episode", None)
+        for position in ("episode", "step"):
+            training.pop(position, None)
         return {
             "evaluation": self.number,
-            **position,
+            "episode": self.episode,
+            "step": self.step,
             "trials": self.trials,
             "successes": self.successes,
             **{
@@ -193,6 +196,7 @@ def evaluation_record(
     return EvaluationRecord(
         number=metrics["evaluation"],
         episode=metrics["episode"],
+        step=metrics["step"],
         trials=metrics["trials"],
         successes=metrics["successes"] if metrics["successes"] >= 0 else None,
         values={
@@ -222,6 +226,7 @@ def _loop_record(recording: Recording, evaluation: Evaluation, trials: NDArray[n
     return EvaluationRecord(
         number=evaluation.number,
         episode=evaluation.after,
+        step=evaluation.train_step,
         trials=len(trials),
         successes=int(trials["success"].sum()) if environment["success_events"] else None,
         values=means,

@@ -7,6 +7,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from runner.analysis.axes import Axis
 from runner.analysis.series import RunSeries
 from runner.errors import RunnerError, nearest
 from runner.recording.metrics import METRICS, SHARES
@@ -25,6 +26,11 @@ class Group:
     runs: tuple[RunSeries, ...]
     left_out: tuple[str, ...] = ()
     """The ids of runs that repeat one of these."""
+
+    @property
+    def axis(self) -> Axis:
+        """The axis over which its runs were read."""
+        return self.runs[0].axis
 
     @property
     def described(self) -> str:

@@ -1,16 +1,18 @@
-"""The metrics of runs over training episodes, read from their recordings, for plots and comparisons."""
+"""The metrics of runs over an axis, read from their recordings, for plots and comparisons."""
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.axes import EPISODES, Axis, Positions, edges_of, positions
 from runner.analysis.evaluations import (
     EvaluationRecord,
     TrainingRecord,
@@ -32,6 +34,9 @@ _MAX_TITLE: Final = 40
 _MAX_POINTS: Final = 200
 _MAX_NAMES: Final = 64
 
+Place = TypeVar("Place", int, float)
+"""A position on an axis."""
+
 
 @dataclass(frozen=True)
 class RunSeries:
@@ -44,15 +49,17 @@ class RunSeries:
     status: str
     """`finished`, `interrupted` or `failed`."""
     config: Mapping[str, Any]
-    evaluation: list[tuple[int, Readings]]
-    """(episode, readings) of every evaluation."""
-    training: list[tuple[int, Readings]]
-    """(episode, readings) of every report of training, those at evaluations among them."""
+    evaluation: list[tuple[float, Readings]]
+    """(position, readings) of every evaluation; positions on an axis of whole numbers are integers."""
+    training: list[tuple[float, Readings]]
+    """(position, readings) of every report of training, those at evaluations among them."""
     content_digest: str = ""
     """Digest of the recording; empty if that is not finished."""
     not_finite: Mapping[str, int] = field(default_factory=dict)
     """Metric -> number of recorded values that are infinite, NaN or too large to be averaged, which the
     readings leave out."""
+    axis: Axis = EPISODES
+    """The axis of the positions."""
 
     @property
     def finished(self) -> bool:
@@ -101,41 +108,42 @@ def title_of(metric: str) -> tuple[str, str]:
 # --- curves -------------------------------------------------------------------------------------------
 
 
-def points_of(run: RunSeries, metric: str, line: str, aligned: bool) -> dict[int, float]:
-    """Return value by episode; a reward that was never paid is 0 percent of the steps.
+def points_of(run: RunSeries, metric: str, line: str, aligned: bool) -> dict[float, float]:
+    """Return value by position; a reward that was never paid is 0 percent of the steps.
 
     Args:
         run: the run.
         metric: the metric.
         line: an agent, a reward, or "".
         aligned: of the reports of training only those at evaluations, which are at the same episodes in
-            every run of a configuration; all of them if the run has no evaluation.
+            every run of a configuration; all of them if the run has no evaluation, or on another axis.
     """
     source = run.training if metric.startswith("training.") else run.evaluation
-    at_evaluations = set() if run.is_loop else {episode for episode, _ in run.evaluation}
+    is_aligned = aligned and run.axis is EPISODES and not run.is_loop
+    at_evaluations = {place for place, _ in run.evaluation} if is_aligned else set()
     missing = 0.0 if metric == SHARES else np.nan
     points = {
-        episode: readings[metric].get(line, missing)
-        for episode, readings in source
-        if metric in readings and (not aligned or not at_evaluations or episode in at_evaluations)
+        place: readings[metric].get(line, missing)
+        for place, readings in source
+        if metric in readings and (not at_evaluations or place in at_evaluations)
     }
-    return {episode: value for episode, value in points.items() if not np.isnan(value)}
+    return {place: value for place, value in points.items() if not np.isnan(value)}
 
 
-def first_crossing(points: Mapping[int, float], level: float) -> int | None:
-    """Return the first episode at which a curve is at a level, or on the other side than where it began."""
+def first_crossing(points: Mapping[Place, float], level: float) -> Place | None:
+    """Return the first position at which a curve is at a level, or on the other side than where it began."""
     below = points[min(points)] < level
-    for episode in sorted(points):
-        if points[episode] >= level if below else points[episode] <= level:
-            return episode
+    for place in sorted(points):
+        if points[place] >= level if below else points[place] <= level:
+            return place
     return None
 
 
-def mean_height(episodes: Sequence[int], values: Sequence[float]) -> float:
+def mean_height(places: Sequence[float], values: Sequence[float]) -> float:
     """Return the area under a curve, by the trapezoid rule, over its span; nan for fewer than two points."""
-    if len(episodes) < 2:
+    if len(places) < 2:
         return math.nan
-    return float(np.trapezoid(values, episodes)) / (episodes[-1] - episodes[0])
+    return float(np.trapezoid(values, places)) / (places[-1] - places[0])
 
 
 def parse_target(text: str) -> tuple[str, float]:
@@ -154,14 +162,18 @@ def parse_target(text: str) -> tuple[str, float]:
 # --- reading ------------------------------------------------------------------------------------------
 
 
-def read_series(recording: Recording) -> RunSeries:
-    """Return the metrics of a recording, also of one that was cut off.
+def read_series(recording: Recording, axis: Axis = EPISODES) -> RunSeries:
+    """Return the metrics of a recording over an axis, also of one that was cut off.
 
     The returns and lengths of a loop's training episodes, and the values it logged, are means over at most
-    200 stretches of 1, 2, 5, 10, ... episodes, so that those of several runs agree. Values that are not
-    finite are left out of the means, and counted in `not_finite`.
+    200 stretches of 1, 2, 5, 10, ... episodes (or steps, ...), so that those of several runs agree. Values
+    that are not finite are left out of the means, and counted in `not_finite`.
+
+    Raises:
+        RecordingError: the recording is damaged, or does not have the axis.
     """
     not_finite: Counter[str] = Counter()
+    places = positions(recording, axis)
     evaluations = evaluation_records(recording)
     config = recording.config
     if recording.has_reports:
@@ -169,10 +181,10 @@ def read_series(recording: Recording) -> RunSeries:
         exact = {each["evaluation"]: exact_readings(each, agents) for each in recording.optimality()}
         readings = [evaluation_readings(each) | exact.get(each.number, {}) for each in evaluations]
         reports = [*training_records(recording), *(each.training for each in evaluations if each.training)]
-        training = [(each.episode, training_readings(each)) for each in reports]
+        training = [(places.one(each.episode, each.step), training_readings(each)) for each in reports]
     else:
         readings = [_single_agent_unnamed(evaluation_readings(each)) for each in evaluations]
-        training = list(_loop_training(recording, not_finite).items())
+        training = _loop_training(recording, places, not_finite)
         if left_out := sum(each.not_finite for each in evaluations):
             not_finite["mean_return"] = left_out
         own = config.get("config")
@@ -184,10 +196,14 @@ def read_series(recording: Recording) -> RunSeries:
         seed=recording.seed,
         status=recording.status,
         config=config,
-        evaluation=[(each.episode, own) for each, own in zip(evaluations, readings, strict=True)],
+        evaluation=[
+            (places.one(each.episode, each.step), own)
+            for each, own in zip(evaluations, readings, strict=True)
+        ],
         training=sorted(training, key=lambda entry: entry[0]),
         content_digest=recording.result.content_digest or "",
         not_finite=dict(not_finite),
+        axis=axis,
     )
 
 
@@ -247,28 +263,31 @@ def _single_agent_unnamed(readings: Readings) -> Readings:
     }
 
 
-def _loop_training(recording: Recording, not_finite: Counter[str]) -> dict[int, Readings]:
-    """Return the means over stretches of training episodes, by the last episode of the stretch."""
-    total = recording.count(schema.TRAIN_EPISODE)
-    widths = (factor * 10**power for power in range(18) for factor in (1, 2, 5))
-    width = next(width for width in widths if total <= width * _MAX_POINTS)
-    edges = np.arange(0, max(total, 1) + width, width)
-    training = _mean_episodes(recording, edges, not_finite)
-    for name, values in _mean_scalars(recording, edges, not_finite).items():
+def _loop_training(
+    recording: Recording, places: Positions, not_finite: Counter[str]
+) -> list[tuple[float, Readings]]:
+    """Return the means over stretches of training, by the end of the stretch."""
+    done = recording.done()
+    last = float(places.at(done["episodes"], done["train_steps"]))
+    edges = edges_of(places.axis, last, _MAX_POINTS)
+    training = _mean_episodes(recording, places, edges, not_finite)
+    for name, values in _mean_scalars(recording, places, edges, not_finite).items():
         for k in np.flatnonzero(~np.isnan(values)).tolist():
-            training.setdefault(int(edges[k + 1]), {})[f"{LOGGED}{name}"] = {"": float(values[k])}
-    return training
+            training.setdefault(k, {})[f"{LOGGED}{name}"] = {"": float(values[k])}
+    ends = (edges.astype(np.int64) if places.axis.whole else edges).tolist()
+    return [(ends[k + 1], readings) for k, readings in training.items()]
 
 
 def _mean_episodes(
-    recording: Recording, edges: NDArray[np.int64], not_finite: Counter[str]
+    recording: Recording, places: Positions, edges: NDArray[np.float64], not_finite: Counter[str]
 ) -> dict[int, Readings]:
-    """Return mean length and return of the training episodes between the edges."""
+    """Return mean length and return of the training episodes that end in each stretch, by its number."""
     agents, bins = recording.agents, len(edges) - 1
     count, length = np.zeros(bins), np.zeros(bins)
     returns, usable_returns = np.zeros((bins, len(agents))), np.zeros((bins, len(agents)))
     for block in recording.blocks(schema.TRAIN_EPISODE):
-        at = (np.searchsorted(edges, block["episode"], side="right") - 1).clip(0, bins - 1)
+        ends = places.at(block["episode"] + 1, block["last_step"] + 1)
+        at = (np.searchsorted(edges, ends) - 1).clip(0, bins - 1)
         count += np.bincount(at, minlength=bins)
         length += np.bincount(at, block["length"], minlength=bins)
         usable = is_usable(block["returns"])
@@ -280,7 +299,7 @@ def _mean_episodes(
             returns[:, i] += np.bincount(at[own], block["returns"][own, i], minlength=bins)
     found: dict[int, Readings] = {}
     for k in np.flatnonzero(count).tolist():
-        readings = found.setdefault(int(edges[k + 1]), {})
+        readings = found.setdefault(k, {})
         readings["training.mean_length"] = {"": float(length[k] / count[k])}
         means = {
             agent if len(agents) > 1 else "": float(returns[k, i] / usable_returns[k, i])
@@ -293,10 +312,12 @@ def _mean_episodes(
 
 
 def _mean_scalars(
-    recording: Recording, edges: NDArray[np.int64], not_finite: Counter[str]
+    recording: Recording, places: Positions, edges: NDArray[np.float64], not_finite: Counter[str]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the means of the values logged under each name between the edges; NaN where there are none."""
-    bins = len(edges) - 1
+    """Return the means of the values logged under each name in each stretch; NaN where there are none."""
+    ends = edges[1:].tolist()
+    bins = len(ends)
+    after = (0, 0)  # training steps, and the episodes that ended in them
     sums: dict[str, NDArray[np.float64]] = {}
     counts: dict[str, NDArray[np.float64]] = {}
     for scalar in recording.decoded(schema.SCALAR_TOPIC):
@@ -308,8 +329,19 @@ def _mean_scalars(
         if not abs(scalar["value"]) <= LARGEST:
             not_finite[f"{LOGGED}{name}"] += 1
             continue
-        k = min(max(int(np.searchsorted(edges, scalar["episode"], side="right")) - 1, 0), bins - 1)
+        step, episodes = training_step(scalar), scalar["episode"]
+        if scalar["phase"] != "train":
+            if step != after[0]:
+                after = (step, recording.first_from(schema.TRAIN_EPISODE, "last_step", step))
+            episodes = after[1]
+        k = min(bisect_left(ends, places.one(episodes + 1, step)), bins - 1)
         sums[name][k] += scalar["value"]
         counts[name][k] += 1
     with np.errstate(invalid="ignore"):
         return {name: sums[name] / counts[name] for name in sums}
+
+
+def training_step(scalar: Mapping[str, Any]) -> int:
+    """Return the training steps before a logged value; one logged in evaluation has steps of its own."""
+    step = int(scalar["step"])
+    return step if scalar["phase"] == "train" else scalar["log_time"] // schema.STEP_NANOSECONDS - step

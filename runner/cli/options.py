@@ -13,6 +13,7 @@ from click.shell_completion import CompletionItem
 from runner.errors import RunnerError
 
 if TYPE_CHECKING:
+    from runner.analysis.axes import Axis
     from runner.analysis.step_reference import StepRef
 
 EXPORTS: Final = Path("exports")
@@ -189,6 +190,12 @@ def _target(text: str) -> tuple[str, float]:
     return parse_target(text)
 
 
+def _axis(text: str) -> Axis:
+    from runner.analysis.axes import axis_of  # loads NumPy
+
+    return axis_of(text)
+
+
 SHIPPED: Final = Completed("name", _shipped)
 SETTING: Final = Completed("setting", _settings)
 FILTER_WORD: Final = Completed("filter", _filter_words)
@@ -198,6 +205,7 @@ NUMBERS: Final = Parsed("numbers", "numbers such as 1000,49000", _numbers)
 PICTURE_SIZE: Final = Parsed("WxH", "WIDTHxHEIGHT up to 8192x8192, such as 1600x900", _picture_size)
 GRID: Final = Parsed("RxC", "ROWSxCOLUMNS up to 8x8, such as 3x3", _grid)
 TARGET: Final = Parsed("METRIC=LEVEL", "METRIC=LEVEL such as success_percent=80", _target)
+AXIS: Final = Parsed("axis", "episodes, steps or updates", _axis)
 STEP: Final = Parsed("step", "EPISODE:T, or eval:N:TRIAL:T", _step)
 DIRECTORY: Final = click.Path(file_okay=False, path_type=Path)
 FILE: Final = click.Path(dir_okay=False, path_type=Path)
@@ -274,6 +282,14 @@ checkpoint_option: Final = click.option(
 )
 policy_option: Final = click.option(
     "--policy", metavar="MODULE:FUNCTION", help="Your function that makes a policy of a checkpoint."
+)
+axis_option: Final = click.option(
+    "--axis",
+    type=AXIS,
+    default="episodes",
+    show_default=True,
+    metavar="episodes|steps|updates",
+    help="Read metrics over training episodes, training steps, or updates as a loop logged them.",
 )
 all_option: Final = click.option(
     "--all", "everything", is_flag=True, help="Include everything, not only a selection."

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Final
 
+from runner.analysis.series import training_step
 from runner.errors import RecordingError
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording
@@ -87,10 +88,9 @@ def measures(recording: Recording) -> Iterator[Measures]:
     if not recording.has_reports:
         for scalar in recording.decoded(SCALAR_TOPIC):
             if math.isfinite(scalar["value"]):
-                position, phase = scalar["log_time"] // STEP_NANOSECONDS, scalar["phase"]
-                step = scalar["step"] if phase == "train" else position - scalar["step"]
+                position, step = scalar["log_time"] // STEP_NANOSECONDS, training_step(scalar)
                 values = {f"logged/{scalar['name']}": scalar["value"]}
-                yield Measures(phase, position, step, scalar["episode"], values)
+                yield Measures(scalar["phase"], position, step, scalar["episode"], values)
 
 
 def episodes(recording: Recording, phase: str) -> Iterator[Measures]:

@@ -108,7 +108,7 @@ def _points_by_curve(
     series: RunSeries,
 ) -> dict[tuple[str, str], tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Return the episodes and values of each curve, by metric and line."""
-    curves: dict[tuple[str, str], dict[int, float]] = {}
+    curves: dict[tuple[str, str], dict[float, float]] = {}
     for episode, readings in (*series.training, *series.evaluation):
         for metric, lines in readings.items():
             for line, value in lines.items():

@@ -15,6 +15,7 @@ from typing import Final
 
 import numpy as np
 
+from runner.analysis.axes import EPISODES
 from runner.analysis.compare import statistics
 from runner.analysis.compare.moments import Moment, higher_is_better, value_of
 from runner.analysis.compare.statistics import Estimate, Values
@@ -142,7 +143,7 @@ def compare(
         moment=moment.described,
         groups={group.label: [run.run_id for run in group.runs] for group in groups},
         metrics=results,
-        notes=[*notes, *_notes(groups, metrics)],
+        notes=[*notes, *_notes(groups, metrics, moment)],
     )
 
 
@@ -153,18 +154,20 @@ def _no_values(
     results: Sequence[MetricResult],
 ) -> str:
     """Return why there is nothing to compare."""
-    if moment.kind != "episode":
+    if moment.kind != "position":
         return f"found nothing to compare: {results[0].notes[0]}."
     runs = [run for group in groups for run in group.runs]
-    episodes = {n for run in runs for name in metrics for n in points_of(run, *name, aligned=True)}
-    before = sorted(n for n in episodes if n < moment.number)[-1:]
-    after = sorted(n for n in episodes if n > moment.number)[:1]
-    nearest = " and ".join(f"{episode:,}" for episode in before + after)
+    places = {n for run in runs for name in metrics for n in points_of(run, *name, aligned=True)}
+    before = sorted(n for n in places if n < moment.number)[-1:]
+    after = sorted(n for n in places if n > moment.number)[:1]
+    nearest = " and ".join(f"{place:,g}" for place in before + after)
     hint = f"; the nearest are those after {nearest}" if nearest else ""
-    return f"moment: found no values after {moment.number:,} training episodes{hint}."
+    return f"moment: found no values after {moment.axis.moment(moment.number)}{hint}."
 
 
-def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]]) -> Iterator[str]:
+def _notes(
+    groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: Moment
+) -> Iterator[str]:
     """Yield what limits the comparison of these groups: environments, metrics, equal contents, few seeds."""
     environments = {
         group.label: run.config["env"]["id"]
@@ -175,7 +178,7 @@ def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]]) -> Itera
     if len(set(environments.values())) > 1:
         where = ", ".join(f"{env_id} in {label}" for label, env_id in environments.items())
         yield f"the environments differ ({where}): their figures do not measure the same"
-    if all(metric.startswith("training.") for metric, _ in metrics):
+    if moment.kind == "last" and all(metric.startswith("training.") for metric, _ in metrics):
         yield "training is compared, as last reported; --moment area takes the mean over all of it"
     digests = {
         group.label: sorted((run.seed or 0, run.content_digest) for run in group.runs)
@@ -205,7 +208,7 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
     better = higher_is_better(metric, groups)
     notes += _uneven_ends(groups, metric, line) if moment.kind == "last" else []
     if moment.level is not None:
-        better, title, unit = False, f"{title}: first at {moment.level:g}", "training episodes"
+        better, title, unit = False, f"{title}: first at {moment.level:g}", moment.axis.label
         for label, values in present.items():
             reached = sum(value < statistics.NEVER for _, value in values.values())
             notes.append(f"{label}: {reached} of {len(values)} seeds reach it")
@@ -259,7 +262,7 @@ def _values(
 
 
 def _uneven_ends(groups: Sequence[Group], metric: str, line: str) -> list[str]:
-    """Return a note if the last evaluation comes after different numbers of episodes in the groups."""
+    """Return a note if the last evaluation comes after different numbers of episodes, ... in the groups."""
     curves = [
         (group.label, points)
         for group in groups
@@ -269,10 +272,13 @@ def _uneven_ends(groups: Sequence[Group], metric: str, line: str) -> list[str]:
     last = {label: max(points) for label, points in curves}
     if len(set(last.values())) < 2:
         return []
-    ends = ", ".join(f"after {end:,} episodes in {label}" for label, end in last.items())
+    axis = groups[0].axis
+    ends = ", ".join(f"after {axis.moment(end)} in {label}" for label, end in last.items())
     what = "report of training" if metric.startswith("training.") else "evaluation"
     shared = set.intersection(*(set(points) for _, points in curves))
-    hint = f"; --moment {max(shared)} compares after as many" if shared else ""
+    if axis is not EPISODES:  # where runs are interpolated
+        shared = {min(last.values())}
+    hint = f"; --moment {max(shared):.10g} compares after as many" if shared else ""
     return [f"the last {what} is {ends}{hint}"]
 
 

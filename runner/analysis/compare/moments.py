@@ -1,19 +1,23 @@
-"""When a metric is read: at the last or best evaluation, after some episodes, over all, at a crossing."""
+"""When a metric is read: at the last or best evaluation, at a position, over all, at a crossing."""
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
+import numpy as np
+
+from runner.analysis.axes import EPISODES, Axis
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.groups import Group
 from runner.analysis.series import RunSeries, first_crossing, mean_height, points_of
 from runner.errors import RunnerError
 from runner.recording.metrics import METRIC_OF
 
-Kind = Literal["last", "best", "area", "episode", "crossing"]
+Kind = Literal["last", "best", "area", "position", "crossing"]
 _OF_WHOLE_RUNS: Final[tuple[Kind, ...]] = ("last", "best", "area")
 
 
@@ -30,13 +34,16 @@ class Moment:
     """A moment, or a way to reduce a curve to one number.
 
     last: the last evaluation. best: the best of all. area: the mean of the curve by the trapezoid rule,
-    over the episodes that every run has. episode: the evaluation after `number` training episodes.
-    crossing: after how many episodes the curve is first at `level`, coming from the other side.
+    over the span that every run covers. position: after `number` training episodes, steps, ...; episodes must
+    have an evaluation there, on other axes a run is interpolated between its readings. crossing: the position
+    at which the curve is first at `level`, coming from the other side.
     """
 
     kind: Kind
-    number: int = 0
+    number: float = 0
     level: float | None = None
+    axis: Axis = EPISODES
+    """The axis on which the runs are read."""
 
     @property
     def described(self) -> str:
@@ -47,22 +54,25 @@ class Moment:
             case "best":
                 return "at each run's best evaluation"
             case "area":
-                return "the mean over training, by area under the curve"
-            case "episode":
-                return f"after {self.number:,} training episodes"
+                return "the mean over training, by area under the curve" + (
+                    "" if self.axis is EPISODES else f" over {self.axis.title}"
+                )
+            case "position":
+                return f"after {self.axis.moment(self.number)}"
             case "crossing":
-                return f"training episodes until it is first at {self.level:g}"
+                return f"{self.axis.label} until it is first at {self.level:g}"
 
 
 def moment_of(
-    moment: str, target: tuple[str, float] | None, chosen: Sequence[str]
+    moment: str, target: tuple[str, float] | None, chosen: Sequence[str], axis: Axis = EPISODES
 ) -> tuple[Moment, Sequence[str]]:
     """Return the moment that options stand for, and the metrics: a target names its own.
 
     Args:
-        moment: `last`, `best`, `area`, or a number of training episodes.
+        moment: `last`, `best`, `area`, or a position: a number of training episodes, or of the axis.
         target: a metric and its level, instead; or None.
         chosen: metrics.
+        axis: the axis on which runs are read.
 
     Raises:
         RunnerError: it is none of these, or both are given.
@@ -71,15 +81,16 @@ def moment_of(
         if moment != "last" or chosen:
             raise RunnerError("target: found a moment or a metric as well, expected it alone.")
         metric, level = target
-        return Moment("crossing", level=level), (metric,)
-    if moment.isascii() and moment.isdecimal():
-        return Moment("episode", number=int(moment)), chosen
+        return Moment("crossing", level=level, axis=axis), (metric,)
     for kind in _OF_WHOLE_RUNS:
         if moment == kind:
-            return Moment(kind), chosen
-    raise RunnerError(
-        f"moment: found {moment!r}, expected last, best, area, or a number of training episodes."
-    )
+            return Moment(kind, axis=axis), chosen
+    if moment.isascii() and moment.isdecimal():
+        return Moment("position", number=int(moment), axis=axis), chosen
+    with contextlib.suppress(ValueError):
+        if not axis.whole and 0 <= (number := float(moment)) < math.inf:
+            return Moment("position", number=number, axis=axis), chosen
+    raise RunnerError(f"moment: found {moment!r}, expected last, best, area, or a number of {axis.label}.")
 
 
 def value_of(
@@ -90,12 +101,12 @@ def value_of(
     points = {episode: value for episode, value in read.items() if math.isfinite(value)}
     if not points:
         return None, f"has no {metric}{'.' + line if line else ''}"
-    if moment.kind == "episode":
-        return points.get(moment.number), f"has none after {moment.number:,} episodes"
+    if moment.kind == "position":
+        return _at(points, moment), f"has none after {moment.axis.moment(moment.number)}"
     if not run.finished:
         return None, "not finished; --moment EPISODE takes it as far as it got"
     if moment.kind == "area":
-        return _area(points, _shared_episodes(metric, line, groups))
+        return _area(points, _shared_span(metric, line, groups))
     if moment.level is not None:
         at = first_crossing(points, moment.level)
         return NEVER if at is None else float(at), ""
@@ -103,14 +114,26 @@ def value_of(
     return best(points.values()) if moment.kind == "best" else points[max(points)], ""
 
 
-def _shared_episodes(metric: str, line: str, groups: Sequence[Group]) -> list[int]:
-    """Return the episodes at which every finished run that has the metric has it."""
+def _at(points: Mapping[float, float], moment: Moment) -> float | None:
+    """Return the value at a position; None where the run has none."""
+    if moment.axis is EPISODES:
+        return points.get(moment.number)
+    places = sorted(points)
+    if not places[0] <= moment.number <= places[-1]:
+        return None
+    return float(np.interp(moment.number, places, [points[place] for place in places]))
+
+
+def _shared_span(metric: str, line: str, groups: Sequence[Group]) -> tuple[float, float]:
+    """Return the first and the last position that every finished run with the metric covers."""
     runs = [run for group in groups for run in group.runs if run.finished]
-    episodes = [set(points_of(run, metric, line, aligned=True)) for run in runs]
-    return sorted(set.intersection(*(some for some in episodes if some)))
+    curves = [points for run in runs if (points := points_of(run, metric, line, aligned=True))]
+    return max(map(min, curves)), min(map(max, curves))
 
 
-def _area(points: dict[int, float], episodes: Sequence[int]) -> tuple[float | None, str]:
-    if len(episodes) < 2:
-        return None, "fewer than two evaluations after as many episodes as in the other runs"
-    return mean_height(episodes, [points[episode] for episode in episodes]), ""
+def _area(points: Mapping[float, float], span: tuple[float, float]) -> tuple[float | None, str]:
+    places = sorted({*(place for place in points if span[0] <= place <= span[1]), *span})
+    if span[0] >= span[1]:
+        return None, "it has no part of training in common with the other runs"
+    known = sorted(points)
+    return mean_height(places, np.interp(places, known, [points[place] for place in known]).tolist()), ""

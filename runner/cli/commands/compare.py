@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from runner.cli import Command
 from runner.cli.options import (
+    INDEX,
     RunName,
     all_option,
+    axis_option,
     force_option,
     html_option,
     json_option,
@@ -25,6 +28,9 @@ from runner.cli.runs import find_all_recorded, find_recorded
 from runner.errors import ExitCode
 from runner.export.places import write_text_new
 from runner.util.humanize import size
+
+if TYPE_CHECKING:
+    from runner.analysis.axes import Axis
 
 
 @click.command("compare", cls=Command)
@@ -41,8 +47,12 @@ from runner.util.humanize import size
     "--moment",
     default="last",
     show_default=True,
-    metavar="last|best|area|EPISODE",
-    help="Compare at the last evaluation, at each run's best, the mean over all, or after EPISODE.",
+    metavar="last|best|area|N",
+    help="Compare at the last evaluation, at each run's best, the mean over all, or after N on the axis.",
+)
+@axis_option
+@click.option(
+    "--at-step", type=INDEX, metavar="N", help="Compare after N training steps: --axis steps --moment N."
 )
 @target_option(multiple=False)
 @json_option
@@ -55,6 +65,8 @@ def compare_command(
     by: str | None,
     metrics: tuple[str, ...],
     moment: str,
+    axis: Axis,
+    at_step: int | None,
     target: tuple[str, float] | None,
     as_json: bool,
     as_markdown: bool,
@@ -74,9 +86,11 @@ def compare_command(
     Examples:
       dualtaxi compare cooperative competitive
       dualtaxi compare first second third --metric mean_length --moment 10000
+      dualtaxi compare ppo dqn --at-step 100000
       dualtaxi compare sweep --by discount --target success_percent=80
       dualtaxi compare cooperative competitive --html comparison.html
     """
+    from runner.analysis.axes import EPISODES, STEPS
     from runner.analysis.compare import compare
     from runner.analysis.compare.moments import moment_of
     from runner.analysis.compare.sections import sections
@@ -89,13 +103,17 @@ def compare_command(
     require_scipy()
     if html is not None:
         require_page(html, force)
-    read_at, chosen = moment_of(moment, target, metrics)
+    if at_step is not None:
+        if moment != "last" or axis is not EPISODES:
+            raise click.UsageError("--at-step: found --moment or --axis as well, expected it alone.")
+        moment, axis = str(at_step), STEPS
+    read_at, chosen = moment_of(moment, target, metrics, axis)
     runs = find_all_recorded(run_names, recordings)
     series = []
     with stage_line("reading runs") as stage:
         for run in runs:
             with open_recording(run.recording) as recording:
-                series.append(read_series(recording))
+                series.append(read_series(recording, axis))
         groups, notes = grouped(series, by)
         require_two(groups, by)
         stage("computing intervals")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -11,6 +12,7 @@ from runner.cli.options import (
     EXPORTS,
     INDEX,
     TRIAL,
+    axis_option,
     runs_argument,
     writing_options,
 )
@@ -22,14 +24,23 @@ from runner.runs.run import recordings_folder
 from runner.sweep import is_sweep
 from runner.util.humanize import size
 
+if TYPE_CHECKING:
+    from runner.analysis.axes import Axis
+
 
 @click.command("plot", cls=Command)
 @runs_argument
+@axis_option
 @writing_options(EXPORTS / "plot.png", "FILE.png|svg|pdf")
 def plot_command(
-    run_names: tuple[str, ...], output: Path, force: bool, recordings: Path | None, as_json: bool
+    run_names: tuple[str, ...],
+    axis: Axis,
+    output: Path,
+    force: bool,
+    recordings: Path | None,
+    as_json: bool,
 ) -> None:
-    """Draw every metric of one or several runs over episodes, in one figure; or a sweep.
+    """Draw every metric of one or several runs over an axis, in one figure; or a sweep.
 
     Runs that differ in nothing but the seed are drawn as one line, their median, with a band from the lowest
     to the highest; a run that was recorded twice counts once, with a message. A name shared by several runs
@@ -41,6 +52,7 @@ def plot_command(
     Examples:
       dualtaxi plot @latest
       dualtaxi plot cooperative competitive -o comparison.pdf
+      dualtaxi plot ppo dqn --axis steps
       dualtaxi plot hyperparameters -o hyperparameters.png
     """
     from runner.analysis.groups import duplicates, groups_of
@@ -54,6 +66,7 @@ def plot_command(
     check_suffix(output)
     folder = recordings_folder(recordings)
     if is_sweep(run_names, folder):
+        _refuse_axis(axis)
         _plot_sweep(run_names[0], folder, output, force, as_json)
         return
     series = []
@@ -61,7 +74,7 @@ def plot_command(
     with count_line("runs read", len(runs)) as progress:
         for run in runs:
             with open_recording(run.recording) as recording:
-                series.append(read_series(recording))
+                series.append(read_series(recording, axis))
                 for shortcoming in shortcomings(recording):
                     say(shortcoming)
             progress(len(series))
@@ -76,6 +89,13 @@ def plot_command(
     count = sum(len(group.runs) for group in groups)
     text = f"{output}: {len(panels)} metrics of {_runs(count)}"
     print_written(text, as_json, output, metrics=len(panels), runs=count)
+
+
+def _refuse_axis(axis: Axis) -> None:
+    if axis.name != "episodes":
+        raise click.UsageError(
+            f"--axis: found {axis.name}, expected episodes, as sweeps are drawn over them."
+        )
 
 
 def _plot_sweep(name: str, recordings: Path, output: Path, force: bool, as_json: bool) -> None:
@@ -113,12 +133,14 @@ def _plot_sweep(name: str, recordings: Path, output: Path, force: bool, as_json:
     metavar="N:TRIAL",
     help="Also show this trial of the evaluation after N training episodes; may be repeated.",
 )
+@axis_option
 @writing_options(EXPORTS / "report.html", "FILE.html")
 def report_command(
     run_names: tuple[str, ...],
     output: Path,
     episodes: tuple[int, ...],
     trials: tuple[tuple[int, int], ...],
+    axis: Axis,
     force: bool,
     recordings: Path | None,
     as_json: bool,
@@ -145,13 +167,16 @@ def report_command(
     if is_sweep(run_names, folder):
         if episodes or trials:
             raise click.UsageError("the page of a sweep shows no episode: leave out --episode and --eval.")
+        _refuse_axis(axis)
         _report_sweep(run_names[0], folder, output, force, as_json)
         return
     replays = [*(("train", number, 0) for number in episodes), *(("eval", *trial) for trial in trials)]
     paths = [run.recording for run in find_all_recorded(run_names, folder)]
     notes: list[str] = []
     with stage_line("reading") as progress:
-        write_new(output, force, lambda path: notes.extend(write_report(path, paths, replays, progress)))
+        write_new(
+            output, force, lambda path: notes.extend(write_report(path, paths, replays, progress, axis))
+        )
     for note in notes:
         say(note)
     text = f"{output}: {size(output.stat().st_size)}, {_runs(len(paths))}"

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from runner.analysis.axes import EPISODES
 from runner.analysis.groups import Group
 from runner.analysis.series import values_left_out
 from runner.drawing import palette
@@ -72,7 +73,7 @@ def curves_sheet(groups: Sequence[Group], panels: Sequence[Panel]) -> Canvas:
     notes = textwrap.wrap(footnote(groups), round(_LETTERS * width / (3 * WIDTH)))
     head = 32.0 + 14 * len(groups)
     rows = math.ceil(len(narrow) / columns) + len(wide)
-    sheet = Canvas(width, head + HEIGHT * rows + 8 + 10 * len(notes), "Metrics over training episodes")
+    sheet = Canvas(width, head + HEIGHT * rows + 8 + 10 * len(notes), f"Metrics over {groups[0].axis.title}")
     sheet.text(10, 20, sheet.title, size=13, bold=True)
     for number, group in enumerate(groups):
         colour, y = series_colour(number), 36.0 + 14 * number
@@ -96,10 +97,11 @@ def footnote(groups: Sequence[Group]) -> str:
     runs = [run for group in groups for run in group.runs]
     left_out = "".join(f" {sentence}" for sentence in values_left_out(runs))
     loops = any(run.is_loop for run in runs)
+    interpolated = loops or runs[0].axis is not EPISODES
     greedy = "" if loops else " Evaluation trials follow the greedy policy: no exploring."
     if max(len(group.runs) for group in groups) == 1:
         return f"Each line is one run, as reported.{greedy}{left_out}"
-    between = " Between its points a run is interpolated." if loops else ""
+    between = " Between its points a run is interpolated." if interpolated else ""
     return (
         "Lines: median over the runs of a configuration that have come as far; bands: from the lowest run to "
         f"the highest.{between}{greedy}{left_out}"
@@ -107,20 +109,21 @@ def footnote(groups: Sequence[Group]) -> str:
 
 
 def panel_chart(panel: Panel, groups: int) -> Chart:
-    """Return the chart of a metric: curves of groups of runs over training episodes."""
+    """Return the chart of a metric: curves of groups of runs over their axis."""
     is_shares = panel.metric == SHARES
-    last = max(float(curve.episodes.max()) for curve in panel.curves) or 1.0
+    last = max(float(curve.places.max()) for curve in panel.curves) or 1.0
     x = Scale(0.0, last * 1.02, 50.0, 461.0 if is_shares else 280.0)
     y = _y_scale(panel)
     width = 2 * WIDTH if is_shares else WIDTH
-    chart = Chart(x, y, width, HEIGHT, f"{panel.title} over training episodes")
+    chart = Chart(x, y, width, HEIGHT, f"{panel.title} over {panel.axis.title}")
     has_legend = len(panel.lines) > 1 and not is_shares
     largest = max(float(np.abs([curve.low, curve.high]).max()) for curve in panel.curves)
     if is_shares:
         _draw_shares(chart, panel)
-    chart.x_ticks(labelled([tick for tick in x.ticks if tick == int(tick)]))
+    ticks = x.ticks if not panel.axis.whole else [tick for tick in x.ticks if tick == int(tick)]
+    chart.x_ticks(labelled(ticks, short=panel.axis is not EPISODES))
     chart.y_ticks(labelled(range(0, 101, 20) if panel.percent else y.ticks, largest >= 10_000))
-    chart.frame(panel.title, 14.0 if has_legend else 25.0, "training episodes", [panel.unit])
+    chart.frame(panel.title, 14.0 if has_legend else 25.0, panel.axis.label, [panel.unit])
     if is_shares:
         return chart
     if not panel.percent and not panel.at_least_zero:
@@ -160,20 +163,20 @@ def _draw_curve(chart: Chart, panel: Panel, curve: Curve, groups: int) -> None:
     number = line if groups == 1 and len(panel.lines) > 1 else curve.group
     colour = series_colour(number)
     if (curve.high > curve.low).any():
-        chart.band(curve.episodes, curve.low, curve.high, colour, opacity=0.2)
-    chart.line(curve.episodes, curve.median, colour, line)
-    every = slice(None, None, max(len(curve.episodes) // 8, 1))
-    chart.markers(curve.episodes[every], curve.median[every], colour, series_marker(number), 1.7)
+        chart.band(curve.places, curve.low, curve.high, colour, opacity=0.2)
+    chart.line(curve.places, curve.median, colour, line)
+    every = slice(None, None, max(len(curve.places) // 8, 1))
+    chart.markers(curve.places[every], curve.median[every], colour, series_marker(number), 1.7)
 
 
 def _draw_shares(chart: Chart, panel: Panel) -> None:
     """Draw shares of a whole on top of each other, the lowest reward darkest and at the bottom."""
-    episodes = panel.curves[0].episodes
+    places = panel.curves[0].places
     bottom = np.zeros_like(panel.curves[0].median)
     colours = palette.ramp_colours(len(panel.curves))
     for curve, colour in zip(panel.curves, colours, strict=True):
-        top = bottom + np.interp(episodes, curve.episodes, curve.median)
-        chart.band(episodes, bottom, top, colour, stroke=palette.WHITE, width=0.3)
+        top = bottom + np.interp(places, curve.places, curve.median)
+        chart.band(places, bottom, top, colour, stroke=palette.WHITE, width=0.3)
         bottom = top
     left = chart.x.end + 10
     chart.text(left, chart.y.end + 4, "reward of a step", size=8)

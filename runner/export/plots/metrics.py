@@ -1,4 +1,4 @@
-"""Every metric of runs over episodes: runs of one configuration together, as median and band.
+"""Every metric of runs over an axis: runs of one configuration together, as median and band.
 
 A `Panel` is a metric; it has a `Curve` for each group of runs (and agent), which `curves` draws.
 """
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.axes import Axis
 from runner.analysis.groups import Group
 from runner.analysis.series import LOGGED, points_of, title_of
 from runner.errors import RunnerError
@@ -23,7 +24,8 @@ class Curve:
 
     group: int
     line: str
-    episodes: NDArray[np.float64]
+    places: NDArray[np.float64]
+    """Positions on the axis of the groups."""
     median: NDArray[np.float64]
     low: NDArray[np.float64]
     high: NDArray[np.float64]
@@ -37,6 +39,7 @@ class Panel:
     title: str
     unit: str
     curves: tuple[Curve, ...]
+    axis: Axis
 
     @property
     def lines(self) -> list[str]:
@@ -73,7 +76,10 @@ def panels_of(groups: Sequence[Group]) -> list[Panel]:
         raise RunnerError(
             f"found no metrics in {runs}: neither an evaluation nor a report of training was recorded."
         )
-    return [Panel(metric, *title_of(metric), tuple(curves[metric])) for metric in sorted(curves, key=_rank)]
+    return [
+        Panel(metric, *title_of(metric), tuple(curves[metric]), groups[0].axis)
+        for metric in sorted(curves, key=_rank)
+    ]
 
 
 def _metrics(group: Group) -> list[tuple[str, str]]:
@@ -92,20 +98,20 @@ def _curve(number: int, group: Group, metric: str, line: str) -> Curve | None:
     """Return the median and the band of a metric, over the runs that have come as far.
 
     Runs report training every number of steps, so at different episodes: of several runs, only the reports at
-    evaluations are drawn, which are at the same episodes. Loops evaluate at any episode: between its points a
-    run is interpolated, so that the line does not jump from one run to another.
+    evaluations are drawn, which are at the same episodes. Loops evaluate at any episode, and on other axes
+    positions differ: between its points a run is interpolated, so that the line does not jump between runs.
     """
     runs = [points_of(run, metric, line, aligned=len(group.runs) > 1) for run in group.runs]
-    episodes = np.array(sorted({episode for points in runs for episode in points}), np.float64)
-    if not len(episodes):
+    places = np.array(sorted({place for points in runs for place in points}), np.float64)
+    if not len(places):
         return None
     values = [
-        np.interp(episodes, sorted(points), [points[at] for at in sorted(points)], np.nan, np.nan)
+        np.interp(places, sorted(points), [points[at] for at in sorted(points)], np.nan, np.nan)
         for points in runs
         if points
     ]
     median, low, high = (band(values, axis=0) for band in (np.nanmedian, np.nanmin, np.nanmax))
-    return Curve(number, line, episodes, median, low, high)
+    return Curve(number, line, places, median, low, high)
 
 
 def _rank(metric: str) -> tuple[int, int]:

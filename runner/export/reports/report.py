@@ -12,6 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from runner.analysis.axes import EPISODES, Axis
 from runner.analysis.evaluations import EvaluationRecord, evaluation_records
 from runner.analysis.groups import groups_of
 from runner.analysis.series import RunSeries, read_series, values_left_out
@@ -100,6 +101,7 @@ def write_report(
     recordings: Sequence[Path],
     chosen: Sequence[Choice] = (),
     progress: Callable[[str], None] = lambda _: None,
+    axis: Axis = EPISODES,
 ) -> list[str]:
     """Write the page about some recordings, and return what is missing from it, a sentence each.
 
@@ -108,13 +110,14 @@ def write_report(
         recordings: the MCAP files.
         chosen: episodes to show in addition to those that are always shown.
         progress: called with the next stage of the work.
+        axis: of the plots.
 
     Raises:
         MissingExtra: Jinja2 is not installed.
-        RecordingError: a recording cannot be read, or has no such episode.
+        RecordingError: a recording cannot be read, has no such episode, or does not have the axis.
         OSError: the page cannot be written.
     """
-    page, missing = render_report(recordings, chosen, progress)
+    page, missing = render_report(recordings, chosen, progress, axis)
     path.write_text(page, encoding="utf-8")
     return missing
 
@@ -132,6 +135,7 @@ def render_report(
     recordings: Sequence[Path],
     chosen: Sequence[Choice] = (),
     progress: Callable[[str], None] = lambda _: None,
+    axis: Axis = EPISODES,
 ) -> tuple[str, list[str]]:
     """Return the page about some recordings, and what is missing from it; see `write_report`."""
     require_packages()
@@ -140,7 +144,7 @@ def render_report(
     for count, path in enumerate(recordings, 1):
         progress(f"reading run {count} of {len(recordings)}")
         with open_recording(path) as recording:
-            series.append(read_series(recording))
+            series.append(read_series(recording, axis))
             runs.append(_run(recording, len(runs), chosen, progress))
     progress("drawing")
     groups = groups_of(series)

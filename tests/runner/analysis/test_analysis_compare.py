@@ -199,7 +199,7 @@ def test_moments_of_a_curve():
 
     assert value(Moment("last")) == 60
     assert value(Moment("best")) == 80
-    assert value(Moment("episode", 200)) == 40
+    assert value(Moment("position", 200)) == 40
     assert value(Moment("area")) == pytest.approx((40 + 60 + 50) / 3)
     assert value(Moment("crossing", level=50.0)) == 100
     assert value(Moment("crossing", level=99.0)) == math.inf
@@ -242,7 +242,7 @@ def test_interrupted_runs_are_left_out_and_taken_at_an_episode_that_they_have():
     metric = result(series).metrics[0]
     assert metric.groups[0].seeds == [0, 1, 2, 3]
     assert "a9x (not finished" in metric.notes[0]
-    assert result(series, Moment("episode", 100)).metrics[0].groups[0].seeds == [0, 1, 2, 3, 9]
+    assert result(series, Moment("position", 100)).metrics[0].groups[0].seeds == [0, 1, 2, 3, 9]
 
 
 def test_groups_of_other_lengths_and_modes_are_compared_as_far_as_they_can_be():
@@ -367,14 +367,16 @@ def test_loops_without_evaluation_are_compared_by_their_training():
 def test_a_moment_is_advised_only_if_all_runs_have_it():
     groups, _ = grouped([loop(0, [1, 2], every=70, lr=1), loop(0, [1, 2], every=80, lr=2)])
     notes = compare(groups, metrics_of(groups), Moment("last")).metrics[0].notes
-    assert notes == ["the last evaluation is after 140 episodes in a, lr=1, after 160 episodes in a, lr=2"]
+    assert notes == [
+        "the last evaluation is after 140 training episodes in a, lr=1, after 160 training episodes in a, lr=2"
+    ]
 
 
 def test_a_line_does_not_jump_between_runs_that_evaluated_at_other_moments():
     (group,) = groups_of([loop(1, [0, 0, 0], every=10), loop(2, [100, 100, 100], every=11)])
     (panel,) = panels_of([group])
     (curve,) = panel.curves
-    assert curve.episodes.tolist() == [10, 11, 20, 22, 30, 33]
+    assert curve.places.tolist() == [10, 11, 20, 22, 30, 33]
     assert curve.median.tolist() == [0, 50, 50, 50, 50, 100]
 
 

@@ -48,7 +48,7 @@ def test_seeds_are_one_group_with_median_and_band(seeds):
     for run in seeds:
         with open_recording(run.recording) as recording:
             lengths.append([record.value("mean_length") for record in evaluation_records(recording)])
-    assert curve.episodes.tolist() == [0, 20, 40]
+    assert curve.places.tolist() == [0, 20, 40]
     assert curve.median.tolist() == [median(each) for each in zip(*lengths, strict=True)]
     assert curve.low.tolist() == [min(each) for each in zip(*lengths, strict=True)]
     assert curve.high.tolist() == [max(each) for each in zip(*lengths, strict=True)]
@@ -87,7 +87,7 @@ def test_every_metric_of_the_tutorial_and_every_event_has_a_panel(pictured):
     assert {"success_percent", "mean_length", "mean_penalties", "training.mean_length"} <= metrics
     assert {"training.percent_filled", "training.reward", "event.pickup", "event.collision"} <= metrics
     shares = next(panel for panel in panels if panel.metric == "training.reward")
-    totals = sum(np.interp(shares.curves[0].episodes, c.episodes, c.median) for c in shares.curves)
+    totals = sum(np.interp(shares.curves[0].places, c.places, c.median) for c in shares.curves)
     assert totals == pytest.approx(np.full(len(totals), 100.0))
 
 

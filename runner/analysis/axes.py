@@ -1,0 +1,166 @@
+"""The horizontal axes of metrics: training episodes, environment steps, updates and wall time.
+
+A moment of a run is known by the training episodes and training steps before it; `Positions` returns where
+such moments are on an axis. Pages, plots, reports, comparisons and exports read axes here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from runner.errors import RecordingError, RunnerError, nearest
+from runner.recording.reader import Recording
+from runner.recording.schema import SCALAR_TOPIC
+
+Values = NDArray[np.float64]
+
+UPDATE_NAMES: Final = ("updates", "n_updates")
+"""Names, or last parts of names such as `train/n_updates`, under which a loop logs its number of updates."""
+_MAX_KNOWN: Final = 1 << 18
+
+
+@dataclass(frozen=True)
+class Axis:
+    """An axis along which a run progresses."""
+
+    name: str
+    title: str
+    """What it counts: `training steps`."""
+    whole: bool
+    """Whether its values are whole numbers."""
+
+    @property
+    def label(self) -> str:
+        """The title with its unit."""
+        return self.title if self.whole else f"{self.title}, seconds"
+
+    def moment(self, value: float) -> str:
+        """Return a value in words: `2,048 training steps`, `12.5 seconds of wall time`."""
+        return f"{value:,.0f} {self.title}" if self.whole else f"{value:,.6g} seconds of {self.title}"
+
+
+EPISODES: Final = Axis("episodes", "training episodes", whole=True)
+STEPS: Final = Axis("steps", "training steps", whole=True)
+UPDATES: Final = Axis("updates", "updates", whole=True)
+AXES: Final = {axis.name: axis for axis in (EPISODES, STEPS, UPDATES)}
+
+
+def axis_of(name: str) -> Axis:
+    """Return the axis of a name.
+
+    Raises:
+        RunnerError: there is none.
+    """
+    if name not in AXES:
+        raise RunnerError(f"axis: found {name!r}, expected one of {', '.join(AXES)}.{nearest(name, AXES)}")
+    return AXES[name]
+
+
+@dataclass(frozen=True)
+class Positions:
+    """The positions of a run's moments on an axis."""
+
+    axis: Axis
+    steps: Values
+    """Training steps at which the axis's value is known, ascending; not used for episodes and steps."""
+    values: Values
+    """Its values there, which never decrease."""
+
+    def at(self, episodes: ArrayLike, steps: ArrayLike) -> Values:
+        """Return the positions of moments by the training episodes and training steps before them."""
+        if self.axis is EPISODES:
+            return np.asarray(episodes, np.float64)
+        own = np.asarray(steps, np.float64)
+        if self.axis is STEPS:
+            return own
+        if self.axis is UPDATES:  # a count holds until the next one
+            return np.concatenate([[0.0], self.values])[np.searchsorted(self.steps, own, side="right")]
+        return np.interp(own, self.steps, self.values)
+
+    def one(self, episodes: int, steps: int) -> float:
+        """Return the position of one moment, an integer where the axis has whole numbers."""
+        if self.axis is EPISODES:
+            return episodes
+        if self.axis is STEPS:
+            return steps
+        value = float(self.at(episodes, steps))
+        return int(value) if self.axis.whole else value
+
+
+def positions(recording: Recording, axis: Axis) -> Positions:
+    """Return the positions of a recording's moments on an axis.
+
+    Raises:
+        RecordingError: the recording does not have this axis; the message states what it would need.
+    """
+    steps, values = np.empty(0), np.empty(0)
+    if axis is UPDATES:
+        if recording.has_reports:  # each training step of a job updates its tables
+            return Positions(STEPS, steps, values)
+        steps, values = _updates(recording)
+    return Positions(axis, steps, values)
+
+
+def axes_of(recording: Recording) -> list[Axis]:
+    """Return the axes that a recording has."""
+    found = []
+    for axis in AXES.values():
+        try:
+            positions(recording, axis)
+        except RecordingError:
+            continue
+        found.append(axis)
+    return found
+
+
+def edges_of(axis: Axis, last: float, parts: int) -> Values:
+    """Return the edges of at most `parts` stretches of 1, 2, 5, 10, ... that reach from 0 to `last`.
+
+    Those of runs of about the same length agree. Only an axis without whole numbers has shorter stretches.
+
+    Args:
+        axis: the axis.
+        last: its last value, finite and not negative.
+        parts: the maximum number of stretches.
+    """
+    width = max(last / parts, 1.0 if axis.whole else 0.0) or 1.0
+    power = math.floor(math.log10(width))
+    scale = next(factor for factor in (1, 2, 5, 10, 20) if factor * 10.0**power >= width * (1 - 1e-12))
+    width = scale * 10.0**power
+    return np.arange(max(math.ceil(last / width * (1 - 1e-12)), 1) + 1, dtype=np.float64) * width
+
+
+def _updates(recording: Recording) -> tuple[Values, Values]:
+    """Return training steps, and the number of updates that the loop logged there.
+
+    Of more than 262,144 values every second, fourth, ... is used.
+    """
+    steps: list[int] = []
+    values: list[float] = []
+    name, every, count = "", 1, 0
+    for scalar in recording.decoded(SCALAR_TOPIC):
+        is_count = scalar["phase"] == "train" and scalar["name"].rpartition("/")[2] in UPDATE_NAMES
+        if not is_count or scalar["name"] != (name := name or scalar["name"]):
+            continue
+        if not (math.isfinite(scalar["value"]) and scalar["value"] >= (values[-1] if values else 0)):
+            raise RecordingError(
+                f"{recording.path}: found {scalar['value']:g} updates logged as {name!r} at training step "
+                f"{scalar['step']:,}, expected numbers that do not decrease: it has no axis of updates."
+            )
+        count += 1
+        if count % every == 0:
+            steps.append(scalar["step"])
+            values.append(scalar["value"])
+        if len(steps) > _MAX_KNOWN:
+            steps, values, every = steps[1::2], values[1::2], 2 * every
+    if not steps:
+        raise RecordingError(
+            f"{recording.path}: has no axis of updates: nothing was logged as {' or '.join(UPDATE_NAMES)}; "
+            'rec.log("updates", COUNT) records it.'
+        )
+    return np.array(steps, np.float64), np.array(values, np.float64)
