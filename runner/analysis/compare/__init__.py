@@ -165,9 +165,7 @@ def _no_values(
     return f"moment: found no values after {moment.axis.moment(moment.number)}{hint}."
 
 
-def _notes(
-    groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: Moment
-) -> Iterator[str]:
+def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: Moment) -> Iterator[str]:
     """Yield what limits the comparison of these groups: environments, metrics, equal contents, few seeds."""
     environments = {
         group.label: run.config["env"]["id"]

@@ -21,7 +21,7 @@ STEPS_TAKEN = 2_000
 
 
 def record(folder, name, seed, *, every=50, updates=True, **config):
-    """Record random steps with a loss and a number of updates logged every so many of them."""
+    """Record random steps with a loss and a number of updates logged at regular steps."""
     env = runner.record(gymnasium.make("CartPole-v1"), recordings=folder, name=name, seed=seed, config=config)
     env.action_space.seed(seed)
     env.reset(seed=seed)
@@ -188,7 +188,9 @@ def test_plot_and_report_name_the_axis(folder, tmp_path):
 
 
 def test_an_unknown_axis_is_refused():
-    with pytest.raises(RunnerError, match="found 'stpes', expected one of episodes, .* Did you mean 'steps'"):
+    with pytest.raises(
+        RunnerError, match=r"found 'stpes', expected one of episodes, .* Did you mean 'steps'"
+    ):
         axis_of("stpes")
 
 

@@ -368,7 +368,8 @@ def test_a_moment_is_advised_only_if_all_runs_have_it():
     groups, _ = grouped([loop(0, [1, 2], every=70, lr=1), loop(0, [1, 2], every=80, lr=2)])
     notes = compare(groups, metrics_of(groups), Moment("last")).metrics[0].notes
     assert notes == [
-        "the last evaluation is after 140 training episodes in a, lr=1, after 160 training episodes in a, lr=2"
+        "the last evaluation is after 140 training episodes in a, lr=1, "
+        "after 160 training episodes in a, lr=2"
     ]
 
 
