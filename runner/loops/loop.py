@@ -238,6 +238,18 @@ class Loop(Generic[R]):
             raise RunnerError(f"run {self.run.run_id} is closed: nothing more can be recorded in it.")
         return sum(self._recorder.steps.values()) + (self.active.filled if self.active else 0)
 
+    def moment(self, rows: PhaseRows) -> tuple[int, int, int]:
+        """Return `position`, and the steps and the episode of a phase.
+
+        Raises:
+            RunnerError: the loop is closed.
+        """
+        step, episode = rows.place
+        if (active := self.active) is None:
+            return self.position, step, episode
+        counts = self._recorder.steps
+        return counts["train"] + counts["eval"] + active.filled, step, episode
+
     def records(self) -> bool:
         """Return whether this process records, and warn if it was forked from the one that does."""
         if self.is_foreign:

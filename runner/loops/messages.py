@@ -32,6 +32,8 @@ MAX_INFO_BYTES: Final = 1 << 20
 """The most bytes of JSON for the info of one step."""
 _MAX_WAITING: Final = 1024
 """Logged numbers, or states, that wait for the recorder; it gets them twice a second at the latest."""
+_MAX_SERIES: Final = 4096
+"""The most names of logged numbers whose encoders are kept at hand."""
 _LONG_NAME: Final = 200
 """Numbers under longer names do not wait, because together they would be large."""
 _JPEG_QUALITY: Final = 90
@@ -41,10 +43,15 @@ class LoopState(Protocol):
     """The loop that messages belong to."""
 
     lock: threading.RLock
+    is_foreign: bool
+    """Whether this process was forked from the one that records."""
 
     @property
     def position(self) -> int:
         """The number of steps executed so far; raises `RunnerError` if the loop is closed."""
+
+    def moment(self, rows: PhaseRows) -> tuple[int, int, int]:
+        """Return `position`, and the steps and the episode of a phase."""
 
     def rows(self, phase: str) -> PhaseRows:
         """Return the steps of a phase; raises `ConfigError` if there is no such phase."""
@@ -83,8 +90,8 @@ class Messages:
         self.has_logged = False
         """Whether anything was logged."""
         self._series: dict[tuple[str, str], _Series] = {}
-        self._numbers: list[tuple[_Series, float, int, int, int]] = []
-        """Logged numbers that the recorder does not have yet: series, value, position, step, episode."""
+        self._numbers: list[tuple[_Series, float, tuple[int, int, int]]] = []
+        """Logged numbers that the recorder does not have yet, with position, step and episode."""
         self._states: list[tuple[Topic, ResetState, int]] = []
         """Reset states that it does not have yet, with their positions."""
 
@@ -103,14 +110,15 @@ class Messages:
             if series is None:
                 check_log_name(name, value)
                 self.has_logged = True
+                if len(self._series) == _MAX_SERIES:  # a loop with names without end
+                    self._series.clear()
                 series = _Series(name, self._loop.rows(phase), scalar_encoder(name, phase))
                 self._series[phase, name] = series
-        with self._loop.lock:
-            if not self._loop.records():
+        loop = self._loop
+        with loop.lock:
+            if loop.is_foreign and not loop.records():
                 return
-            position = self._loop.position
-            step, episode = series.rows.place
-            self._numbers.append((series, value, position, step, episode))
+            self._numbers.append((series, value, loop.moment(series.rows)))
             if len(self._numbers) == _MAX_WAITING or len(name) > _LONG_NAME:
                 self.commit()
 
@@ -121,12 +129,10 @@ class Messages:
             self._recorder.append(topic, state.to_payload(), position)
         numbers, self._numbers = self._numbers, []
         if numbers:
-            payloads = [series.encode(value, step, episode) for series, value, _, step, episode in numbers]
-            self._recorder.extend(
-                schema.SCALAR_TOPIC, payloads, [position for _, _, position, _, _ in numbers]
-            )
-            for series, value, _, _, _ in numbers:
-                self._outcomes.take_logged(series.name, value)
+            payloads = [series.encode(value, step, episode) for series, value, (_, step, episode) in numbers]
+            self._recorder.extend(schema.SCALAR_TOPIC, payloads, [moment[0] for _, _, moment in numbers])
+            for name, value in {series.name: value for series, value, _ in numbers}.items():
+                self._outcomes.take_logged(name, value)
 
     def _log_text(self, name: str, text: str) -> None:
         check_log_name(name, text)

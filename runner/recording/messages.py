@@ -6,8 +6,8 @@ import math
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
-from typing import Any
+from functools import cache, lru_cache
+from typing import Any, Final
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
@@ -94,8 +94,8 @@ def scalar_encoder(name: str, phase: str) -> Callable[[float, int, int], bytes]:
     head = b"\n" + varint(len(named)) + named
     middle = b"\x1a" + varint(len(phased)) + phased
     before_value, before_step = head + b"\x11", middle + b"!"
-    pack = struct.Struct(f"<{len(before_value)}sd{len(before_step)}sqcq").pack
-    pack_value, pack_number = struct.Struct("<cd").pack, struct.Struct("<cq").pack
+    pack = _scalar_struct(len(before_value), len(before_step)).pack
+    pack_value, pack_number = _SCALAR_VALUE.pack, _SCALAR_NUMBER.pack
 
     def encode_scalar(value: float, step: int, episode: int) -> bytes:
         if value and step and episode:
@@ -109,6 +109,16 @@ def scalar_encoder(name: str, phase: str) -> Callable[[float, int, int], bytes]:
         )
 
     return encode_scalar
+
+
+_SCALAR_VALUE: Final = struct.Struct("<cd")
+_SCALAR_NUMBER: Final = struct.Struct("<cq")
+
+
+@lru_cache(256)
+def _scalar_struct(before_value: int, before_step: int) -> struct.Struct:
+    """Return the layout of a `dualtaxi.Scalar` with this many bytes before its value and step."""
+    return struct.Struct(f"<{before_value}sd{before_step}sqcq")
 
 
 def decode(message: MessageType, payload: bytes) -> dict[str, Any]:

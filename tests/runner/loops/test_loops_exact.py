@@ -182,6 +182,22 @@ def test_a_log_of_zeros_is_encoded_as_protobuf_does(tmp_path):
     assert [one["step"] for one in found] == [0, 0, 0, 0, 0, 1]
 
 
+def test_numbers_of_ten_thousand_names_are_recorded_in_order(tmp_path):
+    with runner.record(Sensor(), tmp_path) as rec:
+        rec.reset()
+        for value in (1.5, 2.5):
+            for k in range(10_000):
+                rec.log(f"weight/{k}", value * k)
+            rec.step(0)
+    with open_recording(rec.run.recording) as recording:
+        found = [(one["name"], one["value"], one["step"]) for one in recording.decoded(schema.SCALAR_TOPIC)]
+    expected = [
+        (f"weight/{k}", value * k, step) for step, value in enumerate((1.5, 2.5)) for k in range(10_000)
+    ]
+    assert found == expected
+    assert rec.run.summary["logged"]["weight/7"] == 17.5
+
+
 def test_a_scalar_is_encoded_as_protobuf_does():
     from runner.recording.messages import encode, scalar_encoder
 
