@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -127,6 +128,15 @@ def record(
         ConfigError: an argument cannot be used.
         StorageError: the recordings folder cannot be written.
     """
+    if _is_vec_env(env):
+        if into is not None or phase != "train":
+            raise ConfigError("into, phase: found one of them with a VecEnv, expected none")
+        from runner.loops.recorded_vec_env import record_vec_env  # imports Stable-Baselines3
+
+        given = {"recordings": recordings, "name": name, "seed": seed, "config": config, "info": info}
+        given |= {"frames_every": frames_every, "frame_format": frame_format, "make": make}
+        recorded: RecordedEnv = record_vec_env(env, given | packing)  # a VecEnv, whose type is not known here
+        return recorded
     if not isinstance(env, gymnasium.Env) or issubclass(type(env), VectorEnv):  # EnvPool's are both
         raise ConfigError(
             f"found {type(env).__name__}, expected a Gymnasium environment, such as gymnasium.make gives; "
@@ -146,6 +156,12 @@ def record(
     maker = maker_of(env, checked_make(make))
     loop: Loop[Rows] = Loop(described, options, maker, ROWS[described.kind])
     return RecordedEnv(env, loop, phase)
+
+
+def _is_vec_env(env: object) -> bool:
+    """Return whether an environment is a `VecEnv` of Stable-Baselines3, without importing the library."""
+    module = sys.modules.get("stable_baselines3.common.vec_env")
+    return module is not None and isinstance(env, module.VecEnv)
 
 
 def _record_into_run(env: gymnasium.Env[Any, Any], into: RecordedEnv, phase: str, make: str) -> RecordedEnv:

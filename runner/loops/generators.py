@@ -13,9 +13,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
+from runner.loops.vec_env import mode_of
 from runner.recording.reset_states import SEED_BYTES, STEPS_BETWEEN, ResetState
 
 States = dict[int, ResetState]
@@ -85,17 +86,18 @@ class VectorWatch:
     """
 
     def __init__(self, envs: VectorEnv[Any, Any, Any], first: Any, autoreset: AutoresetMode) -> None:
-        base = envs.unwrapped
+        base: Any = envs.unwrapped
         self._watches: list[GeneratorWatch] = []
         self._async: Any = None
         self._seeded: set[int] = set()
         """The environments of an `AsyncVectorEnv` whose generators come from the seed of a reset."""
-        self._resets_itself = isinstance(base, SyncVectorEnv) and autoreset == AutoresetMode.NEXT_STEP
-        if isinstance(base, SyncVectorEnv):
+        mode = mode_of(base)
+        self._resets_itself = mode == "sync" and autoreset == AutoresetMode.NEXT_STEP
+        if mode == "sync":
             self._watches = [GeneratorWatch(env) for env in base.envs]
-        elif not isinstance(base, AsyncVectorEnv):
+        elif mode == "custom":
             self._watches = [GeneratorWatch(base)]
-        elif isinstance(first, gymnasium.Env) and not is_atari(first.unwrapped):
+        elif not (isinstance(first, gymnasium.Env) and is_atari(first.unwrapped)):
             self._async = base  # the seed of an Atari environment's generator does not determine its emulator
         self.steps = 0
         """The steps of the vector."""

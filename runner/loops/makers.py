@@ -11,9 +11,9 @@ import inspect
 import json
 import platform
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
@@ -21,19 +21,24 @@ from typing import Any, Final
 import numpy as np
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorActionWrapper, VectorEnv
+from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv
 from gymnasium.wrappers import HumanRendering, OrderEnforcing, PassiveEnvChecker, RecordVideo, TimeLimit
 from gymnasium.wrappers.vector import HumanRendering as VectorHumanRendering
 from gymnasium.wrappers.vector import RecordVideo as VectorRecordVideo
 
 from runner.errors import ConfigError
 from runner.loops.actions import action_names
+from runner.loops.vec_env import LIBRARY, VecEnvVector, mode_of
 from runner.recording.maker import FUNCTION_NAME, MAX_SPEC, EnvironmentMaker, VectorMaker
 from runner.util.values import MAX_TEXT
 
 _NAME_MAKE: Final = 'name a function that makes it: make="module:function"'
 _SHOWS_ONLY: Final = (RecordVideo, HumanRendering, VectorRecordVideo, VectorHumanRendering)
 """Wrappers that only show or store pictures: left out when the environment is made again."""
+_OBSERVERS: Final = frozenset(
+    {"sb3_contrib.common.wrappers.action_masker:ActionMasker", "stable_baselines3.common.monitor:Monitor"}
+)
+"""Wrappers of Stable-Baselines3 that change no observation, reward or end: left out, too."""
 _SIMULATORS: Final = ("Box2D", "ale_py", "mujoco", "pettingzoo", "supersuit")
 """Modules whose versions are recorded if they are loaded."""
 _DISTRIBUTIONS: Final = {"Box2D": ("box2d", "box2d-py")}
@@ -48,29 +53,57 @@ def maker_of(env: Any, make: str = "") -> EnvironmentMaker:
     """Return how a Gymnasium environment was made; `make` is the function that the user named, if any."""
     layers = list(_layers(env))
     names = tuple(_class_name(layer) for layer in layers[:-1])
-    base_spec = getattr(layers[-1], "spec", None)
     actions = action_names(env, env.action_space)
     maker = EnvironmentMaker("gymnasium", make=make, wrappers=names, action_names=actions)
-    if not isinstance(base_spec, EnvSpec):
-        top = _top(type(layers[-1]).__module__)
-        return _with_versions(maker, [top], "it was not made by gymnasium.make")
+    wrappers = [layer for layer in reversed(layers[:-1]) if not _only_observes(layer)]
+    top = _top(type(layers[-1]).__module__)
+    return _with_spec(maker, getattr(layers[-1], "spec", None), partial(_wrapping, wrappers), top)
+
+
+def _maker_of_spec(spec: Any) -> EnvironmentMaker:
+    """Return how an environment in another process was made, whose specification has its wrappers."""
+    wrappers = getattr(spec, "additional_wrappers", ())
+    names = tuple(wrapper.entry_point for wrapper in reversed(wrappers))
+
+    def wrapping(assumed: list[str]) -> dict[str, Any]:
+        left = [wrapper for wrapper in wrappers if wrapper.entry_point not in _OBSERVERS]
+        fields = "disable_env_checker", "order_enforce", "max_episode_steps"
+        return {name: getattr(spec, name) for name in fields} | {
+            "additional_wrappers": [_known_wrapper(wrapper, assumed) for wrapper in left]
+        }
+
+    return _with_spec(EnvironmentMaker("gymnasium", wrappers=names), spec, wrapping, "")
+
+
+def _with_spec(
+    maker: EnvironmentMaker, spec: Any, wrapping: Callable[[list[str]], dict[str, Any]], top: str
+) -> EnvironmentMaker:
+    """Return a maker with a specification.
+
+    Args:
+        maker: has the names of the wrappers.
+        spec: Gymnasium's, of the environment inside of them.
+        wrapping: returns the fields that describe the wrappers; appends those whose arguments are unknown.
+        top: the top package of the environment, for versions where there is no specification.
+    """
+    if not isinstance(spec, EnvSpec):
+        return _with_versions(maker, [top] if top else [], "it was not made by gymnasium.make")
     assumed: list[str] = []
     try:
-        entry_point = _entry_point(base_spec.entry_point)
+        entry_point = _entry_point(spec.entry_point)
         fields = {
-            "id": base_spec.id,
+            "id": spec.id,
             "entry_point": entry_point,
-            "reward_threshold": base_spec.reward_threshold,
-            "nondeterministic": base_spec.nondeterministic,
-            "kwargs": _checked_kwargs(base_spec.kwargs, base_spec.id),
+            "reward_threshold": spec.reward_threshold,
+            "nondeterministic": spec.nondeterministic,
+            "kwargs": _checked_kwargs(spec.kwargs, spec.id),
         }
-        wrappers = [layer for layer in reversed(layers[:-1]) if not isinstance(layer, _SHOWS_ONLY)]
-        spec = json.dumps(fields | _wrapping(wrappers, assumed), default=_plain_number)
+        text = json.dumps(fields | wrapping(assumed), default=_plain_number)
     except _Unknown as reason:
-        return _with_versions(maker, [_top(type(layers[-1]).__module__)], reason)
-    top = _top(entry_point.partition(":")[0])
-    maker = replace(maker, spec=spec, registered_by="" if top == "gymnasium" else top, assumed=tuple(assumed))
-    return _with_versions(maker, [top, *(_top(name) for name in names)])
+        return _with_versions(maker, [top] if top else [], reason)
+    top = _top(entry_point)
+    maker = replace(maker, spec=text, registered_by="" if top == "gymnasium" else top, assumed=tuple(assumed))
+    return _with_versions(maker, [top, *(_top(name) for name in maker.wrappers if name not in _OBSERVERS)])
 
 
 def vector_maker_of(
@@ -86,18 +119,19 @@ def vector_maker_of(
     """
     layers = list(_layers(envs))
     base, reason = layers[-1], ""
-    mode = "sync" if isinstance(base, SyncVectorEnv) else "custom"
-    mode = "async" if isinstance(base, AsyncVectorEnv) else mode
-    if mode != "custom":
+    mode = mode_of(base)
+    if mode == "custom":
+        maker = _custom_vector(base)
+    elif first is base:  # its environments are in other processes
+        maker = _maker_of_spec(base.spec)
+    else:
         maker = maker_of(first)
         if mode == "sync" and any(maker_of(other) != maker for other in base.envs[1:]):
             reason = f"its environments were not all made in the same way; {_NAME_MAKE}"
-    else:
-        maker = _custom_vector(base)
     assumed = list(maker.assumed)
     specs = "[]"
     try:
-        wrappers = [layer for layer in reversed(layers[:-1]) if not isinstance(layer, _SHOWS_ONLY)]
+        wrappers = [layer for layer in reversed(layers[:-1]) if not _only_observes(layer)]
         specs = json.dumps([_wrapper_spec(wrapper, assumed) for wrapper in wrappers], default=_plain_number)
     except _Unknown as unknown:
         reason = reason or f"{unknown}; {_NAME_MAKE}"
@@ -110,7 +144,14 @@ def vector_maker_of(
         make=make,
         reason=maker.reason or reason,
         assumed=tuple(assumed),
-        vector=VectorMaker(int(envs.num_envs), mode, autoreset.value, names, specs),
+        vector=VectorMaker(
+            int(envs.num_envs),
+            mode,
+            autoreset.value,
+            names,
+            specs,
+            LIBRARY if isinstance(base, VecEnvVector) else "",
+        ),
         action_names=() if has_others else action_names(first, space),
     )
 
@@ -200,6 +241,20 @@ def _wrapping(wrappers: Sequence[Any], assumed: list[str]) -> dict[str, Any]:
         "max_episode_steps": None if limit is None else limit._max_episode_steps,
         "additional_wrappers": [_wrapper_spec(wrapper, assumed) for wrapper in left],
     }
+
+
+def _only_observes(wrapper: Any) -> bool:
+    return isinstance(wrapper, _SHOWS_ONLY) or _class_name(wrapper) in _OBSERVERS
+
+
+def _known_wrapper(spec: WrapperSpec, assumed: list[str]) -> dict[str, Any]:
+    """Return the fields of a wrapper's specification, which has no arguments if it does not record them."""
+    if spec.kwargs is None:
+        module, _, name = spec.entry_point.partition(":")
+        if _default_arguments(getattr(importlib.import_module(module), name), ("env",)):
+            assumed.append(spec.entry_point)
+    kwargs = _checked_kwargs(spec.kwargs or {}, f"the wrapper {spec.entry_point}")
+    return {"name": spec.name, "entry_point": spec.entry_point, "kwargs": kwargs}
 
 
 def _wrapper_spec(wrapper: Any, assumed: list[str]) -> dict[str, Any]:

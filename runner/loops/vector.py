@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
+from numpy.typing import NDArray
 
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, describe
-from runner.loops.generators import VectorWatch
+from runner.loops.generators import States, VectorWatch
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, vector_maker_of
 from runner.loops.options import options_of
@@ -111,13 +112,35 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
         states = self._watch.before_reset(which, seeds)
         result = self.env.reset(**given(seed=seed, options=options))
         states = self._watch.after_reset(states, which, seeds)
+        self.record_reset(*result, seeds, which, states, others)
+        return result
+
+    def record_reset(
+        self,
+        observations: Any,
+        infos: Any,
+        seeds: Sequence[int | None] = (),
+        which: NDArray[np.bool_] | None = None,
+        states: States | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Record a reset of some environments, or of all, that was just done.
+
+        Args:
+            observations: batched.
+            infos: as the reset returned them.
+            seeds: of all environments; empty for none.
+            which: [N], the environments; all unless given.
+            states: what the reset depended on, as far as it is to be recorded.
+            options: of the reset.
+        """
+        which = np.ones(self.env.num_envs, np.bool_) if which is None else which
         with self._loop.lock:
             self._loop.activate(self._rows)
-            self._rows.reset(result[0], seeds, which, states)
-        self._messages.reset_info(self._phase, _by_environment(result[1]), others, None)
+            self._rows.reset(observations, seeds, which, states or {})
+        self._messages.reset_info(self._phase, _by_environment(infos), options, None)
         if self._options.frames_every:
             self._record_frames(resets=which)
-        return result
 
 
 def record_vector(

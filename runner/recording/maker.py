@@ -44,6 +44,14 @@ class VectorMaker:
     wrapper_specs: str = "[]"
     """JSON: a list of the same as Gymnasium's `WrapperSpec` (`name`, `entry_point`, `kwargs`), from the
     innermost out."""
+    library: str = ""
+    """`stable-baselines3` if it was a `VecEnv` of that library, whose episodes are not recorded as truncated
+    if they terminated; `make` then makes one of its environments."""
+
+    @property
+    def is_vec_env(self) -> bool:
+        """Whether it was a `VecEnv` of Stable-Baselines3."""
+        return self.library == "stable-baselines3"
 
 
 @dataclass(frozen=True)
@@ -124,6 +132,7 @@ def _parse_vector(values: Any, where: str) -> VectorMaker:
         autoreset=check.choice("autoreset", AUTORESET_MODES),
         wrappers=check.names("wrappers"),
         wrapper_specs=check.json("wrapper_specs", list),
+        library=check.text("library", MAX_TEXT) if "library" in check.values else "",
     )
 
 

@@ -170,6 +170,8 @@ class Replay:
                     stepper = GameStepper(env, self._recording)
                 else:
                     stepper = EnvironmentStepper(env, self._recording)
+                    vector = None if maker is None else maker.vector
+                    stepper.ends_once = vector is not None and vector.is_vec_env
                 stepper.check_spaces()
             except (CannotRedo, MemoryError):
                 raise

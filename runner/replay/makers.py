@@ -86,6 +86,8 @@ def is_whole_vector(maker: EnvironmentMaker) -> bool:
     vector = maker.vector
     if vector is None:
         return False
+    if vector.is_vec_env:
+        return False
     return vector.mode == "custom" or bool(maker.make) or bool(vector_wrappers(vector))
 
 

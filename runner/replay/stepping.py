@@ -233,6 +233,8 @@ class RowStepper(Stepper):
 class EnvironmentStepper(RowStepper):
     """A Gymnasium environment."""
 
+    ends_once = False
+    """Whether an episode that terminated is not truncated too."""
     _endings: NDArray[np.void]
     """Rewards and ends of the rows, put down quickly, and copied to their columns at the end."""
 
@@ -243,6 +245,8 @@ class EnvironmentStepper(RowStepper):
         results.rewards[:, 0] = self._endings["reward"]
         results.terminated[:] = self._endings["terminated"]
         results.truncated[:] = self._endings["truncated"]
+        if self.ends_once:
+            results.truncated &= ~results.terminated
         return results
 
     def _spaces(self) -> tuple[Space, Space]:

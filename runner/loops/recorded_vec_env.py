@@ -1,0 +1,144 @@
+"""`runner.record` for a `VecEnv` of Stable-Baselines3. Importing this module imports the library."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+
+from runner.errors import ConfigError
+from runner.loops.recorded import Recorded
+from runner.loops.values import warn_user
+from runner.loops.vec_env import VecEnvVector
+from runner.loops.vector import record_vector
+
+_METHODS = ("reset", "step_async", "step_wait")
+
+
+class RecordedVecEnv(VecEnv):  # type: ignore[misc]
+    """A `VecEnv` whose every reset and step is recorded.
+
+    It has the attributes of the `VecEnv`, and `run`, `log`, `checkpoint` and the other ones of what
+    `runner.record` returns. It is no `VecEnvWrapper`, because `EvalCallback` expects as many of those around
+    the environments of training as of evaluation.
+
+    Args:
+        base: a `VecEnv` without wrappers.
+        options: the arguments of `record_vector`.
+    """
+
+    def __init__(self, base: VecEnv, options: dict[str, Any]) -> None:
+        self.base = base
+        self._vector = VecEnvVector(base)
+        try:
+            self.recorded = record_vector(self._vector, **options)
+        except BaseException:
+            self._vector.release()
+            raise
+        super().__init__(base.num_envs, base.observation_space, base.action_space)
+        self.metadata = base.metadata
+        self._actions: Any = None
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("base", "recorded"):  # not made yet
+            raise AttributeError(name)
+        return getattr(self.recorded if hasattr(Recorded, name) else self.base, name)
+
+    def replace_methods(self) -> None:
+        """Record what is done with the `VecEnv` itself, until `restore_methods` is called."""
+        for name in _METHODS:
+            setattr(self.base, name, getattr(self, name))
+
+    def restore_methods(self) -> None:
+        """Leave the `VecEnv` as it was."""
+        for name in _METHODS:
+            vars(self.base).pop(name, None)
+        self._vector.release()
+
+    def reset(self) -> Any:
+        """Reset all environments, and record it."""
+        seeds, options = self.base._seeds, self.base._options
+        if any(own != options[0] for own in options):
+            warn_user("The options of resets are not recorded where they differ between environments.")
+            options = [None]
+        is_seeded = any(seed is not None for seed in seeds)
+        self.recorded.reset(seed=list(seeds) if is_seeded else None, options=options[0] or None)
+        self.reset_infos = self.base.reset_infos
+        return self._vector.native
+
+    def step_async(self, actions: Any) -> None:
+        """Begin a step in each environment."""
+        self._actions = actions
+        self._vector.step_async(actions)
+
+    def step_wait(self) -> Any:
+        """Wait for the steps, and record them."""
+        self.recorded.step(self._actions)
+        self.reset_infos = self.base.reset_infos
+        return self._vector.native
+
+    def close(self) -> None:
+        """Close the environments, and the recording as finished."""
+        self.recorded.close()
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Set the seeds of the next reset."""
+        return self.base.seed(seed)  # type: ignore[no-any-return]
+
+    def set_options(self, options: Any = None) -> None:
+        """Set the options of the next reset."""
+        self.base.set_options(options)
+
+    def get_images(self) -> Any:
+        """Return a picture of each environment."""
+        return self.base.get_images()
+
+    def render(self, mode: str | None = None) -> Any:
+        """Return one picture of all environments, or show it."""
+        return self.base.render(mode)
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> Any:
+        """Return an attribute of each environment."""
+        return self.base.get_attr(attr_name, indices)
+
+    def has_attr(self, attr_name: str) -> bool:
+        """Return whether each environment has an attribute."""
+        return bool(self.base.has_attr(attr_name))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of each environment."""
+        self.base.set_attr(attr_name, value, indices)
+
+    def env_method(self, method_name: str, *arguments: Any, indices: Any = None, **named: Any) -> Any:
+        """Call a method of each environment."""
+        return self.base.env_method(method_name, *arguments, indices=indices, **named)
+
+    def env_is_wrapped(self, wrapper_class: type, indices: int | Iterable[int] | None = None) -> Any:
+        """Return for each environment whether it has a wrapper."""
+        return self.base.env_is_wrapped(wrapper_class, indices)
+
+
+def record_vec_env(env: VecEnv, options: dict[str, Any]) -> VecEnv:
+    """Return a `VecEnv` whose environments are recorded, as they are inside of all wrappers.
+
+    Args:
+        env: the `VecEnv`; of one with wrappers, the innermost wrapper gets the recorded environments.
+        options: the arguments of `record_vector`.
+
+    Raises:
+        ConfigError: it is recorded already, or an argument cannot be used.
+        EnvironmentNotUsable: a space cannot be recorded.
+        StorageError: the recordings folder cannot be written.
+    """
+    base = env.unwrapped
+    if isinstance(base, RecordedVecEnv):
+        raise ConfigError("found a VecEnv that is recorded already, expected one that is not")
+    recorded = RecordedVecEnv(base, options)
+    if env is base:
+        return recorded
+    innermost = env
+    while isinstance(innermost.venv, VecEnvWrapper):
+        innermost = innermost.venv
+    innermost.venv = recorded
+    return env
