@@ -60,17 +60,17 @@ class Shape:
 
         steps = table(layout.STEPS, "/train/step", "/eval/step")
         episodes = table(layout.EPISODES, "/train/episode", "/eval/episode")
-        log = table(layout.LOG, schema.LOG_TOPIC.name)
+        log = table(layout.LOG, schema.LOG_TOPIC.name), table(layout.CLOCK, schema.CLOCK_TOPIC.name)
         if self.kind == "job":
             return (
                 *(steps, episodes),
                 *(table(layout.TRAIN_METRICS, "/train/metrics"), table(layout.EVAL_METRICS, "/eval/metrics")),
-                *(table(layout.OPTIMALITY, "/eval/optimality"), log),
+                *(table(layout.OPTIMALITY, "/eval/optimality"), *log),
             )
         return (
             *(steps, episodes, table(layout.RESETS, "/train/reset", "/eval/reset")),
             *(table(layout.INFOS, "/train/info", "/eval/info"), table(layout.SCALARS, "/scalar")),
-            *(table(layout.ARRAYS, "/array"), table(layout.FRAMES, "/train/frame", "/eval/frame"), log),
+            *(table(layout.ARRAYS, "/array"), table(layout.FRAMES, "/train/frame", "/eval/frame"), *log),
             *(table(layout.CHECKPOINTS, "/checkpoint"), table(layout.EXTRA_COLUMNS, "/extra")),
             *((table(layout.EXTRAS, "/train/extra", "/eval/extra"),) if self.extras else ()),
             table(layout.RESET_STATES, "/train/reset_state", "/eval/reset_state"),

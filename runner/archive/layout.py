@@ -17,6 +17,7 @@
     <run id>/checkpoints.parquet     the references to checkpoints,
     <run id>/checkpoints/<digest>    and their contents
     <run id>/log.parquet             lines of text
+    <run id>/clock.parquet           the time that had passed after some steps
     <run id>/run.parquet             one row: what the run is, its configuration and provenance
     <run id>/transitions.parquet     the environment's possible outcomes, with their events
     <run id>/states.parquet          a description of each state
@@ -66,6 +67,7 @@ CHECKPOINTS: Final = "checkpoints.parquet"
 CONTENTS: Final = "checkpoints/"
 """The folder of the contents of checkpoints, named by their digests."""
 LOG: Final = "log.parquet"
+CLOCK: Final = "clock.parquet"
 FRAME_ID: Final = "frame_id"
 """A column that archives of earlier versions do not have."""
 RUN: Final = "run.parquet"
@@ -98,6 +100,7 @@ SCHEMAS: Final = {
     EVAL_METRICS: _metrics(schema.EVAL_METRICS_TOPIC),
     OPTIMALITY: _metrics(schema.OPTIMALITY_TOPIC),
     LOG: pa.schema([*_PLACED, *((name, pa.string()) for name in ("name", "level", "message"))]),
+    CLOCK: pa.schema([*_PLACED, ("started", pa.float64()), ("seconds", pa.float64())]),
     Q_TABLES: pa.schema(
         [
             *_PLACED,
@@ -136,7 +139,7 @@ SCHEMAS: Final = {
 }
 """The columns of the tables that are the same in every archive."""
 
-LEFT_OUT_IF_EMPTY: Final = frozenset({EXTRA_COLUMNS, EXTRAS, RESET_STATES, CHECKPOINTS})
+LEFT_OUT_IF_EMPTY: Final = frozenset({EXTRA_COLUMNS, EXTRAS, RESET_STATES, CHECKPOINTS, CLOCK})
 """The tables that an archive need not have."""
 EXTRA_PREFIX: Final = "extra_"
 _MAY_BE_NULL: Final = frozenset({"data", "seed"})

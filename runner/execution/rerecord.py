@@ -15,6 +15,7 @@ from runner.errors import Diverged, RunnerError
 from runner.execution.initial_tables import address, recorded_tables
 from runner.execution.session import Report, Session, Stop, describe, recorder_for, run_job
 from runner.learning.learner import Learner
+from runner.recording import schema
 from runner.recording.metadata import write_result
 from runner.recording.reader import open_recording
 from runner.recording.writer import RecordingFile
@@ -141,13 +142,18 @@ def _record(job: Job, run: Run, fresh: Path, report: Report, stop: Stop) -> dict
         resumed = {
             name: recording.metadata(name) for name in recording.metadata_names if name.startswith("resume/")
         }
+        circumstances = {topic: list(recording.messages(topic)) for topic in schema.MACHINE_TOPICS}
     with RecordingFile(fresh) as file:
         describe(file, job, run, learner, made_by)
         for name, entries in resumed.items():
             file.add_metadata(name, entries)
         file.add_metadata("rerecord", provenance())
-        session = Session(job, learner, recorder_for(job, learner, file, beat=run.beat), report, stop)
+        recorder = recorder_for(job, learner, file, beat=run.beat, clock=False)
+        session = Session(job, learner, recorder, report, stop)
         try:
+            for topic, messages in circumstances.items():
+                for log_time, payload in messages:
+                    recorder.append(topic, payload, log_time // schema.STEP_NANOSECONDS)
             done = session.run()
             topics = session.recorder.drain()
         except BaseException:

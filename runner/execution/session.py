@@ -348,6 +348,7 @@ def recorder_for(
     reference: Reference | None = None,
     beat: Callable[[], None] = lambda: None,
     threads: bool = True,
+    clock: bool = True,
 ) -> Recorder:
     """Return a recorder for a learner's steps into a file, packed as in the job's configuration."""
     options = job.config.recording
@@ -360,6 +361,7 @@ def recorder_for(
         reference=reference,
         beat=beat,
         threads=threads,
+        clock=clock,
     )
 
 

@@ -337,9 +337,10 @@ class _Content:
             self.off_table += int(np.count_nonzero(~outcomes.any(axis=1)))
 
     def add_other_topics(self) -> None:
-        """Add all messages of the topics of varying size."""
+        """Add all messages of the topics of varying size whose number a result states."""
         for topic in self._recording.topics:
-            if topic in self._recording.dtypes or topic.message is schema.EXTRA:
+            is_added = topic in self._recording.dtypes or topic.message is schema.EXTRA
+            if is_added or topic in schema.MACHINE_TOPICS:
                 continue
             for time, payload in self._recording.messages(topic):
                 if topic.digested:

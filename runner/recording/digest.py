@@ -3,7 +3,7 @@
 For each topic, BLAKE3 over its message records in order, each in canonical form: the MCAP message record with
 the topic's own channel id, sequence 0, and publish time equal to log time. Then BLAKE3 over the sorted
 topics that have messages: length of the name (u32), name, hash. It does not depend on where chunks were
-closed, on compression, index, provenance or `/log`.
+closed, on compression, index, provenance, or topics that say how a run went: `/log`, `/clock`.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from runner.recording import schema
 from runner.recording.blocks import Sizes, blank_records, message_record, record_dtype, topic_sizes
+from runner.recording.clock import Stopwatch
 from runner.recording.digest import combined_digest
 from runner.recording.pipeline import MessageBatches, Pipeline
 from runner.recording.reference import Reference
@@ -80,6 +81,7 @@ class Recorder:
         watch: called with the records of a block as they are committed; the block is used again.
         before: called once, before the first message is written. With it, threads are started and messages
             written only when some have gathered, or by `release`, so that a short recording costs little.
+        clock: whether to record the time that passes.
     """
 
     def __init__(
@@ -95,6 +97,7 @@ class Recorder:
         threads: bool = True,
         watch: Callable[[Topic, NDArray[np.void]], None] = lambda *_: None,
         before: Callable[[], None] | None = None,
+        clock: bool = True,
     ) -> None:
         packing = packing or Packing()
         self._file = file
@@ -114,6 +117,9 @@ class Recorder:
         self._last_flush = time.monotonic()
         self._pipeline = Pipeline(file, packing, beat, threads, before)
         self._batches = MessageBatches(self._pipeline.send)
+        is_timed = clock and file is not None and schema.CLOCK_TOPIC in file.topics
+        self._stopwatch = Stopwatch() if is_timed else None
+        self._record_time()
 
     def _lane(self, topic: Topic, sizes: Sizes, write: bool) -> _Lane:
         return _Lane(topic, sizes, capacity_of(topic, sizes, self._chunk_steps), write)
@@ -215,7 +221,8 @@ class Recorder:
         """
         self._pipeline.raise_failure()
         self._batches.extend(topic, [position * STEP_NANOSECONDS for position in positions], payloads)
-        self.counts[topic.name] += len(payloads)
+        if topic not in schema.MACHINE_TOPICS:  # of which a resumed run does not know the number
+            self.counts[topic.name] += len(payloads)
 
     def submit(self, topic: Topic, make: Callable[[], bytes], position: int) -> None:
         """Record one message that is made by a thread of the recorder.
@@ -235,6 +242,7 @@ class Recorder:
 
     def flush(self) -> None:
         """Write every open block and batch now; records that were not taken must be put down again."""
+        self._record_time()
         self._batches.flush()
         for lane in self._lanes.values():
             if lane.open is not None and lane.open.filled:
@@ -247,6 +255,7 @@ class Recorder:
         Raises:
             StorageError: the disk is full or failing; everything before is kept.
         """
+        self._record_time(is_last=True)
         self.flush()
         self._pipeline.close()
         self._pipeline.raise_failure()
@@ -267,6 +276,13 @@ class Recorder:
         if self._file is not None and self._pipeline.is_open and self._pipeline.failure is None:
             self.flush()
         self._pipeline.close()
+
+    def _record_time(self, is_last: bool = False) -> None:
+        """Record a sample of the clock, if one is due; a resumed run has none before it has new steps."""
+        watch = self._stopwatch
+        if watch is not None and self._reference.exhausted and (watch.begin() or is_last or watch.is_due()):
+            position = sum(self.steps.values()) * STEP_NANOSECONDS
+            self._batches.extend(schema.CLOCK_TOPIC, [position], [watch.sample()])
 
     def take(self, topic: Topic, positions: NDArray[np.uint64]) -> None:
         """Take the next filled records of the topic's block: set their times, compare or keep them.

@@ -275,6 +275,8 @@ CHECKPOINT = MessageType(
     ),
 )
 """A reference to content in the store next to the recordings, by its BLAKE3."""
+CLOCK = MessageType("Clock", (Field(1, "started", _DOUBLE), Field(2, "seconds", _DOUBLE)))
+"""How much time had passed at its position; `clock` describes its fields."""
 
 LOG_LEVELS: Final = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
 
@@ -298,7 +300,7 @@ TOPICS: Final = (
     LOG_TOPIC,
     OPTIMALITY_TOPIC,
 )
-"""The topics of a run that the runner itself learned."""
+"""The topics of what the runner itself learned, which a job determines."""
 
 TRAIN_TRANSITION = Topic("/train/step", 9, TRANSITION, "train")
 EVAL_TRANSITION = Topic("/eval/step", 10, TRANSITION, "eval")
@@ -322,6 +324,9 @@ EXTRA_COLUMNS_TOPIC = Topic("/extra", 26, EXTRA_COLUMNS)
 TRAIN_EXTRA = Topic("/train/extra", 27, EXTRA, "train")
 EVAL_EXTRA = Topic("/eval/extra", 28, EXTRA, "eval")
 CHECKPOINT_TOPIC = Topic("/checkpoint", 29, CHECKPOINT)
+CLOCK_TOPIC = Topic("/clock", 30, CLOCK, digested=False)
+MACHINE_TOPICS: Final = (CLOCK_TOPIC,)
+"""The topics of how the recording went on its machine: other messages each time a job is run."""
 
 LOOP_TOPICS: Final = {
     "step": (TRAIN_STEP, EVAL_STEP, TRAIN_RESET, EVAL_RESET),
@@ -341,8 +346,8 @@ _EVERY_LOOP: Final = (
     *(EXTRA_COLUMNS_TOPIC, TRAIN_EXTRA, EVAL_EXTRA, CHECKPOINT_TOPIC),
 )
 KINDS: Final = {
-    "job": TOPICS,
-    **{kind: (*topics, *_EVERY_LOOP) for kind, topics in LOOP_TOPICS.items()},
+    "job": (*TOPICS, *MACHINE_TOPICS),
+    **{kind: (*topics, *_EVERY_LOOP, *MACHINE_TOPICS) for kind, topics in LOOP_TOPICS.items()},
 }
 """The topics of each kind of recording, as the metadata record `run` names it."""
 ALL_TOPICS: Final = tuple(

@@ -38,7 +38,7 @@ from runner.recording.chunks import Chunk
 from runner.recording.index import FOOTER_BODY_BYTES, FOOTER_HEAD, checksum
 from runner.recording.messages import file_descriptor_set
 from runner.recording.records import Contents
-from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, TOPICS, Topic
+from runner.recording.schema import ALL_TOPICS, KINDS, MESSAGES, PROFILE, Topic
 from runner.util.version import __version__
 
 _LIBRARY = f"dualtaxi {__version__}"
@@ -47,7 +47,7 @@ _LIBRARY = f"dualtaxi {__version__}"
 class RecordingFile:
     """A recording that is written: append records, then `finish`. Not thread-safe."""
 
-    def __init__(self, path: Path, topics: Sequence[Topic] = TOPICS) -> None:
+    def __init__(self, path: Path, topics: Sequence[Topic] = KINDS["job"]) -> None:
         """Create the file; one that exists is never overwritten.
 
         Args:
@@ -80,7 +80,8 @@ class RecordingFile:
         self._counts = {topic.channel: 0 for topic in ALL_TOPICS}
         self._start_time: int | None = None
         self._end_time = 0
-        self._topics = tuple(topics)
+        self.topics = tuple(topics)
+        """The topics it has channels for."""
 
     @classmethod
     def reopen(cls, path: Path, contents: Contents) -> RecordingFile:
@@ -228,7 +229,7 @@ class RecordingFile:
 
     def _summary(self, start: int) -> tuple[bytes, bytes]:
         """Return the summary section, which begins at `start`, and the summary offset section."""
-        schemas, channels = schemas_and_channels(self._topics)
+        schemas, channels = schemas_and_channels(self.topics)
         groups = [
             (Opcode.SCHEMA, schemas),
             (Opcode.CHANNEL, channels),
@@ -249,18 +250,18 @@ class RecordingFile:
     def _statistics(self) -> Statistics:
         return Statistics(
             attachment_count=len(self._attachments),
-            channel_count=len(self._topics),
+            channel_count=len(self.topics),
             channel_message_counts={channel: n for channel, n in self._counts.items() if n},
             chunk_count=len(self._chunks),
             message_count=sum(self._counts.values()),
             metadata_count=len(self._metadata),
             message_start_time=self._start_time or 0,
             message_end_time=self._end_time,
-            schema_count=len({topic.message for topic in self._topics}),
+            schema_count=len({topic.message for topic in self.topics}),
         )
 
 
-def create_recording(path: Path, topics: Sequence[Topic] = TOPICS) -> RecordingFile:
+def create_recording(path: Path, topics: Sequence[Topic] = KINDS["job"]) -> RecordingFile:
     """Return the file of a new recording with these topics.
 
     Raises:

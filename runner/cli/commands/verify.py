@@ -217,6 +217,7 @@ _MESSAGES: Final = {
     "/checkpoint": "checkpoints",
     "/train/reset_state": "states before resets",
     "/eval/reset_state": "states before evaluation resets",
+    "/clock": "samples of the clock",
 }
 
 
@@ -269,7 +270,9 @@ def _repair(repaired: Repair, run: Run | None) -> dict[str, str]:
         rows["verdict"] = "repaired before, when not all could be saved; there was nothing to do"
     else:
         counts = [
-            f"{count:,} {_MESSAGES[topic]}" for topic, count in repaired.kept.items() if topic != "/log"
+            f"{count:,} {_MESSAGES[topic]}"
+            for topic, count in repaired.kept.items()
+            if topic not in ("/log", "/clock")
         ]
         rows["verdict"] = "repaired" if repaired.lossless else "repaired, but not all could be saved"
         rows["kept"] = ", ".join(counts) or "nothing but the description: it ended before its first message"

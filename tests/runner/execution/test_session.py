@@ -192,7 +192,7 @@ def test_recorded_without_threads_a_run_is_the_same_to_the_byte(parts, tmp_path)
     )
     assert alone.summary["content_digest"] == threaded.summary["content_digest"]
     with open_recording(alone.recording) as one, open_recording(threaded.recording) as other:
-        for topic in schema.ALL_TOPICS:
+        for topic in set(schema.ALL_TOPICS) - set(schema.MACHINE_TOPICS):
             assert list(one.messages(topic)) == list(other.messages(topic))
     assert set(threading.enumerate()) <= before, "no thread is left"
 

@@ -12,6 +12,7 @@ from gymnasium.wrappers import Autoreset, TransformReward
 
 import runner
 from runner.execution.verify import verify
+from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.digest import ContentHash
 from runner.recording.messages import encode
@@ -28,7 +29,7 @@ def forged(source, target, topics=None, result=None):
         source = altered(source, target.with_name(f"{k}-{target.name}"), topic, change)
     with open_recording(source) as recording:
         digest, counts = ContentHash(), {}
-        for topic in recording.topics:
+        for topic in set(recording.topics) - set(schema.MACHINE_TOPICS):
             messages = list(recording.messages(topic))
             counts[topic.name] = len(messages)
             for time, payload in messages:

@@ -40,7 +40,7 @@ def records_of(data: bytes) -> Iterator[tuple[int, int, int]]:
 def all_messages(recording) -> dict[str, list]:
     """Return every message of every topic, those of fixed width as blocks."""
     found = {}
-    for topic in schema.TOPICS:
+    for topic in schema.KINDS["job"]:
         found[topic.name] = list(recording.messages(topic))
         if topic in schema.BLOCK_TOPICS:
             blocks = list(recording.blocks(topic))

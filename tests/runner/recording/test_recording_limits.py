@@ -113,7 +113,7 @@ def test_a_full_disk_ends_the_run_and_keeps_what_was_written(size, whole, tmp_pa
     assert whole.startswith(kept)
 
 
-@pytest.mark.parametrize("missing", [1, 200, 3_000])
+@pytest.mark.parametrize("missing", [80, 200, 3_000])  # the clock varies in size
 def test_a_disk_that_is_full_at_the_very_end_loses_only_the_index(missing, tmp_path):
     whole = make_run(tmp_path, LAKE)
     run, _ = run_on_small_disk(tmp_path, whole.recording.stat().st_size - missing, LAKE)

@@ -1,0 +1,126 @@
+"""The clock of a recording: how much time had passed after how many steps.
+
+`/clock` has a sample about once a second. A session is the time in which one process records; the pause
+before a run is resumed does not count.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.messages import encode
+from runner.recording.schema import STEP_NANOSECONDS
+from runner.recording.topic_reader import TopicReader
+
+SAMPLE_SECONDS: Final = 1.0
+_SAMPLES_A_DURATION: Final = 3600
+"""After an hour samples become rarer, so that their interval stays this fraction of the duration."""
+_MAX_SAMPLES: Final = 1 << 20
+_MAX_SECONDS: Final = 1e10
+
+
+class Stopwatch:
+    """Measures a session, which begins at the first call of `begin`."""
+
+    def __init__(self) -> None:
+        self._started = 0.0
+        self._origin: float | None = None
+        self._next = 0.0
+
+    def begin(self) -> bool:
+        """Begin the session, unless it has begun; return whether it begins now."""
+        if self._origin is not None:
+            return False
+        self._started, self._origin = time.time(), time.monotonic()
+        self._next = SAMPLE_SECONDS
+        return True
+
+    def is_due(self) -> bool:
+        """Return whether it is time for another sample, and plan the next one."""
+        if self.seconds < self._next:
+            return False
+        self._next = self.seconds + max(SAMPLE_SECONDS, self.seconds / _SAMPLES_A_DURATION)
+        return True
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the beginning of the session; 0 before."""
+        return 0.0 if self._origin is None else time.monotonic() - self._origin
+
+    def sample(self) -> bytes:
+        """Return a `dualtaxi.Clock`: the time now."""
+        return encode(schema.CLOCK, {"started": self._started, "seconds": self.seconds})
+
+
+@dataclass(frozen=True, eq=False)
+class Clock:
+    """How much time had passed after how many steps, without pauses before a run was resumed."""
+
+    positions: NDArray[np.int64]
+    """[samples], never decreasing: steps executed so far, of training and evaluation together."""
+    seconds: NDArray[np.float64]
+    """[samples], never decreasing."""
+    started: NDArray[np.float64]
+    """[samples]: when the session of the sample began, in seconds since 1970, UTC."""
+
+    @property
+    def duration(self) -> float:
+        """The seconds that were recorded."""
+        return float(self.seconds[-1])
+
+    @property
+    def steps_a_second(self) -> float | None:
+        """The mean rate, of training and evaluation together; None if no time passed."""
+        steps = int(self.positions[-1] - self.positions[0])
+        return steps / self.duration if self.duration > 0 else None
+
+    def seconds_at(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the seconds that had passed at each number of steps, interpolated between samples.
+
+        Args:
+            positions: [n], numbers of steps of training and evaluation together: of any message
+                `log_time // STEP_NANOSECONDS`. After the last sample time stands still.
+        """
+        after = np.searchsorted(self.positions, positions, side="left")
+        i = np.minimum(after, len(self.positions) - 1)
+        before = np.maximum(after - 1, 0)
+        gap = self.positions[i] - self.positions[before]
+        done = (np.asarray(positions) - self.positions[before]) / np.maximum(gap, 1)
+        passed = self.seconds[i] - self.seconds[before]
+        return np.asarray(self.seconds[before] + np.clip(done, 0.0, 1.0) * passed)
+
+
+def read_clock(recording: TopicReader) -> Clock | None:
+    """Return the clock of a recording; None if it has no samples, as those of earlier versions.
+
+    Raises:
+        RecordingError: samples are damaged, or more than 1,048,576.
+    """
+    rows: list[tuple[int, float, float]] = []
+    for fields in recording.decoded(schema.CLOCK_TOPIC, max_bytes=1024):
+        row = (fields["log_time"] // STEP_NANOSECONDS, fields["seconds"], fields["started"])
+        if len(rows) == _MAX_SAMPLES or not all(map(math.isfinite, row)) or not 0 <= row[1] < _MAX_SECONDS:
+            raise RecordingError(
+                f"{recording.path}: {schema.CLOCK_TOPIC.name}: found {fields['seconds']} seconds in sample "
+                f"{len(rows)}, expected at most {_MAX_SAMPLES:,} samples of less than {_MAX_SECONDS:g} s."
+            )
+        rows.append(row)
+    if not rows:
+        return None
+    positions = np.array([row[0] for row in rows], np.int64)
+    seconds, started = np.array([row[1:] for row in rows]).T
+    ends = np.flatnonzero(started[1:] != started[:-1])
+    pauses = np.zeros(len(rows))
+    pauses[ends + 1] = seconds[ends]
+    seconds = seconds + np.cumsum(pauses)
+    if (np.diff(positions) < 0).any() or (np.diff(seconds) < 0).any():
+        raise RecordingError(f"{recording.path}: {schema.CLOCK_TOPIC.name}: found a clock that goes back.")
+    return Clock(positions, seconds, started)
