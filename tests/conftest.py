@@ -13,6 +13,7 @@ hypothesis.settings.register_profile("untimed", deadline=None)  # a loaded machi
 hypothesis.settings.load_profile("untimed")
 if sys.platform == "linux":
     os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported
+os.environ["DUALTAXI_CODE"] = "off"  # thousands of runs need not ask git; tests of the user's code turn it on
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -118,6 +118,11 @@ class Archive(RunDescription):
         return self._metadata[name]
 
     @property
+    def attachment_names(self) -> list[str]:
+        """The names of the attachments, in order."""
+        return [name for name, _ in self.attachments]
+
+    @property
     def metadata_names(self) -> list[str]:
         """The names of the metadata records, in order."""
         return list(self._metadata)

@@ -188,6 +188,10 @@ class Recording(Section):
         default=Packing.chunk_steps,
         description="Maximum steps in a chunk; chunks that are flushed by time have fewer.",
     )
+    code: bool = Field(
+        default=True,
+        description="Whether to record the code that runs: git commit and changes, script, arguments.",
+    )
 
     @model_validator(mode="after")
     def _level_goes_with_zstd(self) -> Self:

@@ -16,6 +16,7 @@ from runner.execution.initial_tables import address, recorded_tables
 from runner.execution.session import Report, Session, Stop, describe, recorder_for, run_job
 from runner.learning.learner import Learner
 from runner.recording import schema
+from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD
 from runner.recording.metadata import write_result
 from runner.recording.reader import open_recording
 from runner.recording.writer import RecordingFile
@@ -138,14 +139,19 @@ def _record(job: Job, run: Run, fresh: Path, report: Report, stop: Stop) -> dict
     mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
     with open_recording(run.recording) as recording:
         learner = Learner(job.config, mdp, job.seed, recorded_tables(recording))
-        expected, made_by = recording.result["content_digest"], recording.provenance
-        resumed = {
-            name: recording.metadata(name) for name in recording.metadata_names if name.startswith("resume/")
+        expected, made_by = recording.result["content_digest"], recording.metadata("provenance")
+        kept = {
+            name: recording.metadata(name)
+            for name in recording.metadata_names
+            if name == CODE_RECORD or name.startswith("resume/")
         }
         circumstances = {topic: list(recording.messages(topic)) for topic in schema.MACHINE_TOPICS}
+        code = [entry for entry in recording.attachments() if entry[0] == CODE_ATTACHMENT]
     with RecordingFile(fresh) as file:
         describe(file, job, run, learner, made_by)
-        for name, entries in resumed.items():
+        for attachment in code:
+            file.add_attachment(*attachment)
+        for name, entries in kept.items():
             file.add_metadata(name, entries)
         file.add_metadata("rerecord", provenance())
         recorder = recorder_for(job, learner, file, beat=run.beat, clock=False)

@@ -36,6 +36,7 @@ from runner.execution.session import (
 from runner.execution.verify import differing_environment
 from runner.learning.learner import Held, Learner
 from runner.recording import schema
+from runner.recording.code import CODE_RECORD
 from runner.recording.integrity import may_be_cut, survey
 from runner.recording.liveness import owner
 from runner.recording.metadata import REQUIRED_RECORDS
@@ -43,6 +44,7 @@ from runner.recording.reader import Recording, open_recording
 from runner.recording.records import Contents
 from runner.recording.reference import Reference
 from runner.recording.writer import RecordingFile, storage_error
+from runner.runs.code import CodeCollector
 from runner.runs.listing import run_at
 from runner.runs.locking import locked
 from runner.runs.provenance import Differences, differing_provenance, provenance
@@ -50,7 +52,7 @@ from runner.runs.run import RECORDING_FILE, Run
 from runner.util.files import storage_errors
 
 DECISIVE: Final = (
-    *("dualtaxi", "git", "python", "machine"),
+    *("dualtaxi", "python", "machine"),
     *("package.numpy", "package.numba", "package.llvmlite"),
 )
 """Provenance that must be the same at the beginning of a run and when it is resumed."""
@@ -133,9 +135,11 @@ def _resume(run: Run, accept_changes: bool, report: Report, stop: Stop) -> Run:
             open_recording(path) as recording,
         ):
             reference = Reference(recording, without_steps=job.config.recording.steps == "none")
-            recorder = recorder_for(job, learner, file, reference, beat=run.beat)
+            is_recorded = any(entry.name == CODE_RECORD for entry in contents.metadata)
+            code = CodeCollector(job.config.recording.code and not is_recorded)
+            recorder = recorder_for(job, learner, file, reference, beat=code.beat(run, file))
             session = _ResumedSession(recording, reference, job, learner, recorder, report, stop)
-            done = execute(session, file, run, started)
+            done = execute(session, file, run, started, code)
     except BaseException as error:
         _mark_failed(run, error)
         raise

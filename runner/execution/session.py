@@ -34,6 +34,7 @@ from runner.recording.recorder import Recorder
 from runner.recording.reference import Reference
 from runner.recording.writer import RecordingFile, create_recording
 from runner.runs import run as runs
+from runner.runs.code import CodeCollector
 from runner.runs.provenance import provenance
 from runner.runs.run import Run
 
@@ -98,6 +99,7 @@ def run_job(
         RunnerError: the environment cannot be used, or the disk is full; the run is then marked failed.
     """
     started = time.monotonic()
+    code = CodeCollector(job.config.recording.code)
     with _failing(run):
         mdp = mdp or load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
         job, run = resolve_job(job, run)
@@ -105,30 +107,32 @@ def run_job(
         file = create_recording(run.folder / runs.RECORDING_FILE)
     with file:
         with _failing(run):
-            made_by = provenance()
+            made_by = provenance(with_command=job.config.recording.code)
             describe(file, job, run, learner, made_by)
             run = run.update(provenance={key: made_by[key] for key in runs.MADE_BY if key in made_by})
-        recorder = recorder_for(job, learner, file, beat=run.beat, threads=threads)
-        return execute(Session(job, learner, recorder, report, stop, observer), file, run, started)
+        recorder = recorder_for(job, learner, file, beat=code.beat(run, file), threads=threads)
+        return execute(Session(job, learner, recorder, report, stop, observer), file, run, started, code)
 
 
-def execute(session: Session, file: RecordingFile, run: Run, started: float) -> Run:
+def execute(session: Session, file: RecordingFile, run: Run, started: float, code: CodeCollector) -> Run:
     """Run a session to its end, close its recording and return the run."""
     try:
         status = "finished" if session.run() else "interrupted"
         summary = session.summary(session.recorder.drain())
+        code.write(file, wait=True)
         write_result(file, status, summary)
     except BaseException as error:
         session.recorder.abandon()
         status = "interrupted" if isinstance(error, KeyboardInterrupt | Diverged) else "failed"
         with contextlib.suppress(StorageError):  # a full disk may still have space for the index
+            code.write(file, wait=True)
             write_result(file, status, {"error": truncated_message(error)})
         with contextlib.suppress(StorageError):
             run.update(status=status, summary={"error": truncated_message(error), "bytes": file.size})
         _add_advice(run, error)
         raise
     summary |= {"seconds": round(time.monotonic() - started, 3), "bytes": file.size}
-    return run.update(status=status, summary=summary)
+    return run.update(status=status, summary=summary, provenance=code.made_by(run))
 
 
 @contextlib.contextmanager

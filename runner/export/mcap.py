@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple
 
 from runner.errors import RecordingError, RunnerError
 from runner.export.places import write_new
+from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD
 from runner.recording.labels import Labels, as_json
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import rewrite
@@ -34,7 +35,7 @@ def export_mcap(run: Run, target: Path, anonymous: bool = False, force: bool = F
     Args:
         run: a run that is not running; an interrupted one stays interrupted.
         target: the file to write.
-        anonymous: leave out host, user, command line and folder, and the text of an error.
+        anonymous: leave out host, user, command line, folder and code, and the text of an error.
         force: replace an existing file.
 
     Raises:
@@ -51,12 +52,15 @@ def export_mcap(run: Run, target: Path, anonymous: bool = False, force: bool = F
     record = {"json": json.dumps(_record(run, anonymous), sort_keys=True, ensure_ascii=False)}
 
     def change(name: str, entries: dict[str, str]) -> dict[str, str] | None:
-        if name == EXPORT_RECORD:
+        if name == EXPORT_RECORD or (anonymous and name == CODE_RECORD):
             return None
         return _without_names(name, entries, run.recording) if anonymous else entries
 
+    left_out = (CODE_ATTACHMENT,) if anonymous else ()
     write_new(
-        target, force, lambda temporary: rewrite(run.recording, temporary, change, {EXPORT_RECORD: record})
+        target,
+        force,
+        lambda temporary: rewrite(run.recording, temporary, change, {EXPORT_RECORD: record}, left_out),
     )
     return McapExport(target, list(_warnings(run)) if anonymous else [])
 
@@ -72,13 +76,17 @@ def _record(run: Run, anonymous: bool) -> dict[str, Any]:
 
 
 def _without_names(name: str, entries: dict[str, str], recording: Path) -> dict[str, str]:
-    """Return the entries of a metadata record without host, user, command line and folder.
+    """Return the entries of a metadata record without host, user, command line and folders.
 
     Raises:
         RecordingError: the record cannot be parsed.
     """
     if name in {"provenance", "rerecord"} or name.startswith("resume/"):
-        return {key: text for key, text in entries.items() if key not in PRIVATE}
+        return {
+            key: text
+            for key, text in entries.items()
+            if key not in PRIVATE and not (key.startswith("env.") and "/" in text)
+        }
     if name == "result" and "json" in entries:
         try:
             result = json.loads(entries["json"])

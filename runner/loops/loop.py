@@ -31,6 +31,7 @@ from runner.recording.metadata import run_metadata, sizes_of, write_description,
 from runner.recording.recorder import FLUSH_SECONDS, Recorder
 from runner.recording.writer import create_recording
 from runner.runs import run as runs
+from runner.runs.code import CodeCollector
 from runner.runs.provenance import provenance
 from runner.runs.run import RECORDING_FILE, Run, new_run, recordings_folder, unless_empty
 
@@ -102,7 +103,8 @@ class Loop(Generic[R]):
         self._warnings: set[str] = set()
         self._is_described = False
         self._is_settled = not can_widen(described.action)
-        self._made_by = provenance()
+        self._code = CodeCollector(options.packing.code)
+        self._made_by = provenance(with_command=options.packing.code)
         made_by = {key: self._made_by[key] for key in runs.MADE_BY if key in self._made_by}
         self.run = new_run(folder, self._config, options.seed, self._config["name"], provenance=made_by)
         path = self.run.folder / RECORDING_FILE
@@ -116,7 +118,7 @@ class Loop(Generic[R]):
             learners=len(described.agents),
             events=int(self._facts["events"]),
             packing=options.packing.packing,
-            beat=self.run.beat,
+            beat=self._code.beat(self.run, self._file),
             sizes=sizes_of(self._facts, str(path)),
             watch=self._outcomes.take_records,
             before=self._describe,
@@ -294,7 +296,8 @@ class Loop(Generic[R]):
                 self.closed, self.active = True, None
                 self._rows.clear()
                 self._file.close()
-            self.run = self.run.update(status=status, summary=summary)
+            made_by = self._code.made_by(self.run)
+            self.run = self.run.update(status=status, summary=summary, provenance=made_by)
         if self._follower:
             self._follower.finish(self.run)
         return self.run
@@ -312,6 +315,7 @@ class Loop(Generic[R]):
             result["rewards_off_table"] = sum(rows.off_table for rows in self._rows.values())
         if error:
             result["error"] = truncated_message(error)
+        self._code.write(self._file, wait=True)
         write_result(self._file, status, result, self._own_makers)
         seconds = round(time.monotonic() - self._started, 3)
         return result | {"seconds": seconds, "bytes": self._file.size}

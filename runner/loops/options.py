@@ -21,7 +21,7 @@ from runner.util.values import checked_run_name, is_whole
 MADE_BY: Final = "runner.record"
 ALL_INFO: Final = "*"
 """Among the names of info fields: all of them."""
-_PACKING: Final = ("compression", "level", "index", "chunk_steps")
+_PACKING: Final = ("compression", "level", "index", "chunk_steps", "code")
 
 
 @dataclass(frozen=True)

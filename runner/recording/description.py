@@ -13,6 +13,7 @@ from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names, actions_in_words
 from runner.errors import RecordingError, RunnerError
 from runner.recording import schema
+from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD, Code, parse_code
 from runner.recording.maker import MAKER_RECORD, EnvironmentMaker, parse_maker
 from runner.recording.metadata import (
     environment_description,
@@ -48,6 +49,11 @@ class RunDescription(ABC):
     @abstractmethod
     def metadata_names(self) -> list[str]:
         """The names of the metadata records, in order."""
+
+    @property
+    @abstractmethod
+    def attachment_names(self) -> list[str]:
+        """The names of the attachments, in order."""
 
     @abstractmethod
     def attachment(self, name: str) -> bytes:
@@ -94,8 +100,21 @@ class RunDescription(ABC):
 
     @cached_property
     def provenance(self) -> dict[str, str]:
-        """Where and by what it was made."""
-        return self.metadata("provenance")
+        """Where and by what it was made, with the commit of the user's code where it is recorded."""
+        first = self.metadata("provenance")
+        code = self.metadata(CODE_RECORD) if CODE_RECORD in self.metadata_names else {}
+        return first | code | first  # no entry of the first is replaced
+
+    @cached_property
+    def code(self) -> Code:
+        """The user's code; empty where it is not recorded.
+
+        Raises:
+            RecordingError: it is damaged.
+        """
+        if CODE_RECORD not in self.metadata_names or CODE_ATTACHMENT not in self.attachment_names:
+            return Code()
+        return parse_code(self.attachment(CODE_ATTACHMENT), str(self.path))
 
     @cached_property
     def raw_result(self) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 
 from mcap.opcode import Opcode
@@ -32,7 +32,11 @@ Change = Callable[[str, dict[str, str]], dict[str, str] | None]
 
 
 def rewrite(
-    path: Path, fresh: Path, change: Change, more: Mapping[str, Mapping[str, str]] | None = None
+    path: Path,
+    fresh: Path,
+    change: Change,
+    more: Mapping[str, Mapping[str, str]] | None = None,
+    left_out: Collection[str] = (),
 ) -> None:
     """Write a recording into a new file with its metadata changed.
 
@@ -44,6 +48,7 @@ def rewrite(
         fresh: the new file.
         change: what becomes of each metadata record.
         more: metadata records to add, by name.
+        left_out: the names of attachments to leave out.
 
     Raises:
         RecordingError: the recording is damaged, not merely cut off.
@@ -64,7 +69,9 @@ def rewrite(
                 elif changed is not None:
                     file.add_metadata(name, changed)
             elif opcode == Opcode.ATTACHMENT:
-                file.add_attachment(*attachment_of(body, offset))
+                attachment = attachment_of(body, offset)
+                if attachment[0] not in left_out:
+                    file.add_attachment(*attachment)
             elif opcode == Opcode.CHUNK:
                 chunk = read_chunk(body, offset)
                 file.add_chunk(TOPIC_OF[chunk.summary.channel], copied_chunk(chunk, body, indexed))

@@ -89,6 +89,11 @@ class TopicReader(RunDescription):
         """The names of the metadata records, in the order of the file."""
         return sorted(self._index.metadata, key=lambda name: self._index.metadata[name][0])
 
+    @property
+    def attachment_names(self) -> list[str]:
+        """The names of the attachments, in the order of the file."""
+        return sorted(self._index.attachments, key=lambda name: self._index.attachments[name][0])
+
     def attachments(self) -> Iterator[tuple[str, str, bytes]]:
         """Yield name, media type and data of each attachment, in the order of the file."""
         for name, place in sorted(self._index.attachments.items(), key=lambda item: item[1]):

@@ -1,32 +1,101 @@
-"""The provenance of a run: versions, host and source; it may explain a difference, and is never compared."""
+"""The provenance of a run: versions, machine, settings; it may explain a difference, and is never compared.
+
+All of it is quick to find out; what is not, such as the state of the user's repository, is in `code`.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import getpass
 import os
 import platform
+import random
+import re
+import shlex
 import socket
-import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from pathlib import Path
+from typing import Any, Final
 
+import numpy as np
+from blake3 import blake3
+
+from runner.runs.redaction import is_secret_name, redacted_arguments, redacted_text
 from runner.util.values import as_utf8
 from runner.util.version import __version__
 
-PACKAGES = ("numpy", "numba", "llvmlite", "gymnasium", "mcap", "protobuf", "zstandard", "blake3", "pydantic")
+CODE_VARIABLE: Final = "DUALTAXI_CODE"
+"""Set to `off`, no run records the user's code."""
+VARIABLES: Final = (
+    *("PYTHONHASHSEED", "PYTHONOPTIMIZE", "PYTHONPATH", "VIRTUAL_ENV", "CONDA_DEFAULT_ENV"),
+    *("OMP_*", "MKL_*", "OPENBLAS_*", "NUMEXPR_*", "NUMBA_*", "KMP_*", "GOMP_*"),
+    *("CUDA_*", "CUBLAS_*", "CUDNN_*", "NVIDIA_*", "NCCL_*", "ROCR_*", "HIP_*", "HSA_*", "TPU_*"),
+    *("TORCH_*", "TORCHINDUCTOR_*", "PYTORCH_*", "XLA_*", "JAX_*", "TF_XLA_*", "TF_CUDNN_*", "LIBTPU_*"),
+    *("TF_DETERMINISTIC_OPS", "TF_ENABLE_ONEDNN_OPTS", "TF_FORCE_GPU_ALLOW_GROWTH"),
+    *(
+        "RANK",
+        "LOCAL_RANK",
+        "WORLD_SIZE",
+        "MUJOCO_GL",
+        "PYOPENGL_PLATFORM",
+        "SDL_VIDEODRIVER",
+        "LC_ALL",
+        "LANG",
+        "TZ",
+    ),
+    *("SLURM_JOB_ID", "SLURM_PROCID", "SLURM_NTASKS", "SLURM_CPUS_PER_TASK", "SLURM_JOB_PARTITION"),
+    *("KUBERNETES_SERVICE_HOST", "RAY_ADDRESS", "DUALTAXI_CODE"),
+)
+"""Environment variables that are recorded; those with the name of a secret never are."""
+_VARIABLE: Final = re.compile("|".join(pattern.replace("*", r"\w*") for pattern in VARIABLES))
+_TORCH_FLAGS: Final = {
+    "deterministic_algorithms": "are_deterministic_algorithms_enabled",
+    "float32_matmul_precision": "get_float32_matmul_precision",
+    "threads": "get_num_threads",
+    "seed": "initial_seed",
+}
+_JAX_FLAGS: Final = (
+    *(
+        "jax_enable_x64",
+        "jax_default_matmul_precision",
+        "jax_default_prng_impl",
+        "jax_threefry_partitionable",
+    ),
+    *("jax_disable_jit", "jax_platforms", "jax_numpy_dtype_promotion"),
+)
+_CONTAINERS: Final = re.compile(r"docker|podman|kubepods|containerd|lxc|garden")
+_INSTALLED: Final = re.compile(r"(?P<name>[^-]+)-(?P<version>[^-]+)(?:-py[\d.]+)?\.(?:dist-info|egg-info)")
+_COMPARED: Final = ("dualtaxi", "git", "python", "platform", "machine", "processor")
+"""What may explain that a job gives another content, besides the packages."""
 
 
-def provenance() -> dict[str, str]:
-    """Return versions, host, processor, git state and command line, as text by key."""
-    return _installed() | {
-        "host": socket.gethostname(),
-        "user": as_utf8(_user()),
-        "command": as_utf8(" ".join(sys.argv)),
-        "directory": as_utf8(_directory()),
-    }
+def provenance(with_command: bool = True) -> dict[str, str]:
+    """Return versions, machine, settings and command line, as text by key.
+
+    Args:
+        with_command: False leaves out the command line, for runs that do not record the user's code.
+    """
+    facts = (
+        _machine()
+        | _packages()
+        | _settings()
+        | {
+            "host": socket.gethostname(),
+            "user": _user(),
+            "directory": _directory(),
+        }
+    )
+    if with_command and is_code_wanted():
+        facts["command"] = shlex.join(redacted_arguments(sys.argv))
+    return {key: as_utf8(text) for key, text in facts.items()}
+
+
+def is_code_wanted() -> bool:
+    """Return whether the environment variable allows to record the user's code."""
+    return os.environ.get(CODE_VARIABLE, "").lower() not in ("0", "off", "no", "false")
 
 
 Differences = dict[str, tuple[str, str]]
@@ -34,17 +103,17 @@ Differences = dict[str, tuple[str, str]]
 
 
 def differing_provenance(recorded: Mapping[str, str]) -> Differences:
-    """Return the differences between recorded provenance and this process's."""
+    """Return the differences between recorded provenance and this process's that may explain others."""
     here = provenance()
     return {
         key: (recorded.get(key, ""), here.get(key, ""))
         for key in sorted({*recorded, *here})
-        if recorded.get(key) != here.get(key)
+        if recorded.get(key) != here.get(key) and (key in _COMPARED or key.startswith("package."))
     }
 
 
 @cache
-def _installed() -> dict[str, str]:
+def _machine() -> dict[str, str]:
     """Return what does not change during a process: the machine, and the versions of the code."""
     facts = {
         "dualtaxi": __version__,
@@ -52,15 +121,80 @@ def _installed() -> dict[str, str]:
         "platform": platform.platform(),
         "machine": platform.machine(),
         "processor": _processor(),
+        "processors": str(os.cpu_count() or ""),
+        "memory": _memory(),
+        "container": ", ".join(_containers()),
+        **_nvidia(),
     }
-    return facts | {f"package.{name}": _version(name) for name in PACKAGES} | _git()
+    return {key: text for key, text in facts.items() if text}
 
 
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"
+@cache
+def _packages() -> dict[str, str]:
+    """Return the versions of all installed distributions, by `package.NAME`.
+
+    They are read from the names of their folders: `importlib.metadata` parses each one's metadata, which
+    takes a hundred times as long.
+    """
+    found: dict[str, str] = {}
+    for folder in sys.path:
+        with contextlib.suppress(OSError):
+            for entry in sorted(path.name for path in Path(folder or ".").iterdir()):
+                if match := _INSTALLED.fullmatch(entry):
+                    found.setdefault(f"package.{_normalised(match['name'])}", match["version"])
+                elif entry.endswith(".egg-info"):
+                    for one in distributions(path=[folder]):
+                        found.setdefault(f"package.{_normalised(one.name)}", one.version)
+    return dict(sorted(found.items()))
+
+
+def _normalised(name: str) -> str:
+    """Return the name of a distribution as package indexes compare it."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def _settings() -> dict[str, str]:
+    """Return what may change during a process: environment variables, flags, states of random generators."""
+    facts = {
+        f"env.{name}": redacted_text(value)
+        for name, value in os.environ.items()
+        if _VARIABLE.fullmatch(name) and not is_secret_name(name)
+    }
+    if hasattr(os, "sched_getaffinity"):
+        facts["processors.usable"] = str(len(os.sched_getaffinity(0)))
+    facts["random.state"] = _digest(np.array(random.getstate()[1], np.int64).tobytes())
+    if "numpy.random" in sys.modules:
+        state: Any = np.random.get_state(legacy=False)["state"]
+        facts["numpy.random.state"] = _digest(state["key"].tobytes() + state["pos"].to_bytes(4))
+    for name, read in (("torch", _torch), ("jax", _jax)):
+        if name in sys.modules:
+            with contextlib.suppress(Exception):  # it may be of another version, or being imported
+                facts |= dict(read(sys.modules[name]))
+    return facts
+
+
+def _torch(torch: Any) -> Iterator[tuple[str, str]]:
+    """Yield the flags and seeds of PyTorch; CUDA is not initialised for this."""
+    for key, name in _TORCH_FLAGS.items():
+        yield f"torch.{key}", str(getattr(torch, name)())
+    yield "torch.random.state", _digest(torch.get_rng_state().numpy().tobytes())
+    yield "torch.cuda", str(torch.version.cuda)
+    for flag in ("deterministic", "benchmark"):
+        yield f"torch.cudnn.{flag}", str(getattr(torch.backends.cudnn, flag))
+    if torch.cuda.is_initialized():
+        for number in range(torch.cuda.device_count()):
+            yield f"gpu.{number}", str(torch.cuda.get_device_name(number))
+
+
+def _jax(jax: Any) -> Iterator[tuple[str, str]]:
+    """Yield the settings of JAX; no backend is initialised for this."""
+    for name in _JAX_FLAGS:
+        if hasattr(jax.config, name):
+            yield f"jax.{name.removeprefix('jax_')}", str(getattr(jax.config, name))
+
+
+def _digest(data: bytes) -> str:
+    return blake3(data).hexdigest()[:16]
 
 
 def _directory() -> str:
@@ -78,23 +212,50 @@ def _user() -> str:
 
 
 def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except OSError:
-        pass
+    for line in _text("/proc/cpuinfo").splitlines():
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
     return platform.processor()
 
 
-def _git() -> dict[str, str]:
-    """Return commit and state of the source tree this code runs from; nothing outside one."""
-    root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():
-        return {}
-    command = ["git", "-C", os.fspath(root), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+def _memory() -> str:
     try:
-        found = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return {}
-    return {"git": found.stdout.strip()}
+        return f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / (1 << 30):.1f} GiB"
+    except (AttributeError, ValueError, OSError):
+        return ""
+
+
+def _containers() -> Iterator[str]:
+    """Yield what suggests that this process is in a container."""
+    if Path("/.dockerenv").exists():
+        yield "docker"
+    if Path("/run/.containerenv").exists():
+        yield "podman"
+    if "KUBERNETES_SERVICE_HOST" in os.environ:
+        yield "kubernetes"
+    if match := _CONTAINERS.search(_text("/proc/1/cgroup")):
+        yield f"cgroup {match[0]}"
+    limit = _text("/sys/fs/cgroup/cpu.max").split()
+    if len(limit) == 2 and all(map(str.isdecimal, limit)):
+        yield f"{int(limit[0]) / max(1, int(limit[1])):g} processors"
+    if (limit_bytes := _text("/sys/fs/cgroup/memory.max").strip()).isdecimal():
+        yield f"{int(limit_bytes) / (1 << 30):.1f} GiB"
+
+
+def _nvidia() -> dict[str, str]:
+    """Return the models of NVIDIA's GPUs and their driver, as the driver lists them; nothing is executed."""
+    facts = {}
+    if match := re.search(r"Kernel Module\D*([\d.]+)", _text("/proc/driver/nvidia/version")):
+        facts["gpu.driver"] = match[1]
+    for number, path in enumerate(sorted(Path("/proc/driver/nvidia/gpus").glob("*/information"))):
+        if match := re.search(r"Model:\s*(.+)", _text(path)):
+            facts[f"gpu.{number}"] = match[1].strip()
+    return facts
+
+
+def _text(path: str | Path) -> str:
+    """Return the text of a file of the system; empty if there is none."""
+    try:
+        return Path(path).read_text(errors="replace")[: 1 << 16]
+    except OSError:
+        return ""

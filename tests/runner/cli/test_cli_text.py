@@ -45,11 +45,12 @@ def test_a_run_from_a_folder_whose_name_is_not_utf8_ends_as_any_other(command, t
     (tmp_path / LATIN).mkdir()
     monkeypatch.chdir(tmp_path / LATIN)
     monkeypatch.setattr(sys, "argv", ["dualtaxi", "run", LATIN])
+    monkeypatch.delenv("DUALTAXI_CODE")
     assert command("run", tiny).exit_code == 0
     (run,) = list_runs(command.recordings)
     assert run.status == "finished"
     provenance = command.json("show", run.run_id)["provenance"]
-    assert provenance["command"] == "dualtaxi run caf\\xe9"
+    assert provenance["command"] == "dualtaxi run 'caf\\xe9'"
     assert provenance["directory"].endswith("caf\\xe9")
 
 

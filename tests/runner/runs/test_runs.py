@@ -3,9 +3,7 @@
 import json
 import os
 import socket
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -13,7 +11,6 @@ from runner.config import from_mapping
 from runner.errors import RunNotFound, StorageError
 from runner.runs import run as runs
 from runner.runs.listing import list_runs
-from runner.runs.provenance import provenance
 from runner.runs.resolve import find_run
 from runner.runs.run import RUN_FILE, create_run, recordings_folder
 
@@ -170,12 +167,3 @@ def test_a_folder_that_may_not_be_written(folder):
     folder.mkdir(mode=0o500)
     with pytest.raises(StorageError, match="Permission denied"):
         create_run(folder, CONFIG, 0)
-
-
-def test_the_provenance_has_the_commit_of_the_source_tree():
-    root = Path(__file__).parents[3]
-    if not (root / ".git").exists():
-        pytest.skip("not a checkout")
-    command = ["git", "-C", str(root), "rev-parse", "HEAD"]
-    head = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    assert provenance()["git"].removesuffix("-dirty") == head

@@ -46,7 +46,7 @@ def test_a_job_on_ray_gives_the_same_runs_and_can_be_cancelled(cluster, tmp_path
         kinds = {event.kind for event in jobs.store.events(number)[0]}
         assert kinds == {"state", "run", "log"}
         with open_recording(far[0].recording) as recording:
-            assert "ray" in recording.provenance["command"]
+            assert recording.provenance["package.ray"]
         endless = submit(jobs, ENDLESS).number
         until(lambda progress: progress and progress.episode > 0, lambda: jobs.pool.progress(endless))
         jobs.cancel(endless)

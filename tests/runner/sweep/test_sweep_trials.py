@@ -73,8 +73,8 @@ def test_resuming_a_run_of_other_code_is_refused(done, sweep, tmp_path, monkeypa
     swept(tmp_path, sweep, first, stop=lambda: first.done > 3)
     before = len(list_runs(tmp_path))
     here = provenance.provenance()
-    monkeypatch.setattr(provenance, "provenance", lambda: here | {"git": "another"})
-    with pytest.raises(RunnerError, match=r"git: \S* then, another now"):
+    monkeypatch.setattr(provenance, "provenance", lambda: here | {"dualtaxi": "another"})
+    with pytest.raises(RunnerError, match=r"dualtaxi: \S* then, another now"):
         swept(tmp_path, sweep)
     assert len(list_runs(tmp_path)) == before
     state.begin(sweep, tmp_path, resume=True, accept_changes=True)

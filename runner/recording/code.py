@@ -1,0 +1,108 @@
+"""The user's code as a run recorded it: its sources and what was changed since the commit.
+
+Nothing here executes or imports anything; anyone may have written what is read.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import zstandard
+
+from runner.errors import RecordingError
+from runner.recording.metadata import json_object
+from runner.recording.records import MAX_METADATA_BYTES
+from runner.util.values import is_utf8
+
+CODE_RECORD: Final = "provenance/code"
+"""The metadata record with the commit, the script and what was left out; part of the provenance."""
+CODE_ATTACHMENT: Final = "code.json.zst"
+MAX_CODE_BYTES: Final = 1 << 20
+"""The most bytes of sources and patch that are recorded, and the most that are read."""
+_MAX_UNPACKED: Final = MAX_METADATA_BYTES
+MAX_FILES: Final = 2_000
+_MAX_WINDOW: Final = 1 << 23
+
+
+@dataclass(frozen=True)
+class Code:
+    """The sources of a run, without secrets."""
+
+    files: Mapping[str, str] = field(default_factory=dict)
+    """Path, relative to the repository or to the script's folder, to text."""
+    new: tuple[str, ...] = ()
+    """The paths in `files` that the commit does not have; all of them without a commit."""
+    patch: str = ""
+    """What `git diff HEAD` gave: the changes since the commit."""
+
+    def to_patch(self) -> str:
+        """Return a patch that makes these sources of the commit, or of an empty folder without a commit."""
+        return self.patch + "".join(_new_file(path, self.files[path]) for path in self.new)
+
+    def to_attachment(self) -> bytes:
+        """Return the content of the attachment."""
+        values = {"files": dict(self.files), "new": self.new, "patch": self.patch}
+        text = json.dumps(values, sort_keys=True, ensure_ascii=False)
+        return zstandard.ZstdCompressor().compress(text.encode(errors="replace"))
+
+
+def parse_code(data: bytes, where: str) -> Code:
+    """Return the code in an attachment.
+
+    Raises:
+        RecordingError: it is damaged, or too large.
+    """
+    try:
+        with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data) as stream:
+            text = stream.read(_MAX_UNPACKED + 1)
+    except zstandard.ZstdError as error:
+        raise RecordingError(f"{where}: {CODE_ATTACHMENT} is damaged ({error}).") from error
+    values = json_object(text, f"{where}: {CODE_ATTACHMENT}")
+    files, new, patch = (values.get(key) for key in ("files", "new", "patch"))
+    if not (isinstance(files, dict) and isinstance(new, list) and isinstance(patch, str)):
+        raise RecordingError(f"{where}: {CODE_ATTACHMENT} is damaged: expected files, new and patch.")
+    if len(files) > MAX_FILES or not all(map(_is_path, files)):
+        raise RecordingError(f"{where}: {CODE_ATTACHMENT} is damaged: found a path that is not relative.")
+    if not all(isinstance(text, str) for text in files.values()) or not set(map(str, new)) <= files.keys():
+        raise RecordingError(f"{where}: {CODE_ATTACHMENT} is damaged: found a file that is no text.")
+    return Code(files, tuple(map(str, new)), patch)
+
+
+def _is_path(path: str) -> bool:
+    """Return whether this is a relative path that stays in its folder, printable on one line."""
+    parts = path.split("/")
+    return bool(path) and path.isprintable() and is_utf8(path) and not {"", ".", ".."} & set(parts)
+
+
+def _new_file(path: str, text: str) -> str:
+    """Return the part of a patch that creates a file."""
+    name = f'"b/{path}"' if " " in path or '"' in path or "\\" in path else f"b/{path}"
+    head = f"diff --git {name.replace('b/', 'a/', 1)} {name}\nnew file mode 100644\n"
+    if not text:
+        return head
+    lines = text.split("\n")
+    ending = "" if lines[-1] == "" else "\n\\ No newline at end of file\n"
+    lines = lines[:-1] if lines[-1] == "" else lines
+    body = "\n".join(f"+{line}" for line in lines)
+    return f"{head}--- /dev/null\n+++ {name}\n@@ -0,0 +1,{len(lines)} @@\n{body}{ending or chr(10)}"
+
+
+def patch_parts(patch: str) -> dict[str, str]:
+    """Return the parts of a patch by the path of the file that they change."""
+    parts: dict[str, list[str]] = {}
+    path = ""
+    for line in patch.splitlines(keepends=True):
+        if line.startswith("diff --git "):
+            path = line.rstrip("\n").rpartition(" b/")[2]
+        parts.setdefault(path, []).append(line)
+    return {path: "".join(lines) for path, lines in parts.items()}
+
+
+def unified_diff(a: str, b: str, path: str) -> list[str]:
+    """Return the lines by which two texts differ, with their context, as a unified diff."""
+    left, right = a.split("\n"), b.split("\n")
+    return list(difflib.unified_diff(left, right, f"A/{path}", f"B/{path}", lineterm=""))

@@ -1,0 +1,336 @@
+"""The user's code, collected while a run has begun already: repository, script, modules, notebook cells.
+
+It is read in a thread of its own, within limits on time and size, so that neither a run's start nor its end
+waits for a repository that is huge or on a disk that hangs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+import sys
+import sysconfig
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final
+
+from runner.errors import StorageError
+from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD, MAX_CODE_BYTES, MAX_FILES, Code, patch_parts
+from runner.recording.writer import RecordingFile, storage_error
+from runner.runs.git import GIT_SECONDS, NotRecorded, Repository, read_repository
+from runner.runs.provenance import is_code_wanted
+from runner.runs.redaction import is_secret_name, redacted_text
+from runner.runs.run import Run
+from runner.util.values import as_utf8
+
+MAX_FILE_BYTES: Final = 256 << 10
+"""Larger files are left out."""
+WAIT_SECONDS: Final = GIT_SECONDS + 1
+"""How long after its start a run waits at its end for the code."""
+_FRESH_SECONDS: Final = 10.0
+"""Runs that begin within this time of each other in one process share what was read."""
+_SETTINGS: Final = frozenset({".toml", ".yaml", ".yml", ".json", ".cfg", ".ini", ".xml"})
+"""Suffixes of untracked files that are recorded, unless they have the name of a secret."""
+_SOURCES: Final = _SETTINGS | frozenset(
+    {
+        *(".py", ".pyx", ".pyi", ".c", ".cc", ".cpp", ".cu", ".h", ".hpp"),
+        *(".rs", ".jl", ".sh", ".gin"),
+    }
+)
+"""Suffixes of all untracked files that are recorded."""
+_CELLS: Final = "notebook-cells.py"
+_MAX_CELL_BYTES: Final = 256 << 10
+_MAX_NAMED: Final = 10
+"""The most files that are named among those left out."""
+
+
+@dataclass
+class _Sources:
+    """What is recorded so far, within the limit, and what is left out."""
+
+    files: dict[str, str] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
+    budget: int = MAX_CODE_BYTES
+
+    def add(self, path: str, text: str) -> None:
+        """Add a file without its secrets, or note that it does not fit."""
+        text = redacted_text(text)
+        size = len(text.encode(errors="replace"))
+        if size > min(self.budget, MAX_FILE_BYTES) or len(self.files) == MAX_FILES:
+            self.left_out.append(f"{path} ({size:,} bytes)")
+        else:
+            self.files[path] = text
+            self.budget -= size
+
+    def add_file(self, root: Path, path: str) -> None:
+        """Add a regular file of UTF-8 text, or note why not; a link is not followed."""
+        if path in self.files or not path.isprintable():
+            return
+        if self.budget <= 0 or len(self.files) == MAX_FILES:
+            self.left_out.append(path)
+            return
+        try:
+            descriptor = os.open(
+                root / path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+            )
+            with os.fdopen(descriptor, "rb") as stream:
+                about = os.fstat(descriptor)
+                if not stat.S_ISREG(about.st_mode):
+                    return
+                if about.st_size > MAX_FILE_BYTES:
+                    self.left_out.append(f"{path} ({about.st_size:,} bytes)")
+                    return
+                data = stream.read(MAX_FILE_BYTES + 1)
+        except OSError:
+            return  # it was removed, is a link, or may not be read
+        if b"\0" not in data:
+            self.add(path, data.decode(errors="replace"))
+
+
+@dataclass(frozen=True)
+class RecordedCode:
+    """What a recording gets: the entries of its metadata record, and the sources if there are any."""
+
+    entries: dict[str, str]
+    attachment: bytes = b""
+
+
+class CodeCollector:
+    """Reads the code in a thread, and writes it into the recording as soon as it is known.
+
+    Args:
+        is_wanted: False records nothing.
+    """
+
+    def __init__(self, is_wanted: bool = True) -> None:
+        self.entries: dict[str, str] = {}
+        """The entries of the metadata record; empty until it is written."""
+        self._is_wanted = is_wanted and is_code_wanted()
+        self._found: RecordedCode | None = None
+        self._deadline = time.monotonic() + WAIT_SECONDS
+        self._thread = threading.Thread(
+            target=self._collect, args=(_cells(),), name="recording-code", daemon=True
+        )
+        if self._is_wanted:
+            self._thread.start()
+
+    def _collect(self, cells: str) -> None:
+        try:
+            self._found = _recent.read(cells)
+        except Exception as error:  # a run is worth more than what is known of its code
+            self._found = RecordedCode({"code.not_recorded": f"{type(error).__name__}: {error}"[:500]})
+
+    def beat(self, run: Run, file: RecordingFile) -> Callable[[], None]:
+        """Return what a recorder calls now and then: it marks the run as alive, and writes the code once."""
+
+        def beat() -> None:
+            run.beat()
+            with contextlib.suppress(StorageError):  # tried again at the end
+                self.write(file)
+
+        return beat
+
+    def made_by(self, run: Run) -> dict[str, str]:
+        """Return the provenance in `run.json`, with the commit if it is known."""
+        return dict(run.file.provenance) | {key: self.entries[key] for key in ("git",) if key in self.entries}
+
+    def write(self, file: RecordingFile, wait: bool = False) -> None:
+        """Write the code into a recording, once, if it is known; nothing else may write into it meanwhile.
+
+        Args:
+            file: the recording.
+            wait: wait for it, up to `WAIT_SECONDS` after the start; then write that it is not known.
+
+        Raises:
+            StorageError: the disk is full or failing.
+        """
+        if not self._is_wanted or self.entries:
+            return
+        if wait:
+            self._thread.join(max(0.0, self._deadline - time.monotonic()))
+        found = self._found
+        if found is None:
+            if not wait:
+                return
+            found = RecordedCode({"code.not_recorded": f"reading it took more than {WAIT_SECONDS:g} s"})
+        try:
+            if found.attachment:
+                file.add_attachment(CODE_ATTACHMENT, "application/zstd", found.attachment)
+            file.add_metadata(CODE_RECORD, found.entries)
+        except OSError as error:
+            file.cut_back()
+            raise storage_error(file, error) from error
+        self.entries = found.entries
+
+
+# --- what is collected --------------------------------------------------------------------------------------
+
+
+class _Recent:
+    """The code that was read last, for other runs that begin within seconds of it."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.key: tuple[str, ...] = ()
+        self.read_at = 0.0
+        self.code = RecordedCode({})
+
+    def unlock(self) -> None:
+        """Replace the lock, in a forked process."""
+        self.lock = threading.Lock()
+
+    def read(self, cells: str) -> RecordedCode:
+        """Return the code of this process, read now or a few seconds ago."""
+        script = user_script()
+        folder = Path.cwd() if script is None else script.parent
+        key = (str(folder), str(script), cells)
+        with self.lock:
+            if key != self.key or time.monotonic() - self.read_at > _FRESH_SECONDS:
+                self.code = collect(folder, script, cells)
+                self.key, self.read_at = key, time.monotonic()
+            return self.code
+
+
+_recent = _Recent()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_recent.unlock)  # a thread that is not there may hold it
+
+
+def collect(folder: Path, script: Path | None = None, cells: str = "") -> RecordedCode:
+    """Return the code in a folder.
+
+    Args:
+        folder: of the script; the current one if there is none.
+        script: the script, if it is the user's.
+        cells: the cells of a notebook that were executed.
+    """
+    entries, problems, repository = {}, [], None
+
+    def used(root: Path) -> list[str]:
+        """Return the paths of the script and of the loaded modules in a folder."""
+        first = "" if script is None else _within(root, script)
+        return ([first] if first else []) + [path for path in _modules(root) if path != first]
+
+    try:
+        repository = read_repository(folder, used)
+        problems += repository.problems
+    except NotRecorded as reason:
+        problems.append(str(reason))
+    root = folder.resolve() if repository is None else repository.root.resolve()
+    sources, paths = _Sources(), used(root)
+    if script is not None and (path := _within(root, script)):
+        entries["code.script"] = path
+        sources.add_file(root, path)
+    if cells:
+        sources.add(_CELLS, cells)
+    patch = "" if repository is None else _fitting_patch(repository, sources)
+    for path in paths:
+        sources.add_file(root, path)
+    new = set(sources.files)
+    if repository is not None:
+        untracked = set(repository.untracked)
+        for name in repository.changed:
+            if Path(name).suffix in _SOURCES:
+                sources.add_file(root, name)
+        for name in filter(_is_source, repository.untracked):
+            sources.add_file(root, name)
+        entries |= _repository_entries(repository)
+        if not repository.commit:
+            problems.append("there is no commit yet")
+        else:
+            new = set(sources.files) & (untracked | {_CELLS})
+    if problems:
+        entries["code.not_recorded"] = "; ".join(problems)
+    if sources.left_out:
+        more = len(sources.left_out) - _MAX_NAMED
+        entries["code.left_out"] = ", ".join(sources.left_out[:_MAX_NAMED]) + (
+            f" and {more:,} more" if more > 0 else ""
+        )
+    code = Code(sources.files, tuple(sorted(new)), patch)
+    entries = {key: as_utf8(text) for key, text in entries.items()}
+    return RecordedCode(entries, code.to_attachment() if code.files or code.patch else b"")
+
+
+def _repository_entries(repository: Repository) -> dict[str, str]:
+    is_dirty = bool(repository.changed or any(map(_is_source, repository.untracked)))
+    entries = {
+        "git": repository.commit and repository.commit + ("-dirty" if is_dirty else ""),
+        "git.branch": repository.branch,
+        "git.remote": redacted_text(repository.remote),
+    }
+    return {key: text for key, text in entries.items() if text}
+
+
+def _fitting_patch(repository: Repository, sources: _Sources) -> str:
+    """Return the parts of the patch that fit, and note the others as left out."""
+    kept = []
+    for path, part in patch_parts(redacted_text(repository.patch)).items():
+        size = len(part.encode())
+        if size > min(sources.budget, MAX_FILE_BYTES):
+            sources.left_out.append(f"the changes of {path} ({size:,} bytes)")
+        else:
+            kept.append(part)
+            sources.budget -= size
+    return "".join(kept)
+
+
+def user_script() -> Path | None:
+    """Return the script that runs, unless it is installed, as `dualtaxi` and `jupyter` are."""
+    file = getattr(sys.modules.get("__main__"), "__file__", None)
+    if not isinstance(file, str) or not file:
+        return None
+    path = Path(file).absolute()
+    return None if _is_installed(str(path)) or not path.is_file() else path
+
+
+def _modules(root: Path) -> Iterator[str]:
+    """Yield the paths of the loaded modules in a folder, without installed ones and this project's."""
+    for name, module in sorted(sys.modules.items()):
+        if not isinstance(module, ModuleType) or name.partition(".")[0] in ("runner", "dualtaxi"):
+            continue
+        file = vars(module).get("__file__")  # getattr may import a lazy module
+        if isinstance(file, str) and file.endswith(".py") and not _is_installed(file):
+            path = _within(root, Path(file))
+            if path:
+                yield path
+
+
+def _within(root: Path, path: Path) -> str:
+    """Return the path relative to a folder; empty if it is not in it."""
+    with contextlib.suppress(OSError, ValueError):
+        return path.resolve().relative_to(root).as_posix()
+    return ""
+
+
+@cache
+def _installed_folders() -> tuple[str, ...]:
+    schemes = (sysconfig.get_default_scheme(), sysconfig.get_preferred_scheme("user"))
+    names = ("stdlib", "platstdlib", "purelib", "platlib", "scripts")
+    return tuple({sysconfig.get_path(name, scheme) + os.sep for scheme in schemes for name in names})
+
+
+def _is_installed(file: str) -> bool:
+    parts = Path(file).parts
+    return file.startswith(_installed_folders()) or "site-packages" in parts or "dist-packages" in parts
+
+
+def _is_source(path: str) -> bool:
+    """Return whether an untracked file is recorded, by its name."""
+    suffix = Path(path).suffix
+    return suffix in _SOURCES and not (suffix in _SETTINGS and is_secret_name(Path(path).name))
+
+
+def _cells() -> str:
+    """Return the cells that a notebook executed so far; empty elsewhere."""
+    ipython: Any = sys.modules.get("IPython")
+    with contextlib.suppress(Exception):  # other versions of IPython may have no such history
+        cells = ipython.get_ipython().history_manager.input_hist_raw
+        text = "".join(f"# %% [{number}]\n{cell}\n" for number, cell in enumerate(cells) if cell)
+        return text[-_MAX_CELL_BYTES:]
+    return ""

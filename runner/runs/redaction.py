@@ -1,0 +1,130 @@
+"""Secrets, removed from what is recorded of command lines, addresses and sources.
+
+A secret is known by the name it has (`--api-key`, `HF_TOKEN = "..."`), by its shape (`ghp_...`, an address
+with a password), or because it is the value of an environment variable with such a name.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+REDACTED: Final = "[redacted]"
+SECRET_NAMES: Final = (
+    *("token", "secret", "password", "passwd", "passphrase", "key", "credential", "cookie", "authorization"),
+)
+"""A name that contains one of these, in any case, is that of a secret; `tokenizer` is not."""
+_MIN_VARIABLE: Final = 12
+"""The shortest value of an environment variable that is looked for; shorter ones are words."""
+_NAME: Final = re.compile("|".join(SECRET_NAMES).replace("token", "token(?!i[sz])"), re.IGNORECASE)
+_HARMLESS: Final = re.compile(r"\d{1,5}|\d?\.\d{1,5}|true|false|none|null", re.IGNORECASE)
+"""Values that stay, such as that of `--max-tokens 512`, unless the name has `pass`."""
+_IN_SOURCES: Final = (
+    r"(?:token(?!i[sz])|secret|passw(?:or)?d|passphrase|credential|authorization|cookie|"
+    r"(?:api|access|private|auth|account|signing|encryption)[_-]?key)"
+)
+"""In sources a mere `key` is seldom a secret: `sort(key="length")`."""
+_AFTER_NAME: Final = (
+    r"[\w-]{0,40}[\"']?\]?(?:(?:\s{0,3}:\s{0,3}[\w.\[\]| ]{1,30})?\s{0,3}[:=]\s{0,3}|"
+    r"[^\"'\n]{0,60}default\s?=\s?)"
+)
+SHAPES: Final = (
+    (
+        "private keys",
+        r"-----BEGIN [A-Z ]{0,30}PRIVATE KEY-----[\s\S]{0,20000}?-----END [A-Z ]{0,30}PRIVATE KEY-----",
+    ),
+    ("AWS", r"\b(?:AKIA|ASIA)[0-9A-Z]{16}\b"),
+    ("GitHub", r"\b(?:gh[pousr]_[A-Za-z0-9]{30,255}|github_pat_[A-Za-z0-9_]{22,255})"),
+    ("GitLab", r"\bglpat-[\w-]{20,100}"),
+    ("Slack", r"\bxox[abeoprs]-[\w-]{10,250}"),
+    ("OpenAI, Anthropic", r"\bsk-[A-Za-z0-9][\w-]{19,250}"),
+    ("Hugging Face", r"\bhf_[A-Za-z0-9]{30,100}"),
+    ("Google", r"\bAIza[\w-]{35}|\bya29\.[\w-]{20,500}"),
+    ("npm, PyPI", r"\bnpm_[A-Za-z0-9]{36}\b|\bpypi-[\w-]{50,300}"),
+    ("Stripe", r"\b[rs]k_(?:live|test)_[A-Za-z0-9]{16,100}"),
+    ("SendGrid", r"\bSG\.[\w-]{16,40}\.[\w-]{16,60}"),
+    ("Replicate", r"\br8_[A-Za-z0-9]{37}\b"),
+    ("this project's servers", r"\bdualtaxi_[\w-]{40,60}"),
+    ("JSON web tokens", r"\beyJ[\w-]{8,2000}\.eyJ[\w-]{8,4000}\.[\w-]{8,2000}"),
+    ("bearer tokens", r"(?<=Bearer )[\w.~+/-]{16,500}=*"),
+)
+"""Tokens known by their shape: what they are for, and a regular expression."""
+_SHAPES: Final = re.compile("|".join(shape for _, shape in SHAPES))
+_ADDRESS: Final = re.compile(r"(?<=://)(?!git@)[^\s/@\"'<>]{1,500}(?=@)")
+_PARAMETER: Final = re.compile(
+    rf"([?&][\w-]{{0,40}}{_IN_SOURCES}[\w-]{{0,40}}=)[^&\s\"'\[]{{1,500}}", re.IGNORECASE
+)
+_QUOTED: Final = re.compile(
+    rf"({_IN_SOURCES}{_AFTER_NAME}[rbfuRBFU]?)(\"[^\"\n]{{4,2000}}\"|'[^'\n]{{4,2000}}')", re.IGNORECASE
+)
+_LONG_KEY: Final = re.compile(
+    r"(key[\"']?\]?\s{0,3}[:=]\s{0,3})([\"'])(?=[\w+/=.-]{0,200}\d)[\w+/=.-]{20,200}\2", re.IGNORECASE
+)
+_BARE: Final = re.compile(
+    rf"({_IN_SOURCES}[\w-]{{0,40}}[ \t]{{0,3}}[:=][ \t]{{0,3}})"
+    r"(?=[\w+/=~-]{0,200}\d)[\w+/=~-]{16,500}(?=\s|$)",
+    re.IGNORECASE,
+)
+"""Without quotes, as in shell scripts and YAML: only what is long and has a digit."""
+
+
+def is_secret_name(name: str) -> bool:
+    """Return whether a value of this name is taken for a secret."""
+    return _NAME.search(name) is not None
+
+
+def redacted_arguments(arguments: Sequence[str], variables: Mapping[str, str] = os.environ) -> list[str]:
+    """Return the arguments of a command with secrets replaced by `[redacted]`.
+
+    Args:
+        arguments: such as `sys.argv`.
+        variables: the environment variables.
+    """
+    shown: list[str] = []
+    is_value_secret = False
+    for argument in arguments:
+        name, equals, value = argument.partition("=")
+        if is_value_secret and not argument.startswith("--") and not _stays(shown[-1], argument):
+            shown.append(REDACTED)
+        elif equals and is_secret_name(name) and not _stays(name, value) and "://" not in name:
+            shown.append(f"{name}={REDACTED}")
+        else:
+            shown.append(redacted_text(argument, variables))
+        is_value_secret = argument.startswith("-") and not equals and is_secret_name(argument)
+    return shown
+
+
+def _stays(name: str, value: str) -> bool:
+    return "pass" not in name.lower() and _HARMLESS.fullmatch(value) is not None
+
+
+def redacted_text(text: str, variables: Mapping[str, str] = os.environ) -> str:
+    """Return a source, a patch or an address with secrets replaced by `[redacted]`.
+
+    Args:
+        text: the text.
+        variables: the environment variables; values of those with the name of a secret are replaced.
+    """
+    values = {
+        value
+        for name, value in variables.items()
+        if len(value) >= _MIN_VARIABLE and is_secret_name(name) and "\n" not in value
+    }
+    for value in sorted(values, key=len, reverse=True):
+        text = text.replace(value, REDACTED)
+    text = _SHAPES.sub(REDACTED, text)
+    text = _ADDRESS.sub(REDACTED, text)
+    text = _PARAMETER.sub(rf"\g<1>{REDACTED}", text)
+    text = _QUOTED.sub(_without_value, text)
+    text = _LONG_KEY.sub(rf"\g<1>\g<2>{REDACTED}\g<2>", text)
+    return _BARE.sub(rf"\g<1>{REDACTED}", text)
+
+
+def _without_value(match: re.Match[str]) -> str:
+    """Return an assignment without its value; a placeholder such as `"${TOKEN}"` stays."""
+    name, quoted = match[1], match[2]
+    if quoted[1] in "{$<%[" or _stays(name, quoted[1:-1]):
+        return match[0]
+    return f"{name}{quoted[0]}{REDACTED}{quoted[0]}"
