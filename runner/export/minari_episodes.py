@@ -95,6 +95,7 @@ class _Resets:
 
     def __init__(self, recording: Recording, phase: str) -> None:
         self._has_observations = recording.kind != "step"
+        self._environments = recording.environments
         self._remaining = recording.resets(phase)
         self._next = next(self._remaining, None)
         self._read: dict[tuple[int, int], tuple[int | None, Any]] = {}
@@ -106,7 +107,7 @@ class _Resets:
         while self._next is not None and int(self._next["step"]) <= int(steps[0]["step"]):
             reset = self._next
             seed = int(reset["seed"]) if reset["seeded"] else None
-            key = int(reset["environment"]), int(reset["episode"])
+            key = int(reset["environment"]) % self._environments, int(reset["episode"])
             self._read[key] = seed, _copy(reset["observation"])
             self._next = next(self._remaining, None)
         key = environment, int(steps[0]["episode"])

@@ -52,6 +52,14 @@ class Described:
         described = {"observation": self.observation, "action": self.recorded_action}
         return json.dumps({name: describe_space(space) for name, space in described.items()})
 
+    @property
+    def common(self) -> str:
+        """What all processes that record one run have in common, as JSON: kind, spaces, agents of a game."""
+        spaces_of = {"observation": self.observation, "action": self.action}
+        described = {name: describe_space(space) for name, space in spaces_of.items()}
+        agents = list(map(str, self.agents)) if len(self.agents) > 1 else 1
+        return json.dumps({"kind": self.kind, **described, "agents": agents})
+
     def attachments(self) -> Attachments:
         """Return the attachments that describe the environment, with its arrays if it is tabular."""
         if self.mdp is not None:

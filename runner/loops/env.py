@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 from gymnasium.vector import VectorEnv
@@ -20,6 +20,7 @@ from runner.loops.recorded import RecordedAlone, require_pictures
 from runner.loops.rows import Rows
 from runner.loops.single_rows import ROWS
 from runner.loops.values import check_phase
+from runner.runs.run import Run
 
 
 class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -92,6 +93,8 @@ def record(
     into: RecordedEnv | None = None,
     phase: str = "train",
     make: str | Callable[[], Any] | None = None,
+    join: Run | str | os.PathLike[str] | Literal[True] | None = None,
+    shard: str | None = None,
     **packing: Any,
 ) -> RecordedEnv:
     """Return the environment, with everything that a loop does with it recorded.
@@ -121,11 +124,16 @@ def record(
         make: a function without arguments that makes this environment, at the top of a module, or its name
             ("train:make_env"). It is recorded, and called to repeat the run where wrappers or arguments
             cannot be recorded; `environment_maker` in the recording says where that is.
+        join: a run that is being recorded, by a `Run`, its id or its folder, or True for that of the process
+            that started this one: this process records a shard of it. It has no name, seed and config then.
+        shard: the name of this process in that run, which determines the order of processes in it; by default
+            the name that `multiprocessing` gave it.
         packing: `compression`, `level`, `index`, `chunk_steps`, as in the section `recording` of a file.
 
     Raises:
         EnvironmentNotUsable: a space cannot be recorded.
         ConfigError: an argument cannot be used.
+        RunnerError: the run to join is over, or a job, or there is none.
         StorageError: the recordings folder cannot be written.
     """
     if _is_vec_env(env):
@@ -144,13 +152,16 @@ def record(
         )
     check_phase(phase)
     if into is not None:
-        if recordings is not None or name is not None or config or info or frames_every or packing:
+        others = recordings, name, join, shard
+        if others != (None,) * 4 or config or info or frames_every or packing:
             raise ConfigError(
                 "into: found more arguments than phase, expected none: the run has them already"
             )
         return _record_into_run(env, into, phase, checked_make(make))
     described = describe(env, env.observation_space, env.action_space)
-    options = options_of(recordings, name, seed, config, info, packing, frames_every, frame_format)
+    options = options_of(
+        recordings, name, seed, config, info, packing, frames_every, frame_format, join=join, shard=shard
+    )
     if frames_every:
         require_pictures(env)
     maker = maker_of(env, checked_make(make))

@@ -10,15 +10,17 @@ import time
 import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
 from blake3 import blake3
 
 from runner.client.outbox import Follower, connect, is_server, outbox_folder
 from runner.config.job import NOT_CONTENT
-from runner.errors import RunnerError, StorageError, truncated_message
+from runner.errors import ConfigError, RunnerError, StorageError, truncated_message
 from runner.loops.description import Described
 from runner.loops.extras import Extras
+from runner.loops.folding import OWNER_WAITS, fold_if_over
 from runner.loops.messages import Messages
 from runner.loops.options import Options
 from runner.loops.outcomes import Outcomes
@@ -34,6 +36,8 @@ from runner.runs import run as runs
 from runner.runs.code import CodeCollector
 from runner.runs.provenance import provenance
 from runner.runs.run import RECORDING_FILE, Run, new_run, recordings_folder, unless_empty
+from runner.runs.shards import RUN_VARIABLE, new_shard
+from runner.util.values import is_whole
 
 _UNDECIDED_SECONDS: Final = 5.0
 """The dtype of actions is left open this long while no step is taken; then it is that of their space."""
@@ -82,8 +86,8 @@ class Loop(Generic[R]):
         make_rows: Callable[[Recorder, Described, str, Callable[[Any], None]], R],
         batch: tuple[int, ...] = (),
     ) -> None:
-        client = connect(str(options.recordings)) if is_server(options.recordings) else None
-        folder = outbox_folder() if client else recordings_folder(options.recordings)
+        is_shard = options.join is not None
+        client = connect(str(options.recordings)) if is_server(options.recordings) and not is_shard else None
         self._started = time.monotonic()
         self._config = options.config(described)
         self._maker = maker
@@ -106,7 +110,8 @@ class Loop(Generic[R]):
         self._code = CodeCollector(options.packing.code)
         self._made_by = provenance(with_command=options.packing.code)
         made_by = {key: self._made_by[key] for key in runs.MADE_BY if key in self._made_by}
-        self.run = new_run(folder, self._config, options.seed, self._config["name"], provenance=made_by)
+        facts = {"provenance": made_by, "spaces": described.common}
+        self.run = self._new_run(outbox_folder() if client else None, facts)
         path = self.run.folder / RECORDING_FILE
         topics = schema.KINDS[described.kind]
         with unless_empty(self.run):
@@ -130,7 +135,7 @@ class Loop(Generic[R]):
             self._outcomes,
             options,
             {topic.name: topic for topic in topics},
-            self.run.folder,
+            options.join.folder if options.join else self.run.folder,
         )
         if self._is_settled:
             try:
@@ -140,7 +145,28 @@ class Loop(Generic[R]):
                 self._mark_failed(error)
                 raise
         self._follower = Follower(client, self.run, lambda: self._file.size) if client else None
+        if not is_shard:
+            os.environ[RUN_VARIABLE] = os.path.abspath(self.run.folder)  # noqa: PTH100 - links stay what they are
         _flusher.add(self)
+
+    def _new_run(self, folder: Path | None, facts: Mapping[str, Any]) -> Run:
+        """Create the folder of the run, or of the shard of the run that is joined.
+
+        Raises:
+            ConfigError: the spaces are others than those of the run that is joined.
+            RunnerError: that run is over.
+        """
+        options, config = self.options, self._config
+        if options.join is None:
+            folder = folder or recordings_folder(options.recordings)
+            return new_run(folder, config, options.seed, config["name"], **facts)
+        expected = options.join.facts.get("spaces")
+        if facts["spaces"] != expected:
+            raise ConfigError(
+                f"join: found an environment with {facts['spaces'][:500]}, expected the spaces and agents of "
+                f"run {options.join.run_id}: {str(expected)[:500]}"
+            )
+        return new_shard(options.join, options.shard, config, options.seed, **facts)
 
     def _run_facts(self) -> dict[str, str]:
         described, mdp, run = self.described, self.described.mdp, self.run
@@ -250,14 +276,41 @@ class Loop(Generic[R]):
         if (active := self.active) is None:
             return self.position, step, episode
         counts = self._recorder.steps
-        return counts["train"] + counts["eval"] + active.filled, step, episode
+        return counts["train"] + counts["eval"] + counts["elsewhere"] + active.filled, step, episode
+
+    def at_step(self, steps: int) -> None:
+        """State how many training steps the whole run had when what is recorded from now on happened.
+
+        Raises:
+            ConfigError: it is no number of steps, or lower than before.
+            RunnerError: this process takes training steps itself, or the loop is closed.
+        """
+        with self.lock:
+            if not self.records():
+                return
+            taken = self._recorder.steps
+            before = taken["elsewhere"]
+            if not is_whole(steps := getattr(steps, "item", lambda: steps)(), before, 2**53):
+                raise ConfigError(f"at_step: found {steps!r}, expected a whole number from {before:,} up")
+            self.position  # noqa: B018 - it raises an error if the loop is closed
+            self._commit()
+            self.extras.finish()
+            if taken["train"]:
+                raise RunnerError(
+                    "at_step: found training steps of this process, which have their place by themselves; "
+                    "expected a process that only evaluates or logs."
+                )
+            if "placed" not in self.run.facts:
+                self.run = self.run.update(placed=True)
+            taken["elsewhere"] = steps
 
     def records(self) -> bool:
         """Return whether this process records, and warn if it was forked from the one that does."""
         if self.is_foreign:
             self.warn_once(
                 f"run {self.run.run_id} is recorded by the process that this one was forked from, and not "
-                "here. To record what this process does, wrap the environment in it."
+                "here. To record what this process does into the same run, join it here: "
+                "runner.record(env, join=True), with the environment as it was before it was recorded."
             )
         return not self.is_foreign
 
@@ -298,6 +351,12 @@ class Loop(Generic[R]):
                 self._file.close()
             made_by = self._code.made_by(self.run)
             self.run = self.run.update(status=status, summary=summary, provenance=made_by)
+        if self.options.join is not None:
+            fold_if_over(self.options.join)
+        else:
+            if os.environ.get(RUN_VARIABLE) == os.path.abspath(self.run.folder):  # noqa: PTH100
+                del os.environ[RUN_VARIABLE]
+            self.run = fold_if_over(self.run, OWNER_WAITS)
         if self._follower:
             self._follower.finish(self.run)
         return self.run

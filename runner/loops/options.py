@@ -14,6 +14,8 @@ from runner.config.loading import packing_from
 from runner.config.sections import Recording
 from runner.errors import ConfigError
 from runner.loops.description import Described
+from runner.runs.run import Run
+from runner.runs.shards import find_joined
 from runner.util.extras import require
 from runner.util.jsonable import as_json, as_mapping
 from runner.util.values import checked_run_name, is_whole
@@ -21,7 +23,7 @@ from runner.util.values import checked_run_name, is_whole
 MADE_BY: Final = "runner.record"
 ALL_INFO: Final = "*"
 """Among the names of info fields: all of them."""
-_PACKING: Final = ("compression", "level", "index", "chunk_steps", "code")
+PACKING: Final = ("compression", "level", "index", "chunk_steps", "code")
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,9 @@ class Options:
     frames_of: tuple[int, ...] | None = None
     """The environments of a vector of which frames are recorded; None for all."""
     packing: Recording = field(default_factory=Recording)
+    join: Run | None = None
+    """The run that this process records a shard of."""
+    shard: str | None = None
 
     def __post_init__(self) -> None:
         expectations = (
@@ -86,15 +91,18 @@ def options_of(
     frames_every: int = 0,
     frame_format: str = "png",
     frames_of: tuple[int, ...] | None = None,
+    join: object = None,
+    shard: str | None = None,
 ) -> Options:
     """Return the options for the arguments of `record`.
 
     Raises:
         ConfigError: an argument is unknown or cannot be used.
+        RunnerError: the run to join is over, or there is none.
         MissingExtra: frames need Pillow, which is not installed.
     """
-    if unknown := sorted(set(packing) - set(_PACKING)):
-        raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {', '.join(_PACKING)}")
+    if unknown := sorted(set(packing) - set(PACKING)):
+        raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {', '.join(PACKING)}")
     if isinstance(info, str) and info != ALL_INFO:
         raise ConfigError(f"info: found {info!r}, expected a list of names, such as [{info!r}]")
     mapping = as_mapping({} if config is None else config)
@@ -111,6 +119,13 @@ def options_of(
         ) from error
     if frames_every:
         pillow()
+    if join is None and shard is not None:
+        raise ConfigError(f"shard: found {shard!r} without join, expected the run to join: join=RUN")
+    if join is not None and (name is not None or seed is not None or settings):
+        raise ConfigError(
+            "join: found name, seed or config, expected none of them: the run has them already. The process "
+            "is named by shard."
+        )
     return Options(
         recordings=recordings,
         name=name,
@@ -121,6 +136,8 @@ def options_of(
         frame_format=frame_format,
         frames_of=frames_of,
         packing=packing_from(packing),
+        join=None if join is None else find_joined(join, recordings),
+        shard=shard,
     )
 
 

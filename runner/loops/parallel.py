@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral
-from typing import Any
+from typing import Any, Literal
 
 from gymnasium import spaces
 
@@ -18,7 +18,9 @@ from runner.loops.makers import checked_make, game_maker_of
 from runner.loops.options import options_of
 from runner.loops.recorded import RecordedAlone, require_pictures
 from runner.loops.single_rows import AgentRows
+from runner.loops.values import check_phase
 from runner.loops.vector import by_field, require_fixed
+from runner.runs.run import Run
 
 
 class RecordedParallel(RecordedAlone[AgentRows]):
@@ -27,11 +29,11 @@ class RecordedParallel(RecordedAlone[AgentRows]):
     Its other attributes are those of the environment: `agents`, `action_space`, ...
     """
 
-    def __init__(self, env: Any, loop: Loop[AgentRows]) -> None:
+    def __init__(self, env: Any, loop: Loop[AgentRows], phase: str = "train") -> None:
         self.env = env
         self._watch = GeneratorWatch(env)
         self._record_into(loop)
-        self._enter("train")
+        self._enter(phase)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_") or name == "env":
@@ -90,7 +92,10 @@ def record_parallel(
     info: Sequence[str] = (),
     frames_every: int = 0,
     frame_format: str = "png",
+    phase: str = "train",
     make: str | Callable[[], Any] | None = None,
+    join: Run | str | os.PathLike[str] | Literal[True] | None = None,
+    shard: str | None = None,
     **packing: Any,
 ) -> RecordedParallel:
     """Return a PettingZoo parallel environment, with everything that a loop does with it recorded.
@@ -107,7 +112,10 @@ def record_parallel(
         info: names of fields of the agents' infos to record, where they occur.
         frames_every: as for `record`; a frame shows the whole game.
         frame_format: as for `record`.
+        phase: `train` or `eval`.
         make: as for `record`.
+        join: as for `record`.
+        shard: as for `record`.
         packing: as for `record`.
 
     Raises:
@@ -124,13 +132,16 @@ def record_parallel(
         raise ConfigError(
             f"found {type(env).__name__}, expected a PettingZoo ParallelEnv with possible_agents"
         )
+    check_phase(phase)
     described = _game(env)
     require_fixed(described)
     if frames_every:
         require_pictures(env)
-    options = options_of(recordings, name, seed, config, info, packing, frames_every, frame_format)
+    options = options_of(
+        recordings, name, seed, config, info, packing, frames_every, frame_format, join=join, shard=shard
+    )
     maker = game_maker_of(env, checked_make(make))
-    return RecordedParallel(env, Loop(described, options, maker, AgentRows))
+    return RecordedParallel(env, Loop(described, options, maker, AgentRows), phase)
 
 
 def _game(env: Any) -> Described:

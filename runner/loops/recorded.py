@@ -105,6 +105,21 @@ class Recorded(Generic[R]):
     def _extras_by_name(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
         return values
 
+    def at_step(self, steps: int) -> None:
+        """State how many training steps the whole run had: what follows is recorded as of that moment.
+
+            rec = runner.record(env, join=run, phase="eval")
+            rec.at_step(learner.steps)     # then evaluate the policy of that moment
+
+        For processes of one run that take no training steps themselves, such as evaluators; without it, what
+        they record stands where the others were after as many steps of their own.
+
+        Raises:
+            ConfigError: it is no number of steps, or lower than before.
+            RunnerError: this process takes training steps itself, or the recording is closed.
+        """
+        self._loop.at_step(steps)
+
     @contextlib.contextmanager
     def phase(self, name: str) -> Iterator[Self]:
         """Record what happens in the block in this phase, `train` or `eval`: `with rec.phase("eval"):`.

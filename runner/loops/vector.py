@@ -8,7 +8,7 @@ import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
@@ -21,7 +21,9 @@ from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, vector_maker_of
 from runner.loops.options import options_of
 from runner.loops.recorded import Recorded, given, require_pictures
+from runner.loops.values import check_phase
 from runner.loops.vector_rows import VectorRows
+from runner.runs.run import Run
 
 if TYPE_CHECKING:
     _Wrapper = VectorWrapper[Any, Any, Any, Any, Any]
@@ -35,13 +37,18 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
     env: VectorEnv[Any, Any, Any]
 
     def __init__(
-        self, env: VectorEnv[Any, Any, Any], loop: Loop[VectorRows], mode: AutoresetMode, watch: VectorWatch
+        self,
+        env: VectorEnv[Any, Any, Any],
+        loop: Loop[VectorRows],
+        mode: AutoresetMode,
+        watch: VectorWatch,
+        phase: str = "train",
     ) -> None:
         VectorWrapper.__init__(self, env)
         self._mode = mode
         self._watch = watch
         self._record_into(loop)
-        Recorded._enter(self, "train")
+        Recorded._enter(self, phase)
 
     def _enter(self, phase: str) -> None:
         with self._loop.lock:
@@ -155,7 +162,10 @@ def record_vector(
     frame_format: str = "png",
     frames_of: int | Sequence[int] | None = None,
     autoreset_mode: AutoresetMode | str | None = None,
+    phase: str = "train",
     make: str | Callable[[], Any] | None = None,
+    join: Run | str | os.PathLike[str] | Literal[True] | None = None,
+    shard: str | None = None,
     **packing: Any,
 ) -> RecordedVector:
     """Return a vector environment, with everything that a loop does with it recorded.
@@ -180,7 +190,10 @@ def record_vector(
         frames_of: the number of the environment to render, or several; all unless given.
         autoreset_mode: how the environments reset themselves, if their metadata does not state it:
             "NextStep", "SameStep" or "Disabled"; "SameStep" for SuperSuit.
+        phase: `train` or `eval`.
         make: as for `record`; the function makes the vector environment.
+        join: as for `record`.
+        shard: as for `record`.
         packing: as for `record`.
 
     Raises:
@@ -192,6 +205,7 @@ def record_vector(
         raise ConfigError(
             f"found {type(envs).__name__}, expected a vector environment, such as gymnasium.make_vec gives"
         )
+    check_phase(phase)
     mode = _autoreset_mode(envs, autoreset_mode)
     with _one_of(envs) as first:
         described = _described_vector(envs, first)
@@ -206,10 +220,22 @@ def record_vector(
             f"frames_of: found {frames_of!r} with frames_every={frames_every}, expected numbers from 0 to "
             f"{envs.num_envs - 1}, and frames_every"
         )
-    options = options_of(recordings, name, seed, config, info, packing, frames_every, frame_format, chosen)
+    options = options_of(
+        recordings,
+        name,
+        seed,
+        config,
+        info,
+        packing,
+        frames_every,
+        frame_format,
+        chosen,
+        join=join,
+        shard=shard,
+    )
     rows = partial(VectorRows, next_step=mode == AutoresetMode.NEXT_STEP)
     loop = Loop(described, options, maker, rows, (described.environments,))
-    return RecordedVector(envs, loop, mode, watch)
+    return RecordedVector(envs, loop, mode, watch, phase)
 
 
 def _autoreset_mode(envs: VectorEnv[Any, Any, Any], chosen: AutoresetMode | str | None) -> AutoresetMode:

@@ -354,8 +354,10 @@ class _Phase:
         state, rest = self._state, self._blocks.resets.take_while("step", steps + 1)
         if rest is not None and len(rest):
             environment = rest["environment"].astype(np.int64)
-            if (environment >= self._n).any() or (rest["step"] != steps).any():
+            is_known = environment < self._recording.own_environments
+            if not is_known.all() or (rest["step"] != steps).any():
                 raise Inconsistent(f"/{self._phase}/reset: found resets out of order, or of no environment")
+            environment %= self._n
             cut = np.array([e for e in dict.fromkeys(environment.tolist()) if state.length[e]], np.int64)
             if len(cut):
                 expected: Expected = {

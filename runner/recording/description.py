@@ -25,6 +25,7 @@ from runner.recording.metadata import (
 )
 from runner.recording.run_file import Summary, parse_result
 from runner.recording.schema import Topic
+from runner.recording.shards import SHARD_MAKER, Shard, parse_shards
 
 
 class RunDescription(ABC):
@@ -216,12 +217,23 @@ class RunDescription(ABC):
         """
         return self._maker(MAKER_RECORD)
 
-    def maker_of(self, phase: str) -> EnvironmentMaker | None:
+    def maker_of(self, phase: str, environment: int = 0) -> EnvironmentMaker | None:
         """Return how the environment of a phase was made; `maker` unless it is another environment.
+
+        Args:
+            phase: `train` or `eval`.
+            environment: its number among those of all shards.
 
         Raises:
             RecordingError: it is damaged.
         """
+        last = 0
+        for shard in self.shards:
+            last += shard.environments
+            if environment < last:
+                if (own := self._maker(f"{SHARD_MAKER}/{shard.name}")) is not None:
+                    return own
+                break
         return self._maker(f"{MAKER_RECORD}/{phase}") or self.maker
 
     def action_names(self, phase: str) -> tuple[str, ...]:
@@ -275,6 +287,23 @@ class RunDescription(ABC):
     def environments(self) -> int:
         """How many environments took turns: step number n was taken in number n modulo this."""
         return int(self.run.get("environments", "1"))
+
+    @cached_property
+    def shards(self) -> tuple[Shard, ...]:
+        """The processes that recorded it together; empty if it was one.
+
+        Their environments are numbered through, in this order; `environment` of a reset is that number, and
+        the steps up to the next reset are of that environment.
+
+        Raises:
+            RecordingError: they are damaged.
+        """
+        return parse_shards(self.run.get("shards"), str(self.path))
+
+    @property
+    def own_environments(self) -> int:
+        """How many environments resets name: those of all shards, or those that took turns."""
+        return sum(shard.environments for shard in self.shards) or self.environments
 
     @property
     def leaves_out_steps(self) -> bool:

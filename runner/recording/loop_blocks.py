@@ -137,9 +137,9 @@ class Blocks:
         resets, at = self.resets.take_while("step", first + count), np.empty(0, np.int64)
         if resets is not None and len(resets):
             step, environment = resets["step"], resets["environment"].astype(np.int64)
-            if ((environment >= n) | (step % n != 0) | (step < first)).any():
+            if ((environment >= self._recording.own_environments) | (step % n != 0) | (step < first)).any():
                 raise Inconsistent(f"/{self._phase}/reset: found resets out of order, or of no environment")
-            at = environment * times + (step - first) // n
+            at = environment % n * times + (step - first) // n
         owner = np.repeat(np.arange(n), times)
         return Block(first, times, rows, first + order, owner, opens, resets, at, over, ends)
 

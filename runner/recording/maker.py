@@ -89,6 +89,11 @@ class EnvironmentMaker:
     action_names: tuple[str, ...] = ()
     """The names of the actions of a `Discrete` space, the least action's first; empty if unknown."""
 
+    def is_like(self, other: EnvironmentMaker) -> bool:
+        """Return whether another maker makes the environment, or each of a vector, in the same way."""
+        names = ("spec", "registered_by", "make", "reason", "wrappers", "assumed")
+        return all(getattr(self, name) == getattr(other, name) for name in names)
+
     def to_metadata(self) -> dict[str, str]:
         """Return the entries of the metadata record."""
         return {"json": json.dumps(asdict(self), sort_keys=True)}

@@ -38,6 +38,7 @@ MAX_EPISODE_BYTES: Final = 128 << 20
 MAX_METRICS: Final = 1 << 17
 """The most that `metrics` returns as one list."""
 _METRICS_BYTES: Final = 1 << 20
+_ENDING: Final = np.dtype([("step", "i8"), ("terminated", "?"), ("truncated", "?")])
 
 
 def open_recording(path: str | os.PathLike[str]) -> Recording:
@@ -104,6 +105,37 @@ class Recording(TopicReader):
         if topic.message is schema.EXTRA:
             return self.extras(topic.phase).count
         return self._chunks(topic).count()
+
+    def whole_steps(self, phase: str) -> int:
+        """Return how many steps of a loop's phase are known to have their resets.
+
+        Of a recording that was cut off these are the steps up to the first end of an episode after its last
+        reset: what comes later may lack its reset, since topics are written one after the other.
+        """
+        topic, resets = self.topic(f"/{phase}/step"), self.topic(f"/{phase}/reset")
+        n, total = self.environments, self.count(topic)
+        if "content_digest" in self.result:
+            return total
+        if resets in self.dtypes:
+            count = self.count(resets)
+            last = max(
+                (int(block["step"][-1]) for block in self.blocks(resets, count - 1, count)), default=-1
+            )
+            steps: Iterator[Any] = self.blocks(topic, max(last, 0))
+        else:
+            last = max((int(each["step"]) for each in self.decoded(resets)), default=-1)
+            steps = (
+                np.array([(each["step"], each["terminated"], each["truncated"])], _ENDING)
+                for each in self.decoded(topic)
+                if each["step"] >= last
+            )
+        if last < 0:
+            return 0
+        for block in steps:
+            over = block["terminated"] | block["truncated"]
+            if over.any():
+                return min(int(block["step"][np.argmax(over)]) // n * n + n, total // n * n)
+        return total // n * n
 
     def blocks_of_episodes(self, phase: str, start: int, stop: int | None) -> Iterator[NDArray[np.void]]:
         """Yield the steps of the episodes number `start` up to `stop`; None for all that follow."""

@@ -110,8 +110,8 @@ class Recorder:
             topic: self._lane(topic, own, record_steps or topic.message is not schema.STEP)
             for topic, own in sizes.items()
         }
-        self.steps = {"train": 0, "eval": 0}
-        """Steps committed so far, by phase."""
+        self.steps = {"train": 0, "eval": 0, "elsewhere": 0}
+        """Steps committed so far, by phase; and those of other processes of the run, where they are stated."""
         self.counts = {topic.name: 0 for topic in schema.ALL_TOPICS}
         """Messages committed so far, by topic."""
         self._last_flush = time.monotonic()

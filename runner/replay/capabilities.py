@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.replay.makers import why_not_made
+from runner.replay.makers import is_whole_vector, why_not_made
 
 
 def environments_with_frames(recording: Recording, phase: str) -> Sequence[int]:
@@ -25,4 +26,15 @@ def why_not_redone(recording: Recording, trust: bool = False) -> str:
         return "No steps were recorded."
     if recording.lost:
         return "A part of the recording was lost, and what follows depends on it."
-    return why_not_made(recording.maker, trust)
+    first, reason = 0, ""
+    for shard in recording.shards:
+        phases = [phase for phase, n in zip(schema.PHASES, shard[-2:], strict=True) if n]
+        for maker in (recording.maker_of(phase, first) for phase in phases):
+            if maker is not None and is_whole_vector(maker):
+                return (
+                    "A process stepped a vector that cannot be taken apart; as several processes recorded the "
+                    "run, its environments are recorded one by one."
+                )
+            reason = reason or why_not_made(maker, trust)
+        first += shard.environments
+    return reason or why_not_made(recording.maker, trust)

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from runner.errors import CannotRedo
 from runner.recording import schema
+from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
 from runner.replay.comparison import Comparison, Part, parts_of
-from runner.replay.makers import is_whole_vector, make_environment, make_vector
+from runner.replay.makers import is_whole_vector, make_environment, make_vector, why_not_made
 from runner.replay.recorded import Piece, RecordedReset, pieces
 from runner.replay.redone import RedoneSteps
 from runner.replay.stepping import EnvironmentStepper, GameStepper, Stepper
@@ -63,13 +64,12 @@ class Replay:
         self._steppers: dict[_Key, Stepper] = {}
         self._known: set[_Key] = set()
         """The environments whose random generators are in the recorded state."""
-        makers = {phase: recording.maker_of(phase) for phase in schema.PHASES}
         self._is_separate = _are_separate(recording)
         """Whether training and evaluation have environments of their own."""
-        self.environments: Sequence[int] = range(recording.environments)
+        self.environments: Sequence[int] = range(recording.own_environments)
         """The environments that can be stepped alone; `ALL` where the vector must be stepped as a whole."""
-        self._makers = {phase: maker for phase, maker in makers.items() if maker is not None}
-        if any(map(is_whole_vector, self._makers.values())):
+        makers = (recording.maker_of(phase) for phase in schema.PHASES)
+        if not recording.shards and any(maker is not None and is_whole_vector(maker) for maker in makers):
             self.environments = [ALL]
         self._max_rows = 1 if render else 256
         self.taken = 0
@@ -86,7 +86,7 @@ class Replay:
     def all(self) -> Iterator[RedoneSteps]:
         """Yield all steps of both phases in the order of time, up to the first difference."""
         for piece in pieces(self._recording, schema.PHASES):
-            for environment in self.environments:
+            for environment in self.environments if piece.environment is None else [piece.environment]:
                 for steps in self.steps(piece, environment, draws=self.render):
                     yield steps
                     if steps.difference is not None:
@@ -160,9 +160,9 @@ class Replay:
         Raises:
             CannotRedo: it cannot be made, or has other spaces.
         """
-        key, maker = self._key(phase, environment), self._makers.get(phase)
+        key, maker = self._key(phase, environment), self._recording.maker_of(phase, environment)
         if key not in self._steppers:
-            env = self._environment(phase, environment)
+            env = self._environment(maker, environment)
             try:
                 if environment == ALL and maker is not None and maker.vector is not None:
                     stepper: Stepper = VectorStepper(env, self._recording, maker.vector.autoreset)
@@ -181,14 +181,16 @@ class Replay:
             self._steppers[key] = stepper
         return self._steppers[key]
 
-    def _environment(self, phase: str, environment: int) -> Any:
+    def _environment(self, maker: EnvironmentMaker | None, environment: int) -> Any:
         if environment == ALL and self.render:
             raise CannotRedo("The environments of this vector cannot be made one by one, to draw themselves.")
         if self._make is not None:
             return self._make()
+        if maker is None:
+            raise CannotRedo(why_not_made(maker, self._trust))
         if environment == ALL:
-            return make_vector(self._makers[phase], self._trust)
-        return make_environment(self._makers[phase], self._trust, self.render)
+            return make_vector(maker, self._trust)
+        return make_environment(maker, self._trust, self.render)
 
 
 def _are_separate(recording: Recording) -> bool:
@@ -217,8 +219,10 @@ def own_steps(
 
     Steps at which a vector only reset the environment are left out: the reset stands for them.
     """
+    if piece.environment not in (None, environment):
+        return piece.rows[:0], []
     is_all = environment == ALL
-    rows = piece.rows if is_all else piece.rows[environment::environments]
+    rows = piece.rows if is_all else piece.rows[environment % environments :: environments]
     own = [reset for reset in piece.resets if is_all or reset.environment == environment]
     if not len(rows):
         return rows, [(0, reset) for reset in own]

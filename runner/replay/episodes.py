@@ -139,8 +139,8 @@ def _target(recording: Recording, phase: str, number: int) -> _Target:
     span, n = recording.episode_span(phase, number), recording.environments
     stop_time = _time_of(recording, phase, number, span[-1])
     for reset in _resets_back(recording, phase, stop_time):
-        if reset.environment == span[0] % n and reset.step <= span[0]:
-            others = n - 1 - reset.environment  # their steps follow at once
+        if reset.environment % n == span[0] % n and reset.step <= span[0]:
+            others = n - 1 - reset.environment % n  # their steps follow at once
             return _Target(phase, number, reset.environment, reset, stop_time + others * STEP_NANOSECONDS)
     raise RecordingError(f"{recording.path}: {phase} episode {number} has no reset before it.")
 

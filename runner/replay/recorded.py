@@ -71,6 +71,8 @@ class Piece:
     """In order; those of a piece with steps come before one of them."""
     time: int
     """Nanoseconds before its first step, or at its resets."""
+    environment: int | None = None
+    """The environment of all of it, in a recording with shards."""
 
 
 def pieces(
@@ -88,6 +90,8 @@ def pieces(
         RecordingError: the recording is damaged.
     """
     streams = [_pieces_of(recording, phase, start_time, stop_time) for phase in phases]
+    if recording.shards:
+        streams = [_by_environment(stream) for stream in streams]
     last_phase = ""
     resets: list[Piece] = []
     for piece in heapq.merge(*streams, key=lambda piece: (piece.time, len(piece.rows) > 0)):
@@ -204,7 +208,10 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
     n = recording.environments
     resets = resets_of(recording, phase, start_time, None if stop_time is None else stop_time - 1)
     waiting = next(resets, None)
-    rows = _cut_off(recording, phase, _aligned(_blocks(recording, phase, start_time, stop_time), n), n)
+    rows = _aligned(_blocks(recording, phase, start_time, stop_time), n)
+    if "content_digest" not in recording.result:
+        stop = recording.whole_steps(phase)
+        rows = (whole for block in rows if len(whole := block[block["step"] < stop]))
     nothing = np.empty(0, _row_dtype(recording, recording.topic(f"/{phase}/step")))
     for block in rows:
         first, time = int(block["step"][0]), int(block["log_time"][0]) - STEP_NANOSECONDS
@@ -215,7 +222,8 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
         yield from _without_steps(phase, early, nothing)
         here = []
         while waiting is not None and waiting.step < first + len(block):
-            if waiting.step < first or (waiting.step - first) % n or waiting.environment >= n:
+            is_known = waiting.environment < recording.own_environments
+            if waiting.step < first or (waiting.step - first) % n or not is_known:
                 raise RecordingError(
                     f"{recording.path}: /{phase}/reset {waiting.number}: out of order, or of no environment."
                 )
@@ -223,6 +231,28 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
             waiting = next(resets, None)
         yield Piece(phase, first, block, here, time)
     yield from _without_steps(phase, resets if waiting is None else [waiting, *resets], nothing)
+
+
+def _by_environment(pieces: Iterator[Piece]) -> Iterator[Piece]:
+    """Yield pieces of a recording with shards, cut where a reset is of another environment than the last."""
+    environment: int | None = None
+    for piece in pieces:
+        begin, own = 0, list[RecordedReset]()
+        for reset in piece.resets:
+            if reset.environment != environment:
+                end = reset.step - piece.first if len(piece.rows) else 0
+                if end > begin or own:
+                    yield _part(piece, begin, end, own, environment)
+                begin, own, environment = end, [], reset.environment
+            own.append(reset)
+        if begin < len(piece.rows) or own:
+            yield _part(piece, begin, len(piece.rows), own, environment)
+
+
+def _part(piece: Piece, begin: int, end: int, resets: list[RecordedReset], environment: int | None) -> Piece:
+    """Return the rows from `begin` to `end` of a piece, with their resets."""
+    first, time = piece.first + begin, piece.time + begin * STEP_NANOSECONDS
+    return Piece(piece.phase, first, piece.rows[begin:end], resets, time, environment)
 
 
 def _without_steps(phase: str, resets: Iterable[RecordedReset], nothing: NDArray[np.void]) -> Iterator[Piece]:
@@ -291,27 +321,3 @@ def _aligned(blocks: Iterator[NDArray[np.void]], n: int) -> Iterator[NDArray[np.
         left = rows[whole:]
         if whole:
             yield rows[:whole]
-
-
-def _cut_off(
-    recording: Recording, phase: str, blocks: Iterator[NDArray[np.void]], n: int
-) -> Iterator[NDArray[np.void]]:
-    """Yield the steps up to the first end of an episode after the last reset, if the recording was cut off.
-
-    What comes after it may lack its reset: topics are written one after the other.
-    """
-    if "content_digest" in recording.result:
-        yield from blocks
-        return
-    topic, last = recording.topic(f"/{phase}/reset"), 0
-    for record in recording.blocks(topic) if topic in recording.dtypes else ():
-        last = int(record["step"][-1])
-    if topic not in recording.dtypes:
-        last = max((int(each["step"]) for each in recording.decoded(topic)), default=0)
-    for block in blocks:
-        over = (block["terminated"] | block["truncated"]) & (block["step"] >= last)
-        if over.any():
-            end = int(np.argmax(over)) // n * n + n
-            yield block[:end]
-            return
-        yield block

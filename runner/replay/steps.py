@@ -93,7 +93,7 @@ def reset_of(recording: Recording, phase: str, episode: int) -> Any | None:
     )
     found = None
     for block in recording.blocks(topic, first, stop):
-        own = block[block["environment"] == numbers.start % numbers.step]
+        own = block[block["environment"] % numbers.step == numbers.start % numbers.step]
         found = own[-1] if len(own) else found
     return found
 

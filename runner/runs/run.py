@@ -229,18 +229,22 @@ def new_run(
     name: str,
     run_id: str | None = None,
     labels: Labels | None = None,
+    ids: Iterator[str] | None = None,
     **more: Any,
 ) -> Run:
-    """Create the folder of a new run; `more` are further facts, the rest is as for `create_run`."""
+    """Create the folder of a new run; `more` are further facts, the rest is as for `create_run`.
+
+    Of `ids`, if they are given, the first that is not taken becomes its id.
+    """
     check_folder_name(recordings)
     with storage_errors(recordings, f"choose another folder by --recordings or {RECORDINGS_VARIABLE}"):
         recordings.mkdir(parents=True, exist_ok=True)
-        run_id = run_id or new_run_id(recordings)
+        run_id = run_id or (next(ids) if ids else new_run_id(recordings))
         while True:
             with contextlib.suppress(FileExistsError):
                 (folder := recordings / run_id).mkdir()
                 break
-            run_id = new_run_id(recordings)
+            run_id = next(ids) if ids else new_run_id(recordings)
         facts = {
             "run_id": run_id,
             "name": name,

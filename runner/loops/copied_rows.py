@@ -1,0 +1,163 @@
+"""The rows of a recording that others are folded into: steps and resets as recorded, with new numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.environments.mdp import Mdp
+from runner.loops.rows import Rows
+from runner.recording import schema
+from runner.recording.messages import encode
+from runner.recording.recorder import Recorder
+
+_STEP_FIELDS: Final = ("state", "action", "next_state")
+_TRANSITION_FIELDS: Final = ("action", "next_observation", "acted", "agents_terminated", "agents_truncated")
+_SHARED_FIELDS: Final = ("rewards", "t", "terminated", "truncated")
+
+
+@dataclass(frozen=True)
+class Copied:
+    """What rows need to know of the recording that they are copied into."""
+
+    kind: str
+    mdp: Mdp | None
+
+
+class _Copies(Rows):
+    """What copied rows have in common."""
+
+    def _set_leaves(self, described: Any) -> None:
+        """Do nothing: values are copied."""
+
+    @property
+    def begun(self) -> int:
+        """The number of the episode that began last; -1 before any."""
+        return self._episode + len(self._begins)
+
+
+class CopiedRows(_Copies):
+    """Rows of one size that are copied.
+
+    Args:
+        recorder: takes them.
+        copied: the kind and the table of the recording.
+        phase: `train` or `eval`.
+    """
+
+    def __init__(self, recorder: Recorder, copied: Copied, phase: str) -> None:
+        super().__init__(recorder, copied, phase, lambda _: None)  # type: ignore[arg-type]
+        is_step = copied.kind == "step"
+        self._fields = _SHARED_FIELDS + (_STEP_FIELDS if is_step else _TRANSITION_FIELDS)
+        self._state_fields = _STEP_FIELDS if is_step else ()
+
+    def put_reset(self, reset: Mapping[str, Any], environment: int) -> None:
+        """Copy a reset."""
+        self._reset_block["environment"][len(self._reset_rows)] = environment
+        self.reset(reset["observation"], int(reset["seed"]) if reset["seeded"] else None)
+
+    def put(self, rows: NDArray[np.void]) -> None:
+        """Copy consecutive steps of the environment that was reset last."""
+        edges = [0, *np.flatnonzero(rows["t"] == 0).tolist(), len(rows)]
+        for begin, end in pairwise(edges):
+            done = begin
+            while done < end:
+                part = rows[done : min(end, done + self._room - self.filled)]
+                self._put_part(part)
+                done += len(part)
+                if self.filled == self._room or len(self._ends) >= self._episode_room:
+                    self.commit()
+                    self.open()
+
+    def _put_part(self, part: NDArray[np.void]) -> None:
+        """Copy steps of one episode, for which there is room."""
+        at = self.filled
+        rewards, is_first = np.asarray(part["rewards"]), part["t"][0] == 0
+        if is_first:
+            if not self._fresh:  # a game that ended without the end of any agent
+                self._end(at - 1, False, False)
+            self._begins.append(at)
+            self._fresh = False
+        else:
+            rewards = np.concatenate([np.reshape(self._return, (1, -1)), rewards])
+        self._return = np.add.accumulate(rewards, axis=0)[-1]
+        self.filled = at + len(part)
+        for name in self._fields:
+            self._block[name][at : self.filled] = part[name]
+        if part["terminated"][-1] or part["truncated"][-1]:
+            self._end(self.filled - 1, bool(part["terminated"][-1]), bool(part["truncated"][-1]))
+
+    def _open_steps(self) -> tuple[int, int]:
+        self._block = self._recorder.block(self._steps)
+        self._reset_block = self._recorder.block(self._resets)
+        return len(self._block), len(self._reset_block)
+
+    def _put_reset(self, observation: Any, seed: int | None) -> None:  # noqa: ARG002
+        self._reset_block["observation"][len(self._reset_rows)] = observation
+
+    def _rewards(self, n: int) -> NDArray[np.float64]:
+        return np.asarray(self._block["rewards"][:n, 0])
+
+    def _transitions(self, n: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+        if not self._state_fields:
+            return super()._transitions(n)
+        state, action, after = (self._block[name][:n].astype(np.int64) for name in _STEP_FIELDS)
+        return state, action, after
+
+    def _finish_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
+        block = self._block[:n]
+        block["step"] = self._recorder.steps[self._phase] + np.arange(n)
+        block["episode"], block["t"] = episode, t
+        self._recorder.take(self._steps, np.arange(before + 1, before + n + 1, dtype=np.uint64))
+
+
+class CopiedMessages(_Copies):
+    """Rows whose values vary in size, that are copied; arguments as for `CopiedRows`."""
+
+    def __init__(self, recorder: Recorder, copied: Copied, phase: str) -> None:
+        self._paid = np.zeros(4096)
+        super().__init__(recorder, copied, phase, lambda _: None)  # type: ignore[arg-type]
+
+    def _open_steps(self) -> tuple[int, int]:
+        return len(self._paid), len(self._paid)
+
+    def put_reset(self, reset: Mapping[str, Any], environment: int) -> None:
+        """Copy a reset."""
+        fields = {"reset": self.resets, "episode": self.begun + 1, "step": self.place[0]}
+        fields |= {"environment": environment}
+        position = sum(self._recorder.steps.values()) + self.filled
+        seed = int(reset["seed"]) if reset["seeded"] else None
+        self._recorder.append(self._resets, encode(schema.RESET, _payload(reset) | fields), position)
+        self.reset(None, seed)
+
+    def put(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Copy consecutive steps of the environment that was reset last."""
+        for row in rows:
+            is_first = row["t"] == 0
+            episode = self.begun + is_first
+            position = sum(self._recorder.steps.values()) + self.filled + 1
+            fields = {"step": self.place[0], "episode": episode}
+            self._recorder.append(self._steps, encode(schema.TRANSITION, _payload(row) | fields), position)
+            self._paid[self.filled] = row["rewards"][0]
+            self._count(row["rewards"][0], row["terminated"], row["truncated"])
+
+    def _put_reset(self, observation: Any, seed: int | None) -> None:
+        """Do nothing: the message is complete."""
+
+    def _rewards(self, n: int) -> NDArray[np.float64]:
+        return self._paid[:n]
+
+    def _finish_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
+        """Do nothing: the messages are complete."""
+
+    def _finish_resets(self, begins: NDArray[Any], before: int) -> None:  # noqa: ARG002
+        self._reset_count += len(self._reset_rows)
+
+
+def _payload(message: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in message.items() if name != "log_time"}

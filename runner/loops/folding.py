@@ -1,0 +1,449 @@
+"""The shards of a run, folded into its recording when no process records into it any more.
+
+Each episode is kept whole, with the resets before it, and the episodes of all processes are put in one order:
+by how many steps their processes had taken when they began, then by the names of the processes. So the run is
+as if one loop had done all of it, and does not depend on which process was faster.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from runner.config.loading import packing_from
+from runner.errors import ConfigError, RecordingError
+from runner.loops.copied_rows import Copied, CopiedMessages, CopiedRows
+from runner.loops.options import PACKING
+from runner.loops.outcomes import Outcomes
+from runner.loops.shard_sources import PHASES, Source
+from runner.recording import schema
+from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAMES, ExtraLayout
+from runner.recording.maker import EnvironmentMaker
+from runner.recording.messages import decode, encode, encode_image, encode_log, frame_id, frame_place
+from runner.recording.metadata import sizes_of, write_result
+from runner.recording.reader import open_recording
+from runner.recording.recorder import Recorder
+from runner.recording.salvage import DamagedFile
+from runner.recording.schema import STEP_NANOSECONDS, Topic
+from runner.recording.shards import SHARD_MAKER, Shard
+from runner.recording.writer import create_recording
+from runner.runs.listing import run_at
+from runner.runs.run import RECORDING_FILE, Run
+from runner.runs.shards import SHARDS_FOLDER, are_over, shards_locked, shards_of
+from runner.util.files import open_regular, storage_errors
+
+OWNER_WAITS: Final = 5.0
+"""Seconds for which the process that began a run waits, at its end, for the others to end."""
+_POLL_SECONDS: Final = 0.05
+_KEPT: Final = frozenset({"run", "result", "repair"})
+"""The metadata that is not copied from the process that began the run."""
+
+Report = Callable[[int, int], None]
+"""Takes the steps copied so far, and how many there are."""
+
+
+def fold_if_over(run: Run, seconds: float = 0.0, report: Report = lambda *_: None) -> Run:
+    """Fold the shards of a run into its recording if no process records into it; return the run as it is.
+
+    Args:
+        run: the run.
+        seconds: how long to wait for the processes of its shards to end.
+        report: called while episodes are copied.
+
+    Raises:
+        RecordingError: a recording is damaged; all stay as they are.
+        StorageError: the run's folder cannot be written; all stay as they are.
+    """
+    if not (run.folder / SHARDS_FOLDER).is_dir():
+        return run
+    deadline = time.monotonic() + seconds
+    while not are_over(run_at(run.folder)) and time.monotonic() < deadline:
+        time.sleep(_POLL_SECONDS)
+    with shards_locked(run):
+        run = run_at(run.folder)
+        if not are_over(run):
+            return run
+        with storage_errors(run.folder, "free some disk; `dualtaxi repair` folds its shards in then"):
+            return _fold(run, report)
+
+
+def _fold(run: Run, report: Report) -> Run:
+    fresh = run.folder / f".{RECORDING_FILE}.folding"
+    fresh.unlink(missing_ok=True)
+    summary: Mapping[str, Any] | None = None
+    with ExitStack() as stack:
+        sources = _sources(run, stack)
+        is_folded = bool(sources) and bool(sources[0].recording.shards)
+        if sources and not is_folded:
+            summary = _Fold(run, sources, report).write(fresh)
+    if summary is not None:
+        fresh.replace(run.folder / RECORDING_FILE)
+        status = "interrupted" if run.file.status == "running" else run.file.status
+        run = run.update(status=status, summary={**run.file.summary, **summary})
+    if summary is not None or is_folded:
+        shutil.rmtree(run.folder / SHARDS_FOLDER)
+    return run
+
+
+def _sources(run: Run, stack: ExitStack) -> list[Source]:
+    """Open what each process recorded; leave out those that ended before they recorded anything.
+
+    Raises:
+        RecordingError: one is damaged.
+    """
+    sources: list[Source] = []
+    first = 0
+    for name, part in [("", run), *((shard.run_id, shard) for shard in shards_of(run))]:
+        try:
+            recording = stack.enter_context(open_recording(part.folder / RECORDING_FILE))
+        except RecordingError:
+            if _has_messages(part.folder / RECORDING_FILE):
+                raise
+            continue
+        sources.append(Source(name, recording, len(sources), first, part.facts.get("placed") is True))
+        first += recording.environments
+    return sources
+
+
+def _has_messages(path: Path) -> bool:
+    """Return whether a damaged recording holds any message."""
+    if not path.is_file() or not path.stat().st_size:
+        return False
+    with open_regular(path) as stream:
+        return any(opcode == Opcode.CHUNK for opcode, _, _ in DamagedFile(stream, path).good_records())
+
+
+class _Fold:
+    """Writes the recordings of several processes into one.
+
+    Args:
+        run: the run.
+        sources: of its processes; that which began it comes first, unless it recorded nothing.
+        report: called while episodes are copied.
+    """
+
+    def __init__(self, run: Run, sources: Sequence[Source], report: Report) -> None:
+        self._run, self._sources, self._report = run, sources, report
+        self._first = first = sources[0].recording
+        self._mdp = first.mdp if first.tabular else None
+        self._outcomes = Outcomes(self._mdp)
+        self._units, self._evaluated = self._ordered()
+        self._totals = {phase: sum(source.taken[phase] for source in sources) for phase in PHASES}
+
+    def write(self, fresh: Path) -> dict[str, Any]:
+        """Write the new recording; return the summary of the run."""
+        first, started = self._first, time.monotonic()
+        facts = self._facts()
+        chosen = first.config.get("recording") or {}
+        packing = packing_from({key: chosen[key] for key in PACKING if key in chosen}).packing
+        with create_recording(fresh, schema.KINDS[first.kind]) as file:
+            file.add_metadata("run", facts)
+            for name in first.metadata_names:
+                if name not in _KEPT:
+                    file.add_metadata(name, first.metadata(name))
+            for name, maker in self._own_makers().items():
+                file.add_metadata(f"{SHARD_MAKER}/{name}", maker.to_metadata())
+            for name, media_type, data in first.attachments():
+                file.add_attachment(name, media_type, data)
+            self._recorder = recorder = Recorder(
+                file,
+                learners=len(first.agents),
+                events=int(facts["events"]),
+                packing=packing,
+                sizes=sizes_of(facts, str(fresh)),
+                watch=self._outcomes.take_records,
+            )
+            try:
+                off_table = self._copy_units()
+                with tempfile.TemporaryFile(dir=fresh.parent) as spool:
+                    for topic in first.topics:
+                        self._copy_messages(topic, spool)
+                result = recorder.totals(recorder.drain()) | self._outcomes.summary()
+            except BaseException:
+                recorder.abandon()
+                raise
+            result |= {"episodes": recorder.counts["/train/episode"], "steps_recorded": True}
+            if self._mdp is not None:
+                result["rewards_off_table"] = off_table
+            if error := self._run.file.summary.error:
+                result["error"] = error
+            status = "interrupted" if self._run.file.status == "running" else self._run.file.status
+            write_result(file, status, result)
+            before = self._run.file.summary.seconds or 0.0
+            return result | {"seconds": before + round(time.monotonic() - started, 3), "bytes": file.size}
+
+    def _facts(self) -> dict[str, str]:
+        """Return the metadata record `run`."""
+        shards = [
+            Shard(source.name, source.n, source.recording.status, source.taken["train"], source.taken["eval"])
+            for source in self._sources
+        ]
+        names = {"run_id": self._run.run_id, "name": str(self._run.facts["name"])}
+        seeded = {"seeded": "false"} if not self._run.has_seed else {}
+        run = {key: value for key, value in self._first.run.items() if key != "seeded"}
+        return (
+            run
+            | names
+            | seeded
+            | {"seed": str(self._run.seed), "created": self._run.created_text, "environments": "1"}
+            | {"spaces": self._spaces(), "shards": json.dumps([shard._asdict() for shard in shards])}
+        )
+
+    def _spaces(self) -> str:
+        """Return the description of the spaces, with the widest actions that a process recorded."""
+
+        def width(source: Source) -> int:
+            topic = source.recording.topic("/train/step")
+            dtype = source.recording.dtypes.get(topic)
+            return dtype["action"].itemsize if dtype is not None else 0
+
+        return max(self._sources, key=width).recording.run["spaces"]
+
+    def _own_makers(self) -> dict[str, EnvironmentMaker]:
+        """Return how the environments of shards were made, where it was otherwise than those of the run."""
+        makers = {}
+        for source in self._sources[1:]:
+            maker = source.recording.maker
+            phases = [phase for phase in PHASES if source.stops[phase]]
+            others = [self._first.maker_of(phase) for phase in phases]
+            if maker is not None and any(other is None or not maker.is_like(other) for other in others):
+                makers[source.name] = maker
+        return makers
+
+    # --- the order ------------------------------------------------------------------------------------
+
+    def _ordered(self) -> tuple[NDArray[np.void], NDArray[np.void]]:
+        """Return the units of all processes in the order of the run, and those of evaluations among them."""
+        for source in self._sources:
+            for phase, units in source.units.items():
+                before = units["first"] - units["environment"]
+                others = units["position"] - before
+                if source.stops["train"]:
+                    units["key"] = self._alongside((before if phase == "train" else others) / source.n)
+                else:
+                    units["key"] = others if source.is_placed else self._alongside(before / source.n)
+        every = np.concatenate([units for source in self._sources for units in source.units.values()])
+        names = ("reset", "phase", "steps", "position", "source", "key")
+        columns = [every[name] if name != "steps" else every["steps"] > 0 for name in names]
+        every = every[np.lexsort(columns)]
+        return every, every[every["phase"] == PHASES.index("eval")]
+
+    def _alongside(self, times: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the training steps of the run when every process had stepped its environments so often."""
+        total = np.zeros(len(times))
+        for source in self._sources:
+            if stop := source.stops["train"]:
+                total += np.minimum(times * source.n, stop) * (source.taken["train"] / stop)
+        return total
+
+    def _place(self, source: Source, position: int) -> tuple[float, int]:
+        """Return the key and the position in the run of a position that a process counted."""
+        trained, evaluated = (source.phase_steps(phase, position) for phase in PHASES)
+        if source.stops["train"]:
+            key = float(self._alongside(np.array([trained / source.n]))[0])
+        elif source.is_placed:
+            key = float(position - evaluated)
+        else:
+            key = float(self._alongside(np.array([evaluated / source.n]))[0])
+        return key, min(int(key), self._totals["train"]) + self._evaluated_by(key)
+
+    def _evaluated_by(self, key: float) -> int:
+        """Return the evaluation steps of the run in units up to a key."""
+        count = int(np.searchsorted(self._evaluated["key"], key, side="right"))
+        return int(self._evaluated["steps"][:count].sum())
+
+    # --- steps ----------------------------------------------------------------------------------------
+
+    def _copy_units(self) -> int:
+        """Copy all resets, steps and extras; return how many rewards the environment's table excludes."""
+        recorder, copied = self._recorder, Copied(self._first.kind, self._mdp)
+        kind = CopiedMessages if copied.kind == "variable" else CopiedRows
+        rows = {phase: kind(recorder, copied, phase) for phase in PHASES}
+        extras = _CopiedExtras(recorder, self._sources)
+        active, copied_steps, total = rows["train"], 0, sum(self._totals.values())
+        for unit in self._units:
+            phase, source = PHASES[unit["phase"]], self._sources[unit["source"]]
+            own: Any = rows[phase]
+            if own is not active:
+                active.commit()
+                own.open()
+                active = own
+            unit["new_reset"] = own.resets
+            unit["new_step"] = own.place[0]
+            unit["new_position"] = sum(recorder.steps.values()) + own.filled
+            own.put_reset(source.reset(phase, unit), source.environment + int(unit["environment"]))
+            unit["new_episode"] = own.begun + 1
+            for steps, numbers in source.steps(phase, unit):
+                extras.copy(source, phase, numbers, own.place[0], sum(recorder.steps.values()) + own.filled)
+                own.put(steps)
+                copied_steps += len(numbers)
+                self._report(copied_steps, total)
+        for each in rows.values():
+            each.commit()
+        for source in self._sources:
+            for phase in PHASES:  # the units of each as placed, ordered by environment
+                placed = self._units[
+                    (self._units["source"] == source.number) & (self._units["phase"] == PHASES.index(phase))
+                ]
+                source.units[phase] = placed[np.lexsort((placed["reset"], placed["environment"]))]
+        self._evaluated = self._units[self._units["phase"] == PHASES.index("eval")]
+        return sum(each.off_table for each in rows.values())
+
+    # --- messages -------------------------------------------------------------------------------------
+
+    def _copy_messages(self, topic: Topic, spool: Any) -> None:
+        """Copy the messages of a topic, but those of steps, in the order of the run."""
+        if topic in schema.UNIFORM_TOPICS or topic.name.endswith(("/step", "/reset", "/episode")):
+            return
+        if topic == schema.EXTRA_COLUMNS_TOPIC:
+            return
+        spool.seek(0)
+        places: list[tuple[int, int, int, int]] = []
+        for source in self._sources:
+            if topic not in source.recording.topics:
+                continue
+            for position, payload in self._messages(source, topic):
+                places.append((position, len(places), spool.tell(), len(payload)))
+                spool.write(payload)
+        for position, _, offset, length in sorted(places):
+            spool.seek(offset)
+            self._recorder.append(topic, spool.read(length), position)
+            if topic == schema.SCALAR_TOPIC:
+                spool.seek(offset)
+                fields = decode(schema.SCALAR, spool.read(length))
+                self._outcomes.take_logged(fields["name"], fields["value"])
+
+    def _messages(self, source: Source, topic: Topic) -> Iterator[tuple[int, bytes]]:
+        """Yield position and payload in the run of a process's messages of a topic."""
+        phase = topic.phase
+        if topic.message == schema.RESET_STATE:
+            for state in source.recording.reset_states(phase):
+                found = source.units[phase][source.units[phase]["reset"] == state.reset]
+                for unit in found:
+                    environment = source.environment + state.environment
+                    moved = state._replace(reset=int(unit["new_reset"]), environment=environment)
+                    yield int(unit["new_position"]), moved.to_payload()
+            return
+        for fields in source.recording.decoded(topic):
+            position = int(fields.pop("log_time")) // STEP_NANOSECONDS
+            if topic.message == schema.INFO:
+                yield from self._info(source, phase, fields)
+            elif topic.message == schema.IMAGE:
+                yield self._frame(source, phase, position, fields)
+            else:
+                yield from self._moment(source, topic, position, fields)
+
+    def _info(self, source: Source, phase: str, fields: dict[str, Any]) -> Iterator[tuple[int, bytes]]:
+        if not fields["reset"]:
+            if fields["step"] < source.stops[phase]:
+                step, position = source.step_place(phase, fields["step"])
+                yield position, encode(schema.INFO, fields | {"step": step})
+            return
+        for unit in source.resets_at(phase, fields["step"]):
+            own = fields | {"step": int(unit["new_step"])}
+            yield int(unit["new_position"]), encode(schema.INFO, own)
+
+    def _frame(self, source: Source, phase: str, position: int, fields: dict[str, Any]) -> tuple[int, bytes]:
+        environment, is_reset = frame_place(fields)
+        step = source.phase_steps(phase, position)
+        if is_reset:
+            place = int(source.unit_begun(phase, environment, step)["new_position"])
+        else:
+            _, place = source.step_place(phase, max(step - source.n, 0) + environment)
+        return place, encode_image(fields["data"], fields["format"], place, frame_id(phase, None, is_reset))
+
+    def _moment(
+        self, source: Source, topic: Topic, position: int, fields: dict[str, Any]
+    ) -> Iterator[tuple[int, bytes]]:
+        """Yield a message that belongs to a moment: a logged number, a text, an array, a checkpoint."""
+        key, place = self._place(source, position)
+        if topic.message == schema.LOG:
+            level = schema.LOG_LEVELS[fields["level"]]
+            seconds = place * STEP_NANOSECONDS / 1e9
+            yield place, encode_log(fields["message"], seconds, level, fields["name"])
+        elif {"phase", "step", "episode"} <= fields.keys():
+            units = self._units[self._units["phase"] == PHASES.index(fields["phase"])]
+            at = int(np.searchsorted(units["key"], key, side="right")) - 1
+            fields["step"] = place - self._evaluated_by(key)
+            if fields["phase"] == "eval":
+                fields["step"] = self._evaluated_by(key)
+            fields["episode"] = max(int(units["new_episode"][at]), 0) if at >= 0 else 0
+            yield place, encode(topic.message, fields)
+        elif source.number == 0:  # of a process, such as what it printed: that of the first stands for all
+            yield place, encode(topic.message, fields)
+
+
+class _CopiedExtras:
+    """The extras of all processes, with the names of all of them."""
+
+    def __init__(self, recorder: Recorder, sources: Sequence[Source]) -> None:
+        self._recorder = recorder
+        self._own = {
+            (source.number, phase): source.recording.extras(phase) for source in sources for phase in PHASES
+        }
+        dtypes: dict[str, np.dtype[Any]] = {}
+        for own in self._own.values():
+            for name, dtype in own.items():
+                before = dtypes.get(name, dtype)
+                if before.shape != dtype.shape:
+                    raise ConfigError(
+                        f"extras: found {name!r} of shape {dtype.shape} and {before.shape} in the shards of "
+                        "one run, expected the same shape in all"
+                    )
+                dtypes[name] = np.dtype((np.promote_types(before.base, dtype.base), dtype.shape))
+        self._layout = ExtraLayout(0, np.dtype(list(dtypes.items())))
+        if len(dtypes) > MAX_NAMES or self._layout.values.itemsize > MAX_EXTRA_BYTES:
+            raise ConfigError(
+                f"extras: found {len(dtypes)} names and {self._layout.values.itemsize:,} bytes a step in all "
+                f"shards, expected at most {MAX_NAMES} and {MAX_EXTRA_BYTES:,}"
+            )
+        self._is_described = False
+
+    def copy(
+        self, source: Source, phase: str, numbers: NDArray[np.int64], new_step: int, new_position: int
+    ) -> None:
+        """Copy the extras of some steps, which follow each other in the run.
+
+        Args:
+            source: of the process.
+            phase: `train` or `eval`.
+            numbers: of the steps, as their process counted them.
+            new_step: the number of the first step in the run.
+            new_position: the steps of the run before it.
+        """
+        own = self._own[source.number, phase]
+        if not own:
+            return
+        values = own.at(numbers)
+        given = {
+            name: ~np.ma.getmaskarray(each).reshape(len(numbers), -1)[:, 0] for name, each in values.items()
+        }
+        rows = np.flatnonzero(np.logical_or.reduce(list(given.values())))
+        if not len(rows):
+            return
+        if not self._is_described:
+            payload = encode(schema.EXTRA_COLUMNS, {"json": self._layout.json})
+            self._recorder.append(schema.EXTRA_COLUMNS_TOPIC, payload, new_position + int(rows[0]) + 1)
+            self._recorder.flush_messages()
+            topics = (schema.TRAIN_EXTRA, schema.EVAL_EXTRA)
+            self._recorder.resize(dict.fromkeys(topics, self._layout.sizes))
+            self._is_described = True
+        topic = schema.TRAIN_EXTRA if phase == "train" else schema.EVAL_EXTRA
+        while len(rows):
+            block = self._recorder.block(topic)[: len(rows)]
+            part, rows = rows[: len(block)], rows[len(block) :]
+            block["step"] = new_step + part
+            for name in self._layout.names:
+                block["given"][name] = given[name][part] if name in given else False
+                block["values"][name] = values[name].data[part] if name in given else 0
+            self._recorder.take(topic, (new_position + part + 1).astype(np.uint64))

@@ -1,0 +1,184 @@
+"""The processes of a run as it is folded: what each recorded, in units that begin with a reset.
+
+A unit is a reset of one environment, and the steps that it took up to its next reset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.recording import schema
+from runner.recording.reader import Recording
+from runner.recording.schema import STEP_NANOSECONDS
+
+PHASES: Final = tuple(schema.PHASES)
+UNIT: Final = np.dtype(
+    [
+        ("key", "f8"),
+        ("source", "i8"),
+        ("position", "i8"),
+        ("phase", "i8"),
+        ("environment", "i8"),
+        ("reset", "i8"),
+        ("first", "i8"),
+        ("stop", "i8"),
+        ("steps", "i8"),
+        ("new_step", "i8"),
+        ("new_position", "i8"),
+        ("new_episode", "i8"),
+        ("new_reset", "i8"),
+    ]
+)
+"""A unit: `key` is how many training steps of the whole run it comes after; `position`, `reset`, `first` and
+`stop` (steps of the phase) are as its process counted them, `steps` those that it took; the `new_` ones are
+its numbers in the run."""
+_RESET: Final = ("reset", "step", "environment", "log_time")
+
+
+class Source:
+    """What one process recorded.
+
+    Args:
+        name: of the shard; empty for the process that began the run.
+        recording: of a loop.
+        number: its place among the processes of the run.
+        environment: the number of its first environment among those of the run.
+        is_placed: whether its process stated after how many training steps of the run it recorded.
+    """
+
+    def __init__(
+        self, name: str, recording: Recording, number: int, environment: int, is_placed: bool
+    ) -> None:
+        self.name, self.recording, self.number, self.environment = name, recording, number, environment
+        self.is_placed = is_placed
+        self.n = recording.environments
+        self.stops = {phase: recording.whole_steps(phase) for phase in PHASES}
+        """Steps of each phase."""
+        self.only_resets = {phase: self._only_resets(phase) for phase in PHASES}
+        """The numbers of those at which an environment was only reset."""
+        self.taken = {phase: self.stops[phase] - len(self.only_resets[phase]) for phase in PHASES}
+        self.units = {phase: self._units(phase) for phase in PHASES}
+        self._messages: dict[str, Iterator[Any]] = {}
+        self.times = {phase: self._times(phase) for phase in PHASES}
+        """`log_time` of each step where values vary in size; else empty."""
+
+    def _topic(self, phase: str, name: str) -> schema.Topic:
+        return self.recording.topic(f"/{phase}/{name}")
+
+    @property
+    def _is_fixed(self) -> bool:
+        return self.recording.kind != "variable"
+
+    def _only_resets(self, phase: str) -> NDArray[np.int64]:
+        if self.n == 1:
+            return np.empty(0, np.int64)
+        blocks = self.recording.blocks(self._topic(phase, "step"), 0, self.stops[phase])
+        found = [block["step"][block["t"] == schema.RESET_ONLY] for block in blocks]
+        return np.concatenate([np.empty(0, np.int64), *found])
+
+    def _times(self, phase: str) -> NDArray[np.int64]:
+        if self._is_fixed:
+            return np.empty(0, np.int64)
+        steps = self.recording.decoded(self._topic(phase, "step"))
+        return np.array([step["log_time"] for step in steps], np.int64)[: self.stops[phase]]
+
+    def _units(self, phase: str) -> NDArray[np.void]:
+        """Return the units of a phase, ordered by environment, without key and new numbers."""
+        topic, stop = self._topic(phase, "reset"), self.stops[phase]
+        if self._is_fixed:
+            dtype = np.dtype([(name, "i8") for name in _RESET])
+            parts = [np.empty(0, dtype)]
+            for block in self.recording.blocks(topic):
+                part = np.empty(len(block), dtype)
+                for name in _RESET:
+                    part[name] = block[name]
+                parts.append(part)
+            resets = np.concatenate(parts)
+        else:
+            rows = [tuple(each[name] for name in _RESET) for each in self.recording.decoded(topic)]
+            resets = np.array(rows, [(name, "i8") for name in _RESET])
+        resets = resets[(resets["step"] <= stop) & (resets["environment"] < self.n)]
+        resets = resets[np.lexsort((resets["reset"], resets["environment"]))]
+        units = np.zeros(len(resets), UNIT)
+        units["source"], units["phase"] = self.number, PHASES.index(phase)
+        units["position"] = resets["log_time"] // STEP_NANOSECONDS
+        units["reset"], units["environment"] = resets["reset"], resets["environment"]
+        units["first"] = resets["step"] + resets["environment"]
+        units["stop"] = stop + resets["environment"]
+        same = units["environment"][1:] == units["environment"][:-1]
+        units["stop"][:-1][same] = units["first"][1:][same]
+        units["steps"] = (units["stop"] - units["first"]) // self.n
+        units["steps"] -= np.isin(units["first"], self.only_resets[phase]) & (units["steps"] > 0)
+        return units
+
+    def phase_steps(self, phase: str, position: int) -> int:
+        """Return the steps of a phase that were taken by a position, as its process counted it."""
+        other = next(each for each in PHASES if each != phase)
+        if not self.stops[phase]:
+            return 0
+        if not self.stops[other] and not self.is_placed:
+            return min(position, self.stops[phase])
+        time = position * STEP_NANOSECONDS + 1
+        if not self._is_fixed:
+            return int(np.searchsorted(self.times[phase], time))
+        found = self.recording.first_from(self._topic(phase, "step"), "log_time", time)
+        return min(found, self.stops[phase])
+
+    # --- what a unit holds, read in the order of the run ----------------------------------------------
+
+    def reset(self, phase: str, unit: Any) -> Any:
+        """Return the reset of a unit."""
+        topic, number = self._topic(phase, "reset"), int(unit["reset"])
+        if self._is_fixed:
+            return next(self.recording.blocks(topic, number, number + 1))[0]
+        return next(self._stream(f"/{phase}/reset"))
+
+    def steps(self, phase: str, unit: Any) -> Iterator[tuple[Any, NDArray[np.int64]]]:
+        """Yield the steps of a unit in pieces, with their numbers in the phase of its process."""
+        first, stop = int(unit["first"]), int(unit["stop"])
+        if not self._is_fixed:
+            stream = self._stream(f"/{phase}/step")
+            for begin in range(first, stop, 1024):
+                numbers = np.arange(begin, min(begin + 1024, stop))
+                yield [next(stream) for _ in numbers], numbers
+            return
+        for block in self.recording.blocks(self._topic(phase, "step"), first, stop):
+            rows = block[(first - int(block["step"][0])) % self.n :: self.n]
+            rows = rows[rows["t"] != schema.RESET_ONLY] if self.n > 1 else rows
+            if len(rows):
+                yield rows, rows["step"].astype(np.int64)
+
+    def _stream(self, name: str) -> Iterator[Any]:
+        """Return the messages of a topic of varying size; units of one environment come in their order."""
+        if name not in self._messages:
+            self._messages[name] = self.recording.decoded(self.recording.topic(name))
+        return self._messages[name]
+
+    # --- where messages go ----------------------------------------------------------------------------
+
+    def step_place(self, phase: str, step: int) -> tuple[int, int]:
+        """Return number and position in the run of a step, by its number in the phase of its process."""
+        unit = self._unit(phase, step % self.n, step)
+        is_only_reset = bool(np.isin(unit["first"], self.only_resets[phase]))
+        offset = (step - int(unit["first"])) // self.n - is_only_reset
+        offset = min(max(offset, 0), max(int(unit["steps"]) - 1, 0))
+        return int(unit["new_step"]) + offset, int(unit["new_position"]) + offset + 1
+
+    def resets_at(self, phase: str, step: int) -> Sequence[Any]:
+        """Return the units whose resets came after so many steps of a phase."""
+        units = self.units[phase]
+        return list(units[units["first"] - units["environment"] == step])
+
+    def unit_begun(self, phase: str, environment: int, step: int) -> Any:
+        """Return the last unit of an environment that had begun by a step."""
+        return self._unit(phase, environment, step + environment)
+
+    def _unit(self, phase: str, environment: int, step: int) -> Any:
+        units = self.units[phase]
+        low, high = np.searchsorted(units["environment"], [environment, environment + 1])
+        at = int(np.searchsorted(units["first"][low:high], step, side="right"))
+        return units[low + max(at - 1, 0)]

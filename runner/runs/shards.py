@@ -1,0 +1,132 @@
+"""The shards of a run: what processes that joined it record, until it is over and they are folded into it.
+
+    recordings/k3v9m2xq/shards/worker-1/run.json, recording.mcap
+
+A shard is laid out as a run. Its name determines its place in the run, not the time at which it began.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import multiprocessing
+import os
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from runner.errors import ConfigError, RunnerError, RunNotFound
+from runner.runs.listing import run_at, run_entries, run_in
+from runner.runs.resolve import find_run
+from runner.runs.run import Run, new_run
+from runner.util.files import storage_errors
+
+SHARDS_FOLDER: Final = "shards"
+RUN_VARIABLE: Final = "DUALTAXI_RUN"
+"""The folder of the run that this process recorded last, which its child processes can join."""
+_NAME: Final = re.compile(r"[\w.-]{1,80}")
+_LOCK: Final = "shards.lock"
+
+
+def find_joined(join: object, recordings: str | os.PathLike[str] | None) -> Run:
+    """Return the run that a process wants to join, which is running.
+
+    Args:
+        join: a run, or its id, the beginning of its id, its name or the path of its folder; True for the one
+            in $DUALTAXI_RUN.
+        recordings: the recordings folder.
+
+    Raises:
+        ConfigError: `join` is something else, or True without the variable.
+        RunNotFound: there is no such run.
+        RunnerError: it is over, or a job.
+    """
+    if join is True:
+        join = os.environ.get(RUN_VARIABLE, "")
+        if not join:
+            raise ConfigError(
+                f"join=True: found no {RUN_VARIABLE} in the environment, expected a process that was started "
+                "by the one that records the run. Pass the run's id or folder: join=run.folder."
+            )
+    if isinstance(join, Run):
+        run = run_at(join.folder)
+    elif isinstance(join, str | os.PathLike) and os.fspath(join):
+        run = find_run(os.fspath(join), recordings)
+    else:
+        raise ConfigError(f"join: found {join!r}, expected a run, its id or its folder, or True")
+    _require_open(run)
+    return run
+
+
+def _require_open(run: Run) -> None:
+    if "made_by" not in run.file.config:
+        raise RunnerError(
+            f"join: run {run.run_id} is a job, which the runner trains; expected one of runner.record."
+        )
+    if run.status != "running":
+        raise RunnerError(
+            f"join: run {run.run_id} is {run.status}, expected one that is still being recorded. "
+            "Processes join while the process that began the run has it open."
+        )
+
+
+def new_shard(joined: Run, name: str | None, config: Mapping[str, Any], seed: int | None, **more: Any) -> Run:
+    """Create the folder of a new shard; where the name is taken, `-2`, `-3` ... is added.
+
+    Args:
+        joined: the run, as `find_joined` returned it.
+        name: of letters, digits and `_.-`; that of the process in `multiprocessing` by default.
+        config: the configuration that its recording carries.
+        seed: its seed.
+        more: further facts for its `run.json`.
+
+    Raises:
+        ConfigError: the name is not valid.
+        RunnerError: the run is over by now.
+        StorageError: the run's folder cannot be written.
+    """
+    if name is None:
+        process = multiprocessing.current_process().name
+        name = re.sub(r"[^\w.-]+", "-", process).strip("-.")[:60] or "process"
+    if not isinstance(name, str) or not _NAME.fullmatch(name) or not name.strip("."):
+        raise ConfigError(f"shard: found {name!r}, expected 1 to 80 letters, digits, _, . and -")
+    names = itertools.chain([name], (f"{name}-{n}" for n in itertools.count(2)))
+    with shards_locked(joined):
+        _require_open(run_at(joined.folder))
+        return new_run(joined.folder / SHARDS_FOLDER, config, seed, name, ids=names, **more)
+
+
+def shards_of(run: Run) -> list[Run]:
+    """Return the shards of a run that are not folded into it yet, ordered by name, w2 before w10."""
+    folder = run.folder / SHARDS_FOLDER
+    if run.stands_alone or not folder.is_dir():
+        return []
+    found = (run_in(folder / entry) for entry in run_entries(folder))
+    return sorted((shard for shard in found if shard is not None), key=lambda shard: _order(shard.run_id))
+
+
+def _order(name: str) -> list[tuple[int, str]]:
+    """Return a sort key by which w2 comes before w10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def are_over(run: Run) -> bool:
+    """Return whether no process records into a run or its shards any more."""
+    return run.status != "running" and all(shard.status != "running" for shard in shards_of(run))
+
+
+@contextlib.contextmanager
+def shards_locked(run: Run) -> Iterator[None]:
+    """Keep other processes from joining a run, and from folding its shards, while the block runs.
+
+    Raises:
+        RunNotFound: the run is gone.
+        StorageError: its folder cannot be written.
+    """
+    from filelock import FileLock
+
+    if not Path(run.folder).is_dir():
+        raise RunNotFound(f"run {run.run_id} was removed just now.")
+    with storage_errors(run.folder), FileLock(run.folder / _LOCK):
+        yield
