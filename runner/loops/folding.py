@@ -138,6 +138,9 @@ class _Fold:
         self._mdp = first.mdp if first.tabular else None
         self._outcomes = Outcomes(self._mdp)
         self._units, self._evaluated = self._ordered()
+        leads = sources[0].is_placed or any(sources[0].taken.values())
+        self._main = sources[0] if leads else max(sources, key=lambda source: sum(source.taken.values()))
+        """The process whose clock becomes that of the run."""
         self._totals = {phase: sum(source.taken[phase] for source in sources) for phase in PHASES}
 
     def write(self, fresh: Path) -> dict[str, Any]:
@@ -379,7 +382,7 @@ class _Fold:
                 fields["step"] = self._evaluated_by(key)
             fields["episode"] = max(int(units["new_episode"][at]), 0) if at >= 0 else 0
             yield place, encode(topic.message, fields)
-        elif source.number == 0:  # of a process, such as what it printed: that of the first stands for all
+        elif source is self._main:  # of a process, such as its clock
             yield place, encode(topic.message, fields)
 
 

@@ -111,7 +111,7 @@ class Recorder:
             for topic, own in sizes.items()
         }
         self.steps = {"train": 0, "eval": 0, "elsewhere": 0}
-        """Steps committed so far, by phase; and those of other processes of the run, where they are stated."""
+        """Steps committed so far, by phase; and training steps of other processes, where they are stated."""
         self.counts = {topic.name: 0 for topic in schema.ALL_TOPICS}
         """Messages committed so far, by topic."""
         self._last_flush = time.monotonic()

@@ -32,8 +32,8 @@ def why_not_redone(recording: Recording, trust: bool = False) -> str:
         for maker in (recording.maker_of(phase, first) for phase in phases):
             if maker is not None and is_whole_vector(maker):
                 return (
-                    "A process stepped a vector that cannot be taken apart; as several processes recorded the "
-                    "run, its environments are recorded one by one."
+                    "A process stepped a vector that cannot be taken apart. As several processes recorded "
+                    "the run, its environments are recorded one by one."
                 )
             reason = reason or why_not_made(maker, trust)
         first += shard.environments
