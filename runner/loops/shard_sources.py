@@ -169,7 +169,7 @@ class Source:
         return int(unit["new_step"]) + offset, int(unit["new_position"]) + offset + 1
 
     def resets_at(self, phase: str, step: int) -> Sequence[Any]:
-        """Return the units whose resets came after so many steps of a phase."""
+        """Return the units that began after this number of steps of a phase."""
         units = self.units[phase]
         return list(units[units["first"] - units["environment"] == step])
 
