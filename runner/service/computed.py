@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import json
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis import diff as differences
+from runner.analysis.axes import AXES, EPISODES, Axis, axes_of, axis_of
 from runner.analysis.compare import compare
 from runner.analysis.compare.moments import moment_of
 from runner.analysis.compare.statistics import require_scipy
@@ -24,11 +26,11 @@ from runner.analysis.evaluations import evaluation_records, training_records
 from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.analysis.groups import grouped, groups_of, metrics_of, require_two
 from runner.analysis.qtable import describe_tables, one_array, replay_at
-from runner.analysis.series import RunSeries, parse_target, read_series, title_of
+from runner.analysis.series import RunSeries, parse_target, read_series
 from runner.errors import RunnerError
 from runner.export.plots.curves import curves_sheet
 from runner.export.plots.image import check_suffix, save
-from runner.export.plots.metrics import panels_of
+from runner.export.plots.metrics import Curve, NoMetrics, Panel, panels_of
 from runner.export.rerun.cache import cached_export
 from runner.export.rerun.selection import Request
 from runner.export.rerun.viewer import require_rerun
@@ -41,37 +43,80 @@ from runner.util.values import finite
 RecordKind = Literal["evaluations", "training", "optimality"]
 
 
-def curves(path: Path, metrics: Sequence[str], start: int, stop: int | None, points: int) -> bytes:
-    """Return the metrics of a run over training episodes, as JSON.
+def curves(
+    paths: Sequence[Path],
+    axis: str = EPISODES.name,
+    metrics: Sequence[str] = (),
+    start: float = 0,
+    stop: float | None = None,
+    points: int = 0,
+    lines: bool = False,
+) -> bytes:
+    """Return the metrics of runs over an axis as JSON, runs that differ only in the seed as one curve.
 
     Args:
-        path: its recording.
+        paths: their recordings.
+        axis: the name of the axis.
         metrics: their names; all if there are none.
-        start: the first training episode.
+        start: the first position.
         stop: the first one not included; None for all.
         points: the maximum of a curve; longer ones are thinned. 0 for no limit.
+        lines: whether to include the single runs of a curve.
+
+    Raises:
+        RecordingError: a recording cannot be read, or does not have the axis.
+        RunnerError: there is no such axis.
     """
-    with open_recording(path) as recording:
-        series = read_series(recording)
-    found = []
-    for (metric, line), (episodes, values) in _points_by_curve(series).items():
-        if metrics and metric not in metrics:
-            continue
-        inside = (episodes >= start) & (episodes < (math.inf if stop is None else stop))
-        chosen = np.flatnonzero(inside)[thinned(values[inside], points)]
-        title, unit = title_of(metric)
-        curve = {
-            "metric": metric,
-            "line": line,
-            "title": title,
-            "unit": unit,
-            "episodes": episodes[chosen].tolist(),
-            "values": values[chosen].tolist(),
-            "of": int(inside.sum()),
-            "thinned": bool(len(chosen) < inside.sum()),
+    series, common = [], list(AXES.values())
+    for path in paths:
+        with open_recording(path) as recording:
+            series.append(read_series(recording, axis_of(axis)))
+            own = axes_of(recording)
+            common = [each for each in common if each in own]
+    groups = groups_of(series)
+    shown: list[dict[str, Any]] = []
+    with contextlib.suppress(NoMetrics):
+        for panel in panels_of(groups):
+            if not metrics or panel.metric in metrics:
+                shown += [_shown_curve(panel, curve, start, stop, points, lines) for curve in panel.curves]
+    return as_json(
+        {
+            "axis": axis,
+            "axes": [{"name": each.name, "title": each.title, "label": each.label} for each in common],
+            "groups": [
+                {"runs": [run.run_id for run in group.runs], "left_out": list(group.left_out)}
+                for group in groups
+            ],
+            "curves": shown,
         }
-        found.append(curve)
-    return as_json({"run_id": series.run_id, "curves": found})
+    )
+
+
+def run_curves(path: Path, *options: Any) -> bytes:
+    """Return the metrics of one run; options as for `curves`."""
+    return curves([path], *options)
+
+
+def _shown_curve(
+    panel: Panel, curve: Curve, start: float, stop: float | None, points: int, lines: bool
+) -> dict[str, Any]:
+    inside = np.flatnonzero((curve.places >= start) & (curve.places < (math.inf if stop is None else stop)))
+    chosen = inside[thinned(curve.middle[inside], points)]
+    has_band = len(curve.runs) > 1
+    return {
+        "metric": panel.metric,
+        "line": curve.line,
+        "group": curve.group,
+        "title": panel.title,
+        "unit": panel.unit,
+        "positions": curve.places[chosen].tolist(),
+        "values": curve.middle[chosen].tolist(),
+        "low": curve.low[chosen].tolist() if has_band else None,
+        "high": curve.high[chosen].tolist() if has_band else None,
+        "runs": curve.runs[:, chosen].tolist() if has_band and lines else [],
+        "of": len(inside),
+        "thinned": len(chosen) < len(inside),
+    }
 
 
 def records(path: Path, kind: RecordKind, start: int, stop: int, limit: int) -> bytes:
@@ -102,19 +147,6 @@ def too_many(found: int, limit: int) -> Refused:
         HTTPStatus.UNPROCESSABLE_ENTITY,
         f"query: found a range of {found:,} records, expected at most {limit:,}; request them in parts.",
     )
-
-
-def _points_by_curve(
-    series: RunSeries,
-) -> dict[tuple[str, str], tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return the episodes and values of each curve, by metric and line."""
-    curves: dict[tuple[str, str], dict[float, float]] = {}
-    for episode, readings in (*series.training, *series.evaluation):
-        for metric, lines in readings.items():
-            for line, value in lines.items():
-                curves.setdefault((metric, line), {})[episode] = value
-    ordered = {key: np.array(sorted(points.items()), np.float64) for key, points in curves.items()}
-    return {key: (points[:, 0], points[:, 1]) for key, points in ordered.items()}
 
 
 def thinned(values: NDArray[np.float64], points: int) -> NDArray[np.intp]:
@@ -205,7 +237,12 @@ def difference(a: Run, b: Run, ignore: Sequence[str], first: bool, targets: Sequ
 
 
 def comparison(
-    paths: Sequence[Path], by: str | None, metrics: Sequence[str], moment: str, target: str | None
+    paths: Sequence[Path],
+    by: str | None,
+    metrics: Sequence[str],
+    moment: str,
+    target: str | None,
+    axis: str = EPISODES.name,
 ) -> bytes:
     """Return a comparison of groups of runs, as `dualtaxi compare --json` prints it.
 
@@ -214,8 +251,9 @@ def comparison(
         RunnerError: there is nothing to compare.
     """
     require_scipy()
-    chosen, names = moment_of(moment, parse_target(target) if target else None, metrics)
-    groups, notes = grouped(_series(paths), by)
+    over = axis_of(axis)
+    chosen, names = moment_of(moment, parse_target(target) if target else None, metrics, over)
+    groups, notes = grouped(_series(paths, over), by)
     require_two(groups, by)
     return as_json(dataclasses.asdict(compare(groups, metrics_of(groups, names), chosen, notes)))
 
@@ -237,11 +275,11 @@ def as_json(value: Any) -> bytes:
     return json.dumps(finite(value), allow_nan=False, ensure_ascii=False).encode(errors="replace")
 
 
-def _series(paths: Sequence[Path]) -> list[RunSeries]:
+def _series(paths: Sequence[Path], axis: Axis = EPISODES) -> list[RunSeries]:
     found = []
     for path in paths:
         with open_recording(path) as recording:
-            found.append(read_series(recording))
+            found.append(read_series(recording, axis))
     if not found:
         raise RunnerError("found no run, expected at least one.")
     return found

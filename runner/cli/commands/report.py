@@ -31,10 +31,12 @@ if TYPE_CHECKING:
 @click.command("plot", cls=Command)
 @runs_argument
 @axis_option
+@click.option("--lines", is_flag=True, help="Draw each run as a thin line too.")
 @writing_options(EXPORTS / "plot.png", "FILE.png|svg|pdf")
 def plot_command(
     run_names: tuple[str, ...],
     axis: Axis,
+    lines: bool,
     output: Path,
     force: bool,
     recordings: Path | None,
@@ -42,9 +44,9 @@ def plot_command(
 ) -> None:
     """Draw every metric of one or several runs over an axis, in one figure; or a sweep.
 
-    Runs that differ in nothing but the seed are drawn as one line, their median, with a band from the lowest
-    to the highest; a run that was recorded twice counts once, with a message. A name shared by several runs
-    stands for all of them.
+    Runs that differ in nothing but the seed are drawn as one line, their interquartile mean, with its 95 %
+    interval as a band; below four runs, their mean and range. A run that was recorded twice counts once, with
+    a message. A name shared by several runs stands for all of them.
 
     Of a sweep, given by its name, the objective is drawn against each parameter and in parallel coordinates,
     and over episodes for the best and the median trial.
@@ -67,6 +69,8 @@ def plot_command(
     folder = recordings_folder(recordings)
     if is_sweep(run_names, folder):
         _refuse_axis(axis)
+        if lines:
+            raise click.UsageError("--lines: found a sweep, expected runs.")
         _plot_sweep(run_names[0], folder, output, force, as_json)
         return
     series = []
@@ -85,7 +89,7 @@ def plot_command(
         say(sentence)
     panels = panels_of(groups)
     with stage_line("drawing"):
-        write_new(output, force, lambda path: save(curves_sheet(groups, panels), path))
+        write_new(output, force, lambda path: save(curves_sheet(groups, panels, lines), path))
     count = sum(len(group.runs) for group in groups)
     text = f"{output}: {len(panels)} metrics of {_runs(count)}"
     print_written(text, as_json, output, metrics=len(panels), runs=count)

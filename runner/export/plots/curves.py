@@ -18,7 +18,6 @@ from runner.analysis.groups import Group
 from runner.analysis.series import values_left_out
 from runner.drawing import palette
 from runner.environments.naming import spoken
-from runner.errors import RunnerError
 from runner.export.plots.chart import (
     SMALL,
     Canvas,
@@ -28,7 +27,7 @@ from runner.export.plots.chart import (
     series_colour,
     series_marker,
 )
-from runner.export.plots.metrics import Curve, Panel, panels_of
+from runner.export.plots.metrics import Curve, NoMetrics, Panel, panels_of
 from runner.recording.metrics import SHARES
 
 WIDTH: Final = 288.0
@@ -54,7 +53,7 @@ def plots_of(groups: Sequence[Group]) -> list[Plot]:
     """Return the learning curves of groups of runs for a page; none where no run has a metric."""
     try:
         panels = panels_of(groups)
-    except RunnerError:
+    except NoMetrics:
         return []
     return panel_plots(panels, len(groups))
 
@@ -64,8 +63,14 @@ def panel_plots(panels: Sequence[Panel], groups: int) -> list[Plot]:
     return [Plot(panel.title, panel_chart(panel, groups).svg(), panel.metric == SHARES) for panel in panels]
 
 
-def curves_sheet(groups: Sequence[Group], panels: Sequence[Panel]) -> Canvas:
-    """Return all panels on one sheet, with a legend of the groups above and notes below."""
+def curves_sheet(groups: Sequence[Group], panels: Sequence[Panel], single_runs: bool = False) -> Canvas:
+    """Return all panels on one sheet, with a legend of the groups above and notes below.
+
+    Args:
+        groups: of runs.
+        panels: of these groups.
+        single_runs: whether to draw each run as a thin line too.
+    """
     columns = min(3, len(panels))
     narrow = [panel for panel in panels if panel.metric != SHARES]
     wide = [panel for panel in panels if panel.metric == SHARES]
@@ -84,7 +89,7 @@ def curves_sheet(groups: Sequence[Group], panels: Sequence[Panel]) -> Canvas:
         sheet.text(42, y, group.described)
     for number, panel in enumerate(narrow):
         row, column = divmod(number, columns)
-        sheet.place(panel_chart(panel, len(groups)), WIDTH * column, head + HEIGHT * row)
+        sheet.place(panel_chart(panel, len(groups), single_runs), WIDTH * column, head + HEIGHT * row)
     for number, panel in enumerate(wide):
         sheet.place(panel_chart(panel, len(groups)), 0, head + HEIGHT * (rows - len(wide) + number))
     for number, line in enumerate(notes):
@@ -103,17 +108,18 @@ def footnote(groups: Sequence[Group]) -> str:
         return f"Each line is one run, as reported.{greedy}{left_out}"
     between = " Between its points a run is interpolated." if interpolated else ""
     return (
-        "Lines: median over the runs of a configuration that have come as far; bands: from the lowest run to "
-        f"the highest.{between}{greedy}{left_out}"
+        "Lines: interquartile mean of the runs of a configuration that have come as far; bands: its 95 % "
+        "bootstrap interval; below four runs, their mean, and from the lowest to the highest."
+        f"{between}{greedy}{left_out}"
     )
 
 
-def panel_chart(panel: Panel, groups: int) -> Chart:
+def panel_chart(panel: Panel, groups: int, single_runs: bool = False) -> Chart:
     """Return the chart of a metric: curves of groups of runs over their axis."""
     is_shares = panel.metric == SHARES
     last = max(float(curve.places.max()) for curve in panel.curves) or 1.0
     x = Scale(0.0, last * 1.02, 50.0, 461.0 if is_shares else 280.0)
-    y = _y_scale(panel)
+    y = _y_scale(panel, single_runs)
     width = 2 * WIDTH if is_shares else WIDTH
     chart = Chart(x, y, width, HEIGHT, f"{panel.title} over {panel.axis.title}")
     has_legend = len(panel.lines) > 1 and not is_shares
@@ -129,7 +135,7 @@ def panel_chart(panel: Panel, groups: int) -> Chart:
     if not panel.percent and not panel.at_least_zero:
         chart.shape([(x.start, y.at(0)), (x.end, y.at(0))], stroke=palette.INK, width=0.6)
     for curve in panel.curves:
-        _draw_curve(chart, panel, curve, groups)
+        _draw_curve(chart, panel, curve, groups, single_runs)
     if has_legend:
         colours = [series_colour(i) if groups == 1 else palette.INK for i in range(len(panel.lines))]
         draw_legend(chart, [spoken(line) or "all" for line in panel.lines], colours)
@@ -145,9 +151,12 @@ def draw_legend(chart: Chart, names: Sequence[str], colours: Sequence[str]) -> N
         at += 32 + len(name) * SMALL * _LETTER
 
 
-def _y_scale(panel: Panel) -> Scale:
-    low = min(float(curve.low.min()) for curve in panel.curves)
-    high = max(float(curve.high.max()) for curve in panel.curves)
+def _y_scale(panel: Panel, single_runs: bool) -> Scale:
+    drawn = [
+        np.vstack([curve.low, curve.high, *(curve.runs if single_runs else ())]) for curve in panel.curves
+    ]
+    low = min(float(np.nanmin(values)) for values in drawn)
+    high = max(float(np.nanmax(values)) for values in drawn)
     if panel.percent:
         low, high = 0.0, 100.0 if panel.metric == SHARES else 103.0
     elif panel.at_least_zero:
@@ -158,24 +167,27 @@ def _y_scale(panel: Panel) -> Scale:
     return Scale(low, high, _BOTTOM, _TOP)
 
 
-def _draw_curve(chart: Chart, panel: Panel, curve: Curve, groups: int) -> None:
+def _draw_curve(chart: Chart, panel: Panel, curve: Curve, groups: int, single_runs: bool) -> None:
     line = panel.lines.index(curve.line)
     number = line if groups == 1 and len(panel.lines) > 1 else curve.group
     colour = series_colour(number)
     if (curve.high > curve.low).any():
         chart.band(curve.places, curve.low, curve.high, colour, opacity=0.2)
-    chart.line(curve.places, curve.median, colour, line)
+    for run in curve.runs if single_runs and len(curve.runs) > 1 else ():
+        known = ~np.isnan(run)
+        chart.line(curve.places[known], run[known], colour, line, width=0.6, opacity=0.5)
+    chart.line(curve.places, curve.middle, colour, line)
     every = slice(None, None, max(len(curve.places) // 8, 1))
-    chart.markers(curve.places[every], curve.median[every], colour, series_marker(number), 1.7)
+    chart.markers(curve.places[every], curve.middle[every], colour, series_marker(number), 1.7)
 
 
 def _draw_shares(chart: Chart, panel: Panel) -> None:
     """Draw shares of a whole on top of each other, the lowest reward darkest and at the bottom."""
     places = panel.curves[0].places
-    bottom = np.zeros_like(panel.curves[0].median)
+    bottom = np.zeros_like(panel.curves[0].middle)
     colours = palette.ramp_colours(len(panel.curves))
     for curve, colour in zip(panel.curves, colours, strict=True):
-        top = bottom + np.interp(places, curve.places, curve.median)
+        top = bottom + np.interp(places, curve.places, curve.middle)
         chart.band(places, bottom, top, colour, stroke=palette.WHITE, width=0.3)
         bottom = top
     left = chart.x.end + 10

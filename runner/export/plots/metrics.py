@@ -1,4 +1,4 @@
-"""Every metric of runs over an axis: runs of one configuration together, as median and band.
+"""Every metric of runs over an axis: runs of one configuration together, as IQM and band.
 
 A `Panel` is a metric; it has a `Curve` for each group of runs (and agent), which `curves` draws.
 """
@@ -12,23 +12,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.axes import Axis
+from runner.analysis.compare.statistics import iqm_band
 from runner.analysis.groups import Group
 from runner.analysis.series import LOGGED, points_of, title_of
 from runner.errors import RunnerError
 from runner.recording.metrics import METRIC_OF, SHARES
 
 
+class NoMetrics(RunnerError):
+    """No run has any metric."""
+
+
 @dataclass(frozen=True)
 class Curve:
-    """One line of a panel, float64 arrays of equal length; `low` and `high` are the band."""
+    """One line of a panel, float64 arrays of equal length.
+
+    Of several runs it is their interquartile mean with its 95 % interval, or below four runs their mean and
+    range.
+    """
 
     group: int
     line: str
     places: NDArray[np.float64]
     """Positions on the axis of the groups."""
-    median: NDArray[np.float64]
+    middle: NDArray[np.float64]
     low: NDArray[np.float64]
     high: NDArray[np.float64]
+    runs: NDArray[np.float64]
+    """Each run, [runs, positions], NaN where it has no value."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +72,7 @@ def panels_of(groups: Sequence[Group]) -> list[Panel]:
     """Return a panel for each metric that any run has.
 
     Raises:
-        RunnerError: no run has any metric.
+        NoMetrics: no run has any metric.
     """
     curves: dict[str, list[Curve]] = {}
     for number, group in enumerate(groups):
@@ -73,7 +84,7 @@ def panels_of(groups: Sequence[Group]) -> list[Panel]:
         curves.pop(SHARES, None)
     if not curves:
         runs = ", ".join(run.run_id for group in groups for run in group.runs)
-        raise RunnerError(
+        raise NoMetrics(
             f"found no metrics in {runs}: neither an evaluation nor a report of training was recorded."
         )
     return [
@@ -95,7 +106,7 @@ def _metrics(group: Group) -> list[tuple[str, str]]:
 
 
 def _curve(number: int, group: Group, metric: str, line: str) -> Curve | None:
-    """Return the median and the band of a metric, over the runs that have come as far.
+    """Return the line and the band of a metric, over the runs that have come as far.
 
     Runs report training every number of steps, so at different episodes: of several runs, only the reports at
     evaluations are drawn, which are at the same episodes. Loops evaluate at any episode, and on other axes
@@ -105,13 +116,15 @@ def _curve(number: int, group: Group, metric: str, line: str) -> Curve | None:
     places = np.array(sorted({place for points in runs for place in points}), np.float64)
     if not len(places):
         return None
-    values = [
-        np.interp(places, sorted(points), [points[at] for at in sorted(points)], np.nan, np.nan)
-        for points in runs
-        if points
-    ]
-    median, low, high = (band(values, axis=0) for band in (np.nanmedian, np.nanmin, np.nanmax))
-    return Curve(number, line, places, median, low, high)
+    values = np.array(
+        [
+            np.interp(places, sorted(points), [points[at] for at in sorted(points)], np.nan, np.nan)
+            for points in runs
+            if points
+        ]
+    )
+    inside = ~np.isnan(values).all(axis=0)  # between the end of one run and the beginning of another
+    return Curve(number, line, places[inside], *iqm_band(values[:, inside]), values[:, inside])
 
 
 def _rank(metric: str) -> tuple[int, int]:

@@ -8,8 +8,10 @@ from typing import Annotated, Any, Final
 from fastapi import APIRouter, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
+from runner.analysis.axes import EPISODES
 from runner.runs.run import Run
 from runner.service import computed
+from runner.service.api.reading import AxisName, Curves, FirstPosition, LastPosition, Metrics, Points
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import (
     CacheOf,
@@ -33,6 +35,7 @@ router = APIRouter(
     ),
 )
 MAX_RUNS: Final = 1000
+Runs = Annotated[list[str], Query(min_length=1, max_length=MAX_RUNS, description="A run; may be repeated.")]
 Name = Annotated[str, Query(max_length=200, description="A run: its id, the beginning of it, its name, ...")]
 
 
@@ -56,18 +59,41 @@ async def diff(
     return Response(body, media_type="application/json")  # type: ignore[return-value]
 
 
+@router.get("/curves", response_model=Curves, summary="The curves of several runs, seeds as one curve.")
+async def curves(
+    request: Request,
+    catalogue: CatalogueOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
+    run: Runs,
+    metric: Metrics = None,
+    axis: AxisName = EPISODES.name,
+    start: FirstPosition = 0,
+    stop: LastPosition = None,
+    points: Points = 0,
+    lines: Annotated[bool, Query(description="Include the single runs of each curve.")] = False,
+) -> Response:
+    """Return every metric over an axis, runs that differ in nothing but the seed as one curve with a band."""
+    runs = await found_runs(catalogue, run)
+    key = ("curves", *map(recording_state, runs), request.url.query)
+    options = ([found.recording for found in runs], axis, tuple(metric or ()), start, stop, points, lines)
+    body = await cache.get_or_await(key, lambda: processes(computed.curves, *options), ALWAYS)
+    return Response(body, media_type="application/json")
+
+
 @router.get("/compare", summary="A comparison of groups of runs, with statistics over seeds.")
 async def compare(
     request: Request,
     catalogue: CatalogueOf,
     cache: CacheOf,
     processes: ProcessesOf,
-    run: Annotated[
-        list[str], Query(min_length=1, max_length=MAX_RUNS, description="A run; may be repeated.")
-    ],
+    run: Runs,
     by: Annotated[str | None, Query(max_length=200, description="Group by this setting.")] = None,
     metric: Annotated[list[str] | None, Query(max_length=100)] = None,
-    moment: Annotated[str, Query(max_length=20, description="`last`, `best`, `area`, or episodes.")] = "last",
+    moment: Annotated[
+        str, Query(max_length=20, description="`last`, `best`, `area`, or a position.")
+    ] = "last",
+    axis: AxisName = EPISODES.name,
     target: Annotated[
         str | None, Query(max_length=200, description="METRIC=LEVEL, instead of `moment`.")
     ] = None,
@@ -75,7 +101,7 @@ async def compare(
     """Return what `dualtaxi compare --json` prints; a run's name stands for all runs of that name."""
     runs = await found_runs(catalogue, run, several=True)
     key = ("compare", *map(recording_state, runs), request.url.query)
-    options = ([found.recording for found in runs], by, metric or [], moment, target)
+    options = ([found.recording for found in runs], by, metric or [], moment, target, axis)
     body = await cache.get_or_await(key, lambda: processes(computed.comparison, *options), ALWAYS)
     return Response(body, media_type="application/json")  # type: ignore[return-value]
 

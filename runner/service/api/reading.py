@@ -9,6 +9,7 @@ from fastapi import APIRouter, Path, Query, Response
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from runner.analysis.axes import AXES, EPISODES
 from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.recording.reader import Recording
 from runner.service import computed
@@ -41,26 +42,61 @@ Episode = Annotated[int | None, Query(ge=0, lt=2**62, description="After this nu
 PhasePath = Annotated[Phase, Path(description="`train`, or `eval`: the trials of evaluations.")]
 
 
+AxisName = Annotated[str, Query(max_length=20, description=f"The horizontal axis: one of {', '.join(AXES)}.")]
+Metrics = Annotated[list[str] | None, Query(max_length=100, description="Default: all.")]
+FirstPosition = Annotated[float, Query(ge=0, allow_inf_nan=False, description="The first position.")]
+LastPosition = Annotated[
+    float | None, Query(ge=0, allow_inf_nan=False, description="The first position not included.")
+]
+Points = Annotated[int, Query(ge=0, le=100_000, description="Maximum of a curve; 0: all.")]
+
+
 class Curve(BaseModel):
-    """A metric over training episodes."""
+    """A metric of a group of runs over an axis."""
 
     metric: str
     line: str
     """An agent or a reward; empty if the metric has one line only."""
+    group: int
+    """Number of its group."""
     title: str
     unit: str
-    episodes: list[float]
+    positions: list[float]
     values: list[float | None]
+    """Of several runs, their interquartile mean; below four runs, their mean."""
+    low: list[float | None] | None
+    """Of several runs, the lower end of the 95 % interval; below four runs, the lowest."""
+    high: list[float | None] | None
+    runs: list[list[float | None]]
+    """The values of each run of the group, if they were requested."""
     of: int
     """The number of points between `start` and `stop`."""
     thinned: bool
     """Whether only the lowest and the highest point of each section are included."""
 
 
-class Curves(BaseModel):
-    """The metrics of a run."""
+class AxisInfo(BaseModel):
+    """An axis that all of the runs have."""
 
-    run_id: str
+    name: str
+    title: str
+    label: str
+
+
+class CurveGroup(BaseModel):
+    """Runs that differ in nothing but the seed."""
+
+    runs: list[str]
+    left_out: list[str]
+    """Runs that repeat one of these."""
+
+
+class Curves(BaseModel):
+    """The metrics of runs."""
+
+    axis: str
+    axes: list[AxisInfo]
+    groups: list[CurveGroup]
     curves: list[Curve]
 
 
@@ -86,19 +122,18 @@ class Columns(BaseModel):
 @router.get("/metrics", response_model=Curves, responses=BUSY, summary="The curves of a run's metrics.")
 async def metrics(
     compute: ComputationOf,
-    metric: Annotated[list[str] | None, Query(max_length=100, description="Default: all.")] = None,
-    start: Annotated[int, Count] = 0,
-    stop: Annotated[
-        int | None, Query(ge=0, lt=2**62, description="The first training episode not included.")
-    ] = None,
-    points: Annotated[int, Query(ge=0, le=100_000, description="Maximum of a curve; 0: all.")] = 0,
+    metric: Metrics = None,
+    axis: AxisName = EPISODES.name,
+    start: FirstPosition = 0,
+    stop: LastPosition = None,
+    points: Points = 0,
 ) -> Response:
-    """Return every metric over training episodes, as plots show it.
+    """Return every metric over an axis, as plots show it.
 
     With `points`, longer curves have the lowest and the highest value of each section only, and `thinned` is
     true; `start` and `stop` select a part at full resolution.
     """
-    return _json(await compute(computed.curves, tuple(metric or ()), start, stop, points))
+    return _json(await compute(computed.run_curves, axis, tuple(metric or ()), start, stop, points))
 
 
 def _add_records_route(kind: computed.RecordKind, summary: str, description: str) -> None:

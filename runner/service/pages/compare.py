@@ -64,6 +64,14 @@ class Compared:
     here: str
 
     @property
+    def title(self) -> str:
+        """The names of the runs; of more than two, each name once."""
+        names = [run.head.name for run in self.runs]
+        if len(names) > 2:
+            names = list(dict.fromkeys(names))
+        return " against ".join(names) if len(names) > 1 else f"{len(self.runs)} runs of {names[0]}"
+
+    @property
     def charts(self) -> list[dict[str, str]]:
         """The runs, as `charts.js` reads them."""
         return [{"id": run.head.id, "label": run.label} for run in self.runs]

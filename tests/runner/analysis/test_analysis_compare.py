@@ -378,7 +378,7 @@ def test_a_line_does_not_jump_between_runs_that_evaluated_at_other_moments():
     (panel,) = panels_of([group])
     (curve,) = panel.curves
     assert curve.places.tolist() == [10, 11, 20, 22, 30, 33]
-    assert curve.median.tolist() == [0, 50, 50, 50, 50, 100]
+    assert curve.middle.tolist() == [0, 50, 50, 50, 50, 100]
 
 
 def test_a_legend_shows_how_a_run_ended():

@@ -19,6 +19,24 @@ def test_the_interval_of_the_iqm_has_its_nominal_coverage():
     assert sum(inside) >= 33  # 95 % of 40 is 38; a percentile interval of 20 values is a little short
 
 
+def test_the_band_of_a_curve_is_the_interval_of_a_single_value():
+    values = np.random.default_rng(4).normal(0, 1, (12, 3))
+    middle, low, high = statistics.iqm_band(values)
+    for k in range(3):
+        alone = statistics.interquartile_mean(values[:, k])
+        assert middle[k] == pytest.approx(alone.value)
+        assert (low[k], high[k]) == pytest.approx((alone.low, alone.high), abs=0.06)
+
+
+def test_a_band_has_the_runs_that_come_as_far_and_their_range_below_four():
+    values = np.array([[1.0, 1, 1], [2, 2, np.nan], [3, 3, 3], [100, np.nan, np.nan], [4, np.nan, np.nan]])
+    middle, low, high = statistics.iqm_band(values)
+    assert middle.tolist() == [3, 2, 2]  # of five runs, the lowest and the highest are cut off
+    assert (low[1:].tolist(), high[1:].tolist()) == ([1, 1], [3, 3])
+    same = statistics.iqm_band(np.full((6, 2), 7.0))
+    assert np.allclose(same, 7)
+
+
 @pytest.mark.parametrize(("seeds", "shift"), [(5, 0.0), (5, 1.5), (10, 0.8)])
 def test_the_interval_of_the_probability_of_improvement_has_its_nominal_coverage(seeds, shift):
     rng = np.random.default_rng(2)

@@ -129,10 +129,55 @@ def test_the_legend_of_a_plot_distinguishes_lines_and_shows_values(page):
     plot = browser.find_element(By.CSS_SELECTOR, ".u-over")
     browser.execute_script("arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})", plot)
     ActionChains(browser).move_to_element(plot).perform()
-    wait(browser, lambda: re.search(r"episode \d", text_of(browser, ".key")))
+    wait(browser, lambda: re.search(r"training episodes \d", text_of(browser, ".key")))
     entry = browser.find_element(By.CSS_SELECTOR, ".key button")
     entry.click()
     assert entry.get_attribute("aria-pressed") == "false"
+
+
+def set_field(browser, name, value):
+    browser.execute_script(
+        """const field = document.querySelector(`[name=${arguments[0]}]`);
+        if (field.type === "checkbox") field.checked = arguments[1]; else field.value = arguments[1];
+        field.dispatchEvent(new Event("input", {bubbles: true}));
+        field.dispatchEvent(new Event("change", {bubbles: true}));""",
+        name,
+        value,
+    )
+
+
+def test_axis_smoothing_and_logarithmic_scales_are_chosen_and_kept_in_the_address(page):
+    browser = page("/runs/first")
+    wait(browser, lambda: len(browser.find_elements(By.CSS_SELECTOR, ".uplot canvas")) > 3)
+    assert "axis=" not in browser.current_url
+    set_field(browser, "axis", "steps")
+    wait(browser, lambda: "axis=steps" in browser.current_url)
+    set_field(browser, "smooth", "5")
+    wait(browser, lambda: "5 % of the axis" in text_of(browser, "form.zoom"))
+    set_field(browser, "logy", True)
+    wait(browser, lambda: "logy=1" in browser.current_url)
+    caption = "not logarithmic: no value is positive"  # returns of the taxis are negative
+    wait(browser, lambda: caption in text_of(browser, ".plots"))
+    browser.refresh()
+    wait(browser, lambda: caption in text_of(browser, ".plots"))
+    assert browser.find_element(By.NAME, "axis").get_attribute("value") == "steps"
+    plot = browser.find_element(By.CSS_SELECTOR, ".u-over")
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})", plot)
+    ActionChains(browser).move_to_element(plot).perform()
+    wait(browser, lambda: re.search(r"training steps \d", text_of(browser, ".key")))
+
+
+def test_seeds_are_one_line_and_single_runs_are_drawn_on_request(page, folder):
+    config = {"name": "several", "env": {"id": "FrozenLake-v1"}, "episodes": 60, "seeds": [0, 1, 2, 3]}
+    runs = list(runner.run_all(config | {"evaluation": {"every": 20, "trials": 5}}, recordings=folder))
+    browser = page("/compare?run=first&" + "&".join(f"run={run.run_id}" for run in runs))
+    wait(browser, lambda: "B C D E: several" in text_of(browser, ".key"))
+    looks = "return [...document.querySelectorAll('.legend .swatch')].map((one) => one.className)"
+    first, *others = browser.execute_script(looks)
+    assert first not in others
+    assert len(set(others)) == 1
+    set_field(browser, "lines", True)
+    wait(browser, lambda: "D: several" in text_of(browser, ".key").split("B C D E: several")[0])
 
 
 def test_a_narrow_screen_shows_the_open_tab_the_results_and_both_sides(page):

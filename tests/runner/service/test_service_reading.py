@@ -117,9 +117,33 @@ def test_metrics_are_complete_or_marked_as_thinned(client, recording):
     assert thin["of"] == len(recorded)
     assert {min(recorded), max(recorded)} <= set(thin["values"])
     (part,) = client.get(
-        f"{RUN}/metrics", params=params | {"points": 0, "start": finish["episodes"][1]}
+        f"{RUN}/metrics", params=params | {"points": 0, "start": finish["positions"][1]}
     ).json()["curves"]
     assert part["values"] == recorded[1:]
+
+
+def test_metrics_are_read_over_any_axis_that_the_run_has(client, recording):
+    over_steps = client.get(f"{RUN}/metrics", params={"axis": "steps", "metric": "success_percent"}).json()
+    assert [axis["name"] for axis in over_steps["axes"]] == ["episodes", "steps", "updates"]
+    (curve,) = over_steps["curves"]
+    assert curve["positions"] == [record["step"] for record in recording.metrics("eval")]
+    refused = client.get(f"{RUN}/metrics", params={"axis": "stops"})
+    assert refused.status_code == 400
+    assert "Did you mean 'steps'" in refused.json()["error"]["message"]
+
+
+def test_runs_that_differ_in_the_seed_are_one_curve_with_a_band(recordings, client):
+    config = {"env": {"id": "FrozenLake-v1"}, "episodes": 40, "evaluation": {"every": 20, "trials": 5}}
+    runs = list(runner.run_all(config | {"name": "seeds", "seeds": [0, 1, 2, 3, 4]}, recordings=recordings))
+    params = {"run": [run.run_id for run in runs], "metric": "mean_length", "lines": True}
+    found = client.get("/api/v1/curves", params=params).json()
+    assert found["groups"] == [{"runs": params["run"], "left_out": []}]
+    (curve,) = found["curves"]
+    for k, values in enumerate(zip(*curve["runs"], strict=True)):
+        assert curve["values"][k] == pytest.approx(np.mean(sorted(values)[1:-1]))
+        assert min(values) <= curve["low"][k] <= curve["values"][k] <= curve["high"][k] <= max(values)
+    alone = client.get("/api/v1/curves", params={"run": params["run"][:1], "metric": "mean_length"}).json()
+    assert (alone["curves"][0]["low"], alone["curves"][0]["runs"]) == (None, [])
 
 
 def test_plots_are_pictures(client):

@@ -1,73 +1,164 @@
-// Metrics of one or several runs over training episodes. Of a long curve the server returns the lowest and the
-// highest value of each stretch, with a notice; zooming in requests that part at full resolution.
+// Metrics of one or several runs over an axis; runs that differ in nothing but the seed are one line with a band.
+// Of a long curve the server returns the lowest and the highest value of each stretch, with a notice; zooming in
+// requests that part at full resolution. The address holds what is chosen.
 import { request } from "./api.js";
 
 const box = document.querySelector("[data-charts]");
 const runs = JSON.parse(box.dataset.charts);
-const plots = box.querySelector("[data-plots]"), message = box.querySelector("[data-message]"), form = box.querySelector("form");
+const plots = box.querySelector("[data-plots]"), message = box.querySelector("[data-message]");
+const form = box.querySelector("form"), fields = form.elements;
 const COLOURS = 7;  // of lines, in the style
 const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3]];
 const SHARES = "training.reward";
 const shown = new Map();
-let range = zoomed(), requests = 0;
+let requests = 0, last = null;
 
-function zoomed() {
+// --- what is chosen: in the address, and in the form ----------------------------------------------------
+
+function chosen() {
   const query = new URLSearchParams(location.search);
-  const end = (name) => query.get(name) ? Number(query.get(name)) : null;
-  return { from: end("from"), to: end("to") };
+  const number = (name) => query.get(name) ? Number(query.get(name)) : null;
+  return {
+    axis: query.get("axis") ?? "episodes", from: number("from"), to: number("to"), smooth: number("smooth") ?? 0,
+    logx: query.has("logx"), logy: query.has("logy"), lines: query.has("lines"),
+  };
 }
 
-const look = () => getComputedStyle(document.documentElement);
-const colour = (i) => look().getPropertyValue(`--line-${i % COLOURS}`).trim();
-const spoken = (name) => name.replaceAll("_", " ");
-
-async function curvesOf(run) {
-  const query = new URLSearchParams({ points: Math.max(400, Math.round(plots.clientWidth)) });
-  if (range.from) query.set("start", Math.max(0, Math.floor(range.from)));
-  if (range.to) query.set("stop", Math.ceil(range.to) + 1);
-  return (await request(`/api/v1/runs/${run.id}/metrics?${query}`)).curves;
+function fill(state) {
+  for (const name of ["from", "to"]) fields[name].value = state[name] ?? "";
+  for (const name of ["logx", "logy", "lines"]) fields[name].checked = state[name];
+  fields.smooth.value = state.smooth;
+  fields.smoothed.value = state.smooth ? `${state.smooth} % of the axis` : "none";
 }
+
+function change(changes, keep = true) {
+  const query = new URLSearchParams(location.search);
+  for (const [name, value] of Object.entries(changes)) {
+    if (value === null || value === false || value === 0 || value === "episodes") query.delete(name);
+    else query.set(name, value === true ? "1" : value);
+  }
+  if (keep) history.pushState(null, "", query.size ? `?${query}` : location.pathname);
+  else history.replaceState(null, "", query.size ? `?${query}` : location.pathname);
+  fill(chosen());
+}
+
+// --- data -----------------------------------------------------------------------------------------------
 
 async function draw() {
-  const mine = ++requests;
+  const mine = ++requests, { axis, from, to, lines } = chosen();
+  const query = new URLSearchParams({ axis, points: Math.max(400, Math.round(plots.clientWidth)) });
+  for (const run of runs) query.append("run", run.id);
+  if (from !== null) query.set("start", Math.max(0, from));
+  if (to !== null) query.set("stop", axis === "time" ? to : to + 1);
+  if (lines) query.set("lines", "true");
   box.setAttribute("aria-busy", "true");
   try {
-    const found = await Promise.all(runs.map(curvesOf));
+    const found = await request(`/api/v1/curves?${query}`);
     if (mine !== requests) return;
-    show(found);
+    last = found;
+    fields.axis.replaceChildren(...found.axes.map(({ name, label }) => new Option(label, name, false, name === axis)));
+    box.querySelector("[data-seeds]").hidden = found.groups.every((group) => group.runs.length < 2);
+    found.groups.forEach((group, i) => group.runs.forEach((id) => {  // the colours of the runs above
+      const swatch = document.querySelector(`.swatch[data-run="${id}"]`);
+      if (swatch) swatch.className = `swatch line-${i % COLOURS}`;
+    }));
+    show();
   } catch (error) {
     message.textContent = error.message;
   }
   box.removeAttribute("aria-busy");
 }
 
-function show(found) {
+function show() {
   const metrics = new Map();
-  found.forEach((curves, run) => curves.forEach((curve) => {
-    if (curve.metric === SHARES && runs.length > 1) return;  // as many lines as rewards
-    const panel = metrics.get(curve.metric) ?? { ...curve, lines: [] };
-    panel.lines.push({ ...curve, run });
+  for (const curve of last.curves) {
+    const panel = metrics.get(curve.metric) ?? { ...curve, curves: [] };
+    panel.curves.push(curve);
     metrics.set(curve.metric, panel);
-  }));
+  }
   const ranked = [...metrics].sort(([one], [other]) => rank(one) - rank(other));
   for (const [metric, panel] of ranked) plot(metric, panel);
   for (const [metric, one] of shown) if (!metrics.has(metric)) { one.chart?.destroy(); one.figure.remove(); shown.delete(metric); }
-  const all = [...metrics.values()].flatMap((panel) => panel.lines);
-  const thinned = all.filter((line) => line.thinned);
-  message.textContent = !all.length ? "No metrics were recorded."
-    : thinned.length ? `Thinned: of up to ${Math.max(...thinned.map((line) => line.of)).toLocaleString("en")} points a curve the lowest and highest of each stretch are drawn. Zoom in for all of them.`
-      : "Every recorded point is drawn. Drag across a plot to zoom; double click shows all.";
+  const thinned = last.curves.filter((curve) => curve.thinned), repeated = last.groups.flatMap((group) => group.left_out);
+  const parts = [!last.curves.length ? "No metrics were recorded."
+    : thinned.length ? `Thinned: of up to ${Math.max(...thinned.map((curve) => curve.of)).toLocaleString("en")} points a curve the lowest and highest of each stretch are drawn. Zoom in for all of them.`
+      : "Every recorded point is drawn. Drag across a plot to zoom; double click shows all."];
+  if (last.groups.some((group) => group.runs.length > 1)) parts.push("Runs that differ only in the seed: interquartile mean with its 95 % interval; below four runs, mean and range.");
+  if (repeated.length) parts.push(`Left out, as the same run is there: ${repeated.map(named).join(", ")}.`);
+  message.textContent = parts.join(" ");
 }
 
 function rank(metric) {
   return metric === SHARES ? 4 : metric.startsWith("training.logged.") ? 3 : metric.startsWith("training.") ? 2 : metric.startsWith("event.") ? 1 : 0;
 }
 
+const named = (id) => runs.find((run) => run.id === id)?.label ?? id;
+
+function groupName(number) {
+  const own = last.groups[number].runs.map(named);
+  if (own.length === 1) return own[0];
+  const [first] = own, at = first.indexOf(": ");
+  return at < 0 ? `${own.length} runs` : `${own.map((label) => label.slice(0, label.indexOf(": "))).join(" ")}: ${first.slice(at + 2)}`;
+}
+
+// An exponential mean whose memory is a share of the visible axis, so that it does not depend on how many points
+// there are. The first value begins it.
+function smoothed(positions, values, memory) {
+  let mean = null, before = 0;
+  return values.map((value, i) => {
+    if (value === null) return null;
+    mean = mean === null ? value : mean + (1 - Math.exp(-(positions[i] - before) / memory)) * (value - mean);
+    before = positions[i];
+    return mean;
+  });
+}
+
+// The series of a plot: for each curve its band, its single runs, its values (faint if they are smoothed), and
+// the smoothed line. A logarithmic axis leaves out what is not positive, and is linear if nothing is.
+function seriesOf(panel, state) {
+  const lines = [...new Set(panel.curves.map((curve) => curve.line))];
+  const logy = state.logy && panel.curves.some((curve) => curve.values.some((value) => value > 0));
+  const series = [];
+  let left = 0;
+  for (const curve of panel.curves) {
+    const at = lines.indexOf(curve.line), several = last.groups.length > 1;
+    const keep = curve.positions.map((place, i) => !(state.logx && place <= 0) && !(logy && curve.values[i] !== null && curve.values[i] <= 0));
+    left += keep.filter((kept) => !kept).length;
+    const only = (values) => values.filter((_, i) => keep[i]).map((value) => logy && value <= 0 ? null : value);
+    const positions = curve.positions.filter((_, i) => keep[i]);
+    const base = { stroke: colour(several ? curve.group : at), dash: DASHES[at % DASHES.length], width: 1.8, points: positions.length < 80 };
+    const add = (values, style) => series.push({ ...base, positions, values, label: "", ...style });
+    if (curve.low) {
+      add(only(curve.high), { width: 0, points: false, fill: `${base.stroke}33` });
+      add(only(curve.low), { width: 0, points: false });
+    }
+    curve.runs.forEach((values, i) => add(only(values), { width: 0.7, points: false, stroke: `${base.stroke}aa`, label: `${named(last.groups[curve.group].runs[i])}${curve.line && lines.length > 1 ? `, ${spoken(curve.line)}` : ""}` }));
+    const values = only(curve.values), label = labelOf(curve, lines);
+    if (!state.smooth || positions.length < 3) add(values, { label });
+    else {
+      const span = (state.to ?? positions.at(-1)) - (state.from ?? positions[0]);
+      add(values, { stroke: `${base.stroke}55`, width: 1, points: false });
+      add(smoothed(positions, values, span * state.smooth / 100), { label, points: false });
+    }
+  }
+  return { series, left, logy };
+}
+
+function labelOf(curve, lines) {
+  const parts = [last.groups.length > 1 || runs.length > 1 ? groupName(curve.group) : "", lines.length > 1 && curve.line ? spoken(curve.line) : ""];
+  return parts.filter(Boolean).join(", ") || curve.title;
+}
+
+// --- plots ----------------------------------------------------------------------------------------------
+
+const look = () => getComputedStyle(document.documentElement);
+const colour = (i) => look().getPropertyValue(`--line-${i % COLOURS}`).trim();
+const spoken = (name) => name.replaceAll("_", " ");
+
 function plot(metric, panel) {
-  const lines = [...new Set(panel.lines.map((line) => line.line))];
-  const data = uPlot.join(panel.lines.map((line) => [line.episodes, line.values]));
-  const labels = panel.lines.map((line) => label(line, lines));
-  const kinds = JSON.stringify([labels, plots.clientWidth < 500]);
+  const state = chosen(), { series, left, logy } = seriesOf(panel, state);
+  const data = uPlot.join(series.map(({ positions, values }) => [positions, values]));
+  const kinds = JSON.stringify([series.map(({ label, stroke, width, points }) => [label, stroke, width, points]), state.logx, logy, state.axis, plots.clientWidth < 500]);
   let one = shown.get(metric);
   if (one && one.kinds !== kinds) { one.chart.destroy(); one.chart = null; }
   if (!one) {
@@ -81,31 +172,37 @@ function plot(metric, panel) {
   const [caption, place, key] = one.figure.children;
   const [title, unit] = [document.createElement("b"), document.createElement("span")];
   title.textContent = panel.title;
-  unit.textContent = panel.unit + (panel.lines.some((line) => line.thinned) ? ", thinned" : "")
-    + (panel.lines.every((line) => line.episodes.length === 0) ? ", no point in this part" : "");
+  unit.textContent = [panel.unit, panel.curves.some((curve) => curve.thinned) && "thinned",
+    state.logy && !logy && "not logarithmic: no value is positive",
+    left && `${left.toLocaleString("en")} point${left > 1 ? "s" : ""} at 0 or below left out`,
+    series.every(({ positions }) => positions.length === 0) && "no point in this part"].filter(Boolean).join(", ");
   caption.replaceChildren(title, " ", unit);
   place.setAttribute("role", "img");
-  place.setAttribute("aria-label", `${panel.title}, ${panel.unit}: ${panel.lines.map((line) => summary(line, lines)).join("; ")}`);
-  const sparse = panel.lines.every((line) => line.episodes.length < 80);
+  const lines = [...new Set(panel.curves.map((curve) => curve.line))];
+  place.setAttribute("aria-label", `${panel.title}, ${panel.unit}: ${panel.curves.map((curve) => summary(curve, lines)).join("; ")}`);
   if (one.chart) one.chart.setData(data);
-  else one.chart = new uPlot(options(panel, lines, labels, place, key, sparse), data, place);
-  if (one.kinds !== kinds) legend(one.chart, key, labels);
+  else {
+    one.chart = new uPlot(options(panel, series, state, logy, place, key), data, place);
+    legend(one.chart, key, series);
+  }
   one.kinds = kinds;
 }
 
-// A key of all lines, as they are drawn; a click hides or shows a line. While the cursor is over a plot, the key
-// shows the episode and the values there.
-function legend(chart, key, labels) {
-  const entries = labels.map((name, i) => {
+// A key of all labelled lines, as they are drawn; a click hides or shows a line. While the cursor is over a plot,
+// the key shows the position and the values there.
+function legend(chart, key, series) {
+  const labelled = series.flatMap(({ label }, i) => label ? [i + 1] : []);
+  const entries = labelled.map((number) => {
     const entry = document.createElement("button"), value = document.createElement("output");
-    const { stroke, dash } = chart.series[i + 1];
+    const { label, stroke, dash } = series[number - 1];
     entry.type = "button";
-    entry.append(sample(stroke(chart, i + 1), dash), name, " ", value);
+    entry.dataset.series = value.dataset.series = number;
+    entry.append(sample(stroke, dash), label, " ", value);
     entry.setAttribute("aria-pressed", "true");
-    entry.hidden = labels.length < 2;
+    entry.hidden = labelled.length < 2;
     entry.addEventListener("click", () => {
-      const show = !chart.series[i + 1].show;
-      chart.setSeries(i + 1, { show });
+      const show = !chart.series[number].show;
+      chart.setSeries(number, { show });
       entry.setAttribute("aria-pressed", String(show));
     });
     return entry;
@@ -123,18 +220,20 @@ function sample(stroke, dash) {
 }
 
 function readOut(chart, key) {
-  const at = chart.cursor.idx, outputs = key.querySelectorAll("output");
-  if (!outputs.length) return;
+  const at = chart.cursor.idx, outputs = [...key.querySelectorAll("output")], position = outputs.pop();
+  if (!position) return;
   const there = at !== null && at !== undefined && chart.cursor.left >= 0;
   const value = (i) => there && chart.data[i][at] !== null && chart.data[i][at] !== undefined ? exact(chart.data[i][at]) : "";
-  chart.series.slice(1).forEach((_, i) => { if (outputs.length > 2) outputs[i].textContent = value(i + 1); });
-  const alone = outputs.length === 2 && value(1) ? `: ${value(1)}` : "";
-  outputs[outputs.length - 1].textContent = there ? `episode ${exact(chart.data[0][at])}${alone}` : "";
+  if (outputs.length > 1) for (const output of outputs) output.textContent = value(output.dataset.series);
+  const alone = outputs.length === 1 && value(outputs[0].dataset.series);
+  const axis = last.axes.find(({ name }) => name === last.axis);
+  position.textContent = there ? `${axis.label} ${exact(chart.data[0][at])}${alone ? `: ${alone}` : ""}` : "";
 }
 
 const exact = (value) => Number(value.toPrecision(6)).toLocaleString("en", { maximumFractionDigits: 6 });
 
 function tick(value) {
+  if (value === null) return "";
   const size = Math.abs(value), units = [[1e12, "T"], [1e9, "G"], [1e6, "M"], [1e4, "k"]];
   if (size >= 1e15 || (size > 0 && size < 1e-4)) return value.toExponential(0);
   const [, unit] = units.find(([least]) => size >= least) ?? [1, ""];
@@ -142,41 +241,35 @@ function tick(value) {
   return Number(shown.toPrecision(6)).toLocaleString("en", { maximumFractionDigits: 6 }) + unit;
 }
 
-function label(line, lines) {
-  const parts = [runs.length > 1 ? runs[line.run].label : "", lines.length > 1 && line.line ? spoken(line.line) : ""];
-  return parts.filter(Boolean).join(", ") || line.title;
+function summary(curve, lines) {
+  const known = curve.values.filter((value) => value !== null), end = known.at(-1);
+  if (end === undefined) return `${labelOf(curve, lines)} has no point in this part`;
+  return `${labelOf(curve, lines)} ends at ${Number(end.toPrecision(4))}, between ${Number(Math.min(...known).toPrecision(4))} and ${Number(Math.max(...known).toPrecision(4))}`;
 }
 
-function summary(line, lines) {
-  const known = line.values.filter((value) => value !== null);
-  const last = known.at(-1);
-  if (last === undefined) return `${label(line, lines)} has no point in this part`;
-  return `${label(line, lines)} ends at ${Number(last.toPrecision(4))}, between ${Number(Math.min(...known).toPrecision(4))} and ${Number(Math.max(...known).toPrecision(4))}`;
-}
-
-function options(panel, lines, labels, place, key, sparse) {
-  const percent = panel.unit.startsWith("percent");
-  const positive = panel.lines.every((line) => line.values.every((value) => value === null || value >= 0));
+function options(panel, series, state, logy, place, key) {
+  const percent = panel.unit.startsWith("percent"), positive = series.every(({ values }) => values.every((value) => value === null || value >= 0));
   const axis = {
     stroke: look().getPropertyValue("--soft").trim(), grid: { stroke: look().getPropertyValue("--line").trim(), width: 1 },
     ticks: { show: false }, font: "12px system-ui, sans-serif", values: (_, ticks) => ticks.map(tick),
   };
-  const series = panel.lines.map((line, i) => {
-    const at = lines.indexOf(line.line), several = runs.length > 1;
-    const stroke = colour(several ? line.run : at);
-    return { label: labels[i], stroke, width: 1.8, dash: DASHES[at % DASHES.length], spanGaps: true, points: { show: sparse, size: 4 } };
-  });
+  const scale = (log, range) => ({ distr: log ? 3 : 1, range: (_, low, high) => log ? uPlot.rangeLog(low > 0 ? low : 0.1, high > 0 ? high : 1, 10, false) : range(low, high) });
+  const lines = series.map(({ label, stroke, dash, width, points }) => ({ label, stroke, dash, width, spanGaps: true, points: { show: points, size: 4 } }));
   return {
     width: place.clientWidth, height: 216, padding: [8, 22, 0, 0],
-    scales: { x: { time: false, range: (_, low, high) => [range.from ?? low ?? 0, range.to ?? high ?? 1] }, y: { range: (_, low, high) => bounds(low, high, percent, positive) } },
-    series: [{ label: "episode" }, ...series],
+    scales: {
+      x: { time: false, ...scale(state.logx, (low, high) => [state.from ?? low ?? 0, state.to ?? high ?? 1]) },
+      y: scale(logy, (low, high) => bounds(low, high, percent, positive)),
+    },
+    series: [{}, ...lines],
+    bands: series.flatMap(({ fill }, i) => fill ? [{ series: [i + 1, i + 2], fill }] : []),
     axes: [
-      { ...axis, size: 28, label: "training episodes", labelSize: 18, labelGap: 0, labelFont: axis.font },
+      { ...axis, size: 28, label: last.axes.find(({ name }) => name === last.axis).label, labelSize: 18, labelGap: 0, labelFont: axis.font },
       { ...axis, size: (_, values) => 18 + 7.2 * Math.max(3, ...(values ?? []).map((text) => text.length)) },
     ],
     legend: { show: false },
     cursor: { drag: { x: true, y: false, setScale: false }, sync: { key: "metrics", setSeries: false } },
-    hooks: { setSelect: [(chart) => zoom(chart)], setCursor: [(chart) => readOut(chart, key)] },
+    hooks: { setSelect: [zoom], setCursor: [(chart) => readOut(chart, key)] },
   };
 }
 
@@ -187,6 +280,14 @@ function bounds(low, high, percent, positive) {
   return [from, high + 0.05 * (high - from || 1)];
 }
 
+// --- events ---------------------------------------------------------------------------------------------
+
+function go(from, to) {
+  const end = (value, round) => value === null || chosen().axis === "time" ? value : round(value);
+  change({ from: end(from, Math.floor), to: end(to, Math.ceil) });
+  draw();
+}
+
 function zoom(chart) {
   const { left, width } = chart.select;
   if (width < 4) return;
@@ -194,26 +295,18 @@ function zoom(chart) {
   chart.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
 }
 
-function go(from, to, keep = true) {
-  range = { from: from === null ? null : Math.floor(from), to: to === null ? null : Math.ceil(to) };
-  form.elements.from.value = range.from ?? "";
-  form.elements.to.value = range.to ?? "";
-  if (keep) {
-    const query = new URLSearchParams(location.search);
-    for (const [name, value] of Object.entries(range)) value === null ? query.delete(name) : query.set(name, value);
-    history.pushState(null, "", query.size ? `?${query}` : location.pathname);
-  }
-  draw();
-}
-
 form.addEventListener("submit", (event) => {
   event.preventDefault();
-  const end = (name) => form.elements[name].value === "" ? null : Number(form.elements[name].value);
+  const end = (name) => fields[name].value === "" ? null : Number(fields[name].value);
   go(end("from"), end("to"));
 });
+fields.axis.addEventListener("change", () => { change({ axis: fields.axis.value, from: null, to: null }); draw(); });
+fields.lines.addEventListener("change", () => { change({ lines: fields.lines.checked }); draw(); });
+for (const name of ["logx", "logy"]) fields[name].addEventListener("change", () => { change({ [name]: fields[name].checked }); if (last) show(); });
+fields.smooth.addEventListener("input", () => { change({ smooth: Number(fields.smooth.value) }, false); if (last) show(); });
 box.querySelector("[data-reset]").addEventListener("click", () => go(null, null));
 plots.addEventListener("dblclick", () => go(null, null));
-addEventListener("popstate", () => { const { from, to } = zoomed(); go(from, to, false); });
+addEventListener("popstate", () => { fill(chosen()); draw(); });
 
 let width = plots.clientWidth;
 new ResizeObserver(() => {
@@ -221,12 +314,8 @@ new ResizeObserver(() => {
   width = plots.clientWidth;
   for (const { chart, figure } of shown.values()) chart?.setSize({ width: figure.children[1].clientWidth, height: 216 });
 }).observe(plots);
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
-  for (const one of shown.values()) one.kinds = null;
-  draw();
-});
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { if (last) show(); });
 
-form.elements.from.value = range.from ?? "";
-form.elements.to.value = range.to ?? "";
+fill(chosen());
 await draw();
 if (document.querySelector("[data-live]")) setInterval(() => { if (!document.hidden) draw(); }, 4000);
