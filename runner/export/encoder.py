@@ -39,9 +39,19 @@ class Format:
 
 
 FORMATS: Final = {
-    ".mp4": Format("mp4", "h264", "yuv420p", {"preset": "veryfast", "crf": "18"}, {"movflags": "+faststart"}),
+    # Looking further ahead saves little space, and keeps more frames in memory.
+    ".mp4": Format(
+        "mp4",
+        "h264",
+        "yuv420p",
+        {"preset": "veryfast", "crf": "18", "rc-lookahead": "5"},
+        {"movflags": "+faststart"},
+    ),
     ".webm": Format(
-        "webm", "libvpx-vp9", "yuv420p", {"crf": "28", "b": "0", "deadline": "realtime", "cpu-used": "6"}
+        "webm",
+        "libvpx-vp9",
+        "yuv420p",
+        {"crf": "28", "b": "0", "deadline": "realtime", "cpu-used": "6", "lag-in-frames": "0"},
     ),
     ".gif": Format("gif", "gif", "pal8", {}, {"final_delay": str(round(100 * LAST_SECONDS))}),
     # What hardly changes is transparent. FFmpeg's other encoder, libwebp_anim, keeps every frame in memory.
@@ -201,5 +211,6 @@ def frames_of(path: Path) -> Generator[Pixels, None, None]:
     import av
 
     with av.open(path) as container:
+        container.streams.video[0].thread_count = 1  # each thread would keep frames of its own
         for frame in container.decode(video=0):
             yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)

@@ -17,7 +17,7 @@ from runner.recording.reader import Recording
 from runner.replay.comparison import Comparison, Part, parts_of
 from runner.replay.makers import is_whole_vector, make_environment, make_vector, why_not_made
 from runner.replay.recorded import Piece, RecordedReset, pieces
-from runner.replay.redone import RedoneSteps
+from runner.replay.redone import Frame, RedoneSteps
 from runner.replay.stepping import EnvironmentStepper, GameStepper, Stepper
 from runner.replay.stepping_vector import VectorStepper
 
@@ -28,6 +28,8 @@ _PHASE_CHANGES: Final = 100
 """How many changes of the phase are looked at to find out whether both are of one environment."""
 _MAX_PICTURES: Final = 32
 """The most steps in a block with pictures."""
+_MAX_PICTURE_BYTES: Final = 8 << 20
+"""The most bytes of the pictures in a block of several steps."""
 
 ALL: Final = -1
 """The number that stands for all environments of a vector."""
@@ -129,7 +131,7 @@ class Replay:
             resets, block = resets[len(here) :], rows[begin * width : end * width]
             started = time.monotonic()
             results = stepper.run(block, here)
-            self._adapt(time.monotonic() - started, stepper.draws)
+            self._adapt(time.monotonic() - started, results.frames if stepper.draws else None)
             self.taken += results.done
             self._report(self.taken)
             whole = Part(phase, environment, block, here, results)
@@ -147,10 +149,14 @@ class Replay:
         """Return the same for both phases if they are of one environment."""
         return (phase if self._is_separate else "", environment)
 
-    def _adapt(self, seconds: float, draws: bool) -> None:
-        """Adapt the size of blocks to the time that one takes."""
+    def _adapt(self, seconds: float, frames: Sequence[Frame] | None) -> None:
+        """Adapt the size of blocks to the time that one takes, and to its pictures if it has any."""
         if seconds < BLOCK_SECONDS / 2:
-            self._max_rows = min(2 * self._max_rows, _MAX_PICTURES if draws else _MAX_ROWS)
+            limit = _MAX_ROWS
+            if frames is not None:
+                size = max((frame.nbytes for frame in frames), default=0)
+                limit = min(_MAX_PICTURES, max(_MAX_PICTURE_BYTES // size, 1) if size else 1)
+            self._max_rows = min(2 * self._max_rows, limit)
         elif seconds > 2 * BLOCK_SECONDS:
             self._max_rows = max(self._max_rows // 2, 1)
 

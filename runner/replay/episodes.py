@@ -21,7 +21,9 @@ from runner.replay.stepping import RowStepper
 
 _HELD_STEPS: Final = 64
 _HELD_SECONDS: Final = 0.3
-"""An episode counts as begun in the right state if this many steps agree, or those of this time."""
+_HELD_BYTES: Final = 32 << 20
+"""An episode counts as begun in the right state if this many steps agree, or those of this time, or as many
+as have pictures of this size."""
 
 
 OnReset = Callable[[RowStepper, Iterator[Any]], None]
@@ -273,16 +275,18 @@ def _held(found: Iterator[RedoneSteps], is_last: bool) -> Iterator[RedoneSteps]:
         _Astray: they do not, and there is another place to begin.
     """
     held: list[RedoneSteps] = []
-    count, begun = 0, time.monotonic()
+    count = size = 0
+    begun = time.monotonic()
     for steps in found:
-        if not is_last and count < _HELD_STEPS and (not held or time.monotonic() < begun + _HELD_SECONDS):
+        is_early = count < _HELD_STEPS and size < _HELD_BYTES
+        if not is_last and is_early and (not held or time.monotonic() < begun + _HELD_SECONDS):
             if steps.difference is not None:
                 raise _Astray
             held.append(steps)
-            count += len(steps)
+            count, size = count + len(steps), size + sum(frame.nbytes for frame in steps.frames)
             continue
-        yield from held
-        held = []
+        while held:
+            yield held.pop(0)
         yield steps
     yield from held
 

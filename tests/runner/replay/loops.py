@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -73,6 +73,20 @@ class Counter(gymnasium.Env[Any, Any]):
 
     def reward(self) -> float:
         return 1.0
+
+
+class Wide(Counter):
+    """Draws large pictures at once."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"]}
+
+    def __init__(self, render_mode: str | None = "rgb_array") -> None:
+        self.render_mode = render_mode
+        self._picture = np.zeros((1500, 2000, 3), np.uint8)
+
+    def render(self) -> np.ndarray:
+        """Return a picture of 9 MB."""
+        return self._picture
 
 
 def counter() -> Counter:

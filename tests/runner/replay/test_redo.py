@@ -185,6 +185,14 @@ def test_few_pictures_are_in_memory_after_episodes_that_are_not_drawn(tmp_path):
     assert max(blocks) <= 32
 
 
+def test_large_pictures_come_one_by_one(tmp_path):
+    path = record(loops.Wide(), tmp_path, 100, make="tests.runner.replay.loops:Wide")
+    with open_recording(path) as recording:
+        blocks = [len(block.frames) for block in redo(recording, "train", [0], render=True, trust=True)]
+    assert sum(blocks) == 10
+    assert max(blocks) == 1, "as many of them as of small pictures would take gigabytes"
+
+
 def test_a_child_process_draws_the_pictures_of_an_episode(tmp_path):
     path = record(gymnasium.make("CartPole-v1"), tmp_path, 200)
     blocks = list(redo_in_child(path, "train", [3], render=True))
