@@ -119,12 +119,13 @@ def _compare(path: Path, sample: int | None, tolerance: float, trust: bool) -> N
 
 def _compare_all(recording: Recording, tolerance: float, trust: bool) -> Redone:
     found = Redone("reproduced", tolerance=tolerance)
-    left = {phase: recording.count(recording.topic(f"/{phase}/step")) for phase in schema.PHASES}
+    total = {phase: recording.step_count(phase) for phase in schema.PHASES}
+    left = total.copy()
     with closing(Replay(recording, trust, tolerance, report_progress, render=False)) as replay:
         for steps in replay.all():
             if len(steps):
-                recorded = recording.count(recording.topic(f"/{steps.phase}/step"))
-                left[steps.phase] = min(left[steps.phase], recorded - 1 - int(steps.step[-1]))
+                after = total[steps.phase] - 1 - int(steps.step[-1])
+                left[steps.phase] = min(left[steps.phase], after)
             found = replace(
                 found,
                 episodes=found.episodes + int(np.count_nonzero(steps.t == 0)),

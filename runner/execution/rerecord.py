@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,6 +14,7 @@ from runner.config.job import Job
 from runner.environments.loading import load_mdp
 from runner.errors import Diverged, RunnerError
 from runner.execution.initial_tables import address, recorded_tables
+from runner.execution.rerecord_loop import rerecord_loop
 from runner.execution.session import Report, Session, Stop, describe, recorder_for, run_job
 from runner.learning.learner import Learner
 from runner.recording import schema
@@ -37,18 +39,45 @@ def holds_steps(run: Run) -> bool:
         return not recording.leaves_out_steps
 
 
-def rerecord(run: Run, report: Report = lambda _: None, stop: Stop = lambda: False) -> Run:
+def is_done_again(run: Run) -> bool:
+    """Return whether the steps of a run come again from its environment, not from training."""
+    if not run.recording.is_file():
+        return False
+    with open_recording(run.recording) as recording:
+        return not recording.can_train_again
+
+
+def rerecord(
+    run: Run,
+    report: Report = lambda _: None,
+    stop: Stop = lambda: False,
+    *,
+    trust: bool = False,
+    count: Callable[[int], None] = lambda _: None,
+) -> Run:
     """Record the steps of a run that left them out.
 
-    The new recording replaces the old one when it is complete and has the same content digest. A run that has
-    its steps is returned as it is.
+    A job is trained again; a loop's environment takes the recorded actions again. The new recording replaces
+    the old one when it is complete and has the same content digest. A run that has its steps is returned as
+    it is.
+
+    Args:
+        run: the run.
+        report: called with the progress of a job, a few times a second.
+        stop: called every few milliseconds while a job is trained; return True to stop.
+        trust: whether the environment may be imported that a loop's recording names, if no installed package
+            registers it.
+        count: called with the number of steps of a loop that were done, a few times a second.
 
     Raises:
+        CannotRedo: the environment of a loop cannot be had.
         RunnerError: the run is not finished, or its folder cannot be used.
         Diverged: the job gives another content than it gave then; the recording stays as it is.
         KeyboardInterrupt: `stop` returned True; the recording stays as it is.
     """
     with locked(run) as current:
+        if is_done_again(current):
+            return current if holds_steps(current) else rerecord_loop(current, trust, count)
         if current.status != "finished":
             from_mapping(current.file.config)  # refuses a loop's run, which nobody can resume
             raise RunnerError(

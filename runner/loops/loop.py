@@ -13,7 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
+import numpy as np
 from blake3 import blake3
+from numpy.typing import NDArray
 
 from runner.client.outbox import Follower, connect, is_server, outbox_folder
 from runner.config.job import NOT_CONTENT
@@ -27,10 +29,12 @@ from runner.loops.outcomes import Outcomes
 from runner.loops.rows import PhaseRows
 from runner.loops.values import check_phase, warn_user
 from runner.recording import schema
+from runner.recording.action_recorder import ActionRecorder
 from runner.recording.gym_spaces import can_widen, widened
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.metadata import run_metadata, sizes_of, write_description, write_result
 from runner.recording.recorder import FLUSH_SECONDS, Recorder
+from runner.recording.schema import Topic
 from runner.recording.writer import create_recording
 from runner.runs import run as runs
 from runner.runs.code import CodeCollector
@@ -75,6 +79,7 @@ class Loop(Generic[R]):
         batch: (N,) for N environments that step at once, else ().
 
     Raises:
+        ConfigError: steps are to be left out whose values vary in size.
         StorageError: the recordings folder cannot be written.
     """
 
@@ -86,6 +91,9 @@ class Loop(Generic[R]):
         make_rows: Callable[[Recorder, Described, str, Callable[[Any], None]], R],
         batch: tuple[int, ...] = (),
     ) -> None:
+        if options.steps != "all" and (described.kind == "variable" or options.join is not None):
+            reason = "a shard has whole steps" if options.join else "the environment's values vary in size"
+            raise ConfigError(f"steps: found {options.steps!r}, expected all: {reason}.")
         is_shard = options.join is not None
         client = connect(str(options.recordings)) if is_server(options.recordings) and not is_shard else None
         self._started = time.monotonic()
@@ -123,11 +131,16 @@ class Loop(Generic[R]):
             learners=len(described.agents),
             events=int(self._facts["events"]),
             packing=options.packing.packing,
+            record_steps=options.steps == "all",
             beat=self._code.beat(self.run, self._file),
             sizes=sizes_of(self._facts, str(path)),
-            watch=self._outcomes.take_records,
+            watch=self._watch,
             before=self._describe,
         )
+        self._actions = None
+        if options.steps == "actions":
+            steps = options.packing.chunk_steps
+            self._actions = ActionRecorder(self._recorder, described.environments, steps)
         self.extras = Extras(self._recorder, batch)
         self.messages = Messages(
             self,
@@ -167,6 +180,11 @@ class Loop(Generic[R]):
                 f"run {options.join.run_id}: {str(expected)[:500]}"
             )
         return new_shard(options.join, options.shard, config, options.seed, **facts)
+
+    def _watch(self, topic: Topic, records: NDArray[np.void]) -> None:
+        self._outcomes.take_records(topic, records)
+        if self._actions is not None:
+            self._actions.take_records(topic, records)
 
     def _run_facts(self) -> dict[str, str]:
         described, mdp, run = self.described, self.described.mdp, self.run
@@ -369,7 +387,10 @@ class Loop(Generic[R]):
         self._commit()
         self.extras.finish()
         result = self._recorder.totals(self._recorder.drain()) | self._outcomes.summary()
-        result |= {"episodes": self._recorder.counts["/train/episode"], "steps_recorded": True}
+        result |= {
+            "episodes": self._recorder.counts["/train/episode"],
+            "steps_recorded": self.options.steps == "all",
+        }
         if self.described.mdp is not None:
             result["rewards_off_table"] = sum(rows.off_table for rows in self._rows.values())
         if error:
@@ -385,6 +406,8 @@ class Loop(Generic[R]):
             rows.commit()
         self.extras.commit()
         self.messages.commit()
+        if self._actions is not None:
+            self._actions.commit()
 
     def flush(self) -> bool:
         """Write what is half a second old, also while the loop does something else.

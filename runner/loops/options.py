@@ -24,6 +24,7 @@ MADE_BY: Final = "runner.record"
 ALL_INFO: Final = "*"
 """Among the names of info fields: all of them."""
 PACKING: Final = ("compression", "level", "index", "chunk_steps", "code")
+_STEPS: Final = ("all", "actions", "none")
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,8 @@ class Options:
     join: Run | None = None
     """The run that this process records a shard of."""
     shard: str | None = None
+    steps: str = "all"
+    """What is recorded of a step: `all`, `actions` or `none`."""
 
     def __post_init__(self) -> None:
         expectations = (
@@ -60,6 +63,7 @@ class Options:
             ("info", "names of fields", all(isinstance(name, str) for name in self.info)),
             ("frames_every", "a whole number from 0", is_whole(self.frames_every, 0, 2**31)),
             ("frame_format", "png or jpeg", self.frame_format in ("png", "jpeg")),
+            ("steps", "all, actions or none", self.steps in _STEPS),
         )
         for key, expected, holds in expectations:
             if not holds:
@@ -77,7 +81,7 @@ class Options:
             "info": list(self.info),
             "frames": {"every": self.frames_every, "format": self.frame_format}
             | ({} if self.frames_of is None else {"environments": list(self.frames_of)}),
-            "recording": self.packing.model_dump(mode="json"),
+            "recording": self.packing.model_dump(mode="json") | {"steps": self.steps},
         }
 
 
@@ -101,8 +105,13 @@ def options_of(
         RunnerError: the run to join is over, or there is none.
         MissingExtra: frames need Pillow, which is not installed.
     """
+    packing = dict(packing)
+    steps = packing.pop("steps", "all")
+    if steps == "actions":  # an index of messages would take more than they do
+        packing = {"index": "chunk"} | packing
     if unknown := sorted(set(packing) - set(PACKING)):
-        raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {', '.join(PACKING)}")
+        expected = ", ".join(("steps", *PACKING))
+        raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {expected}")
     if isinstance(info, str) and info != ALL_INFO:
         raise ConfigError(f"info: found {info!r}, expected a list of names, such as [{info!r}]")
     mapping = as_mapping({} if config is None else config)
@@ -138,6 +147,7 @@ def options_of(
         packing=packing_from(packing),
         join=None if join is None else find_joined(join, recordings),
         shard=shard,
+        steps=steps,
     )
 
 

@@ -92,7 +92,7 @@ def check_extras(recording: Recording, phase: str, complete: bool, on_block: OnB
     extras, last = recording.extras(phase), -1
     steps, topic = recording.topic(f"/{phase}/step"), recording.topic(f"/{phase}/extra")
     # Steps of varying size are not looked up: their extras are only counted, and compared with one another.
-    total = recording.count(steps) if extras else 0
+    total = recording.step_count(phase) if extras else 0
     for block in extras.blocks(stop=None if complete else total):
         on_block(topic, block)
         numbers, where = block["step"], f"{topic.name}, step {block['step'][0]} and later"
@@ -103,7 +103,7 @@ def check_extras(recording: Recording, phase: str, complete: bool, on_block: OnB
             given, values = block["given"][name], block["values"][name].reshape(len(block), -1)
             if (given.view(np.uint8) > 1).any() or values[~given].any():
                 raise Inconsistent(f"{where}: {name}: found values where none were given")
-        if steps in recording.dtypes:
+        if steps in recording.dtypes and recording.has_messages(steps.name):
             parts = recording.blocks(steps, int(numbers[0]), last + 1)
             found = np.concatenate([part["log_time"][np.isin(part["step"], numbers)] for part in parts])
             if len(found) != len(block) or (found != block["log_time"]).any():

@@ -307,9 +307,9 @@ class RunDescription(ABC):
 
     @property
     def leaves_out_steps(self) -> bool:
-        """Whether the configuration leaves the steps out of the recording (`recording.steps: none`)."""
+        """Whether the configuration leaves whole steps out of the recording (`recording.steps`)."""
         plan = self.config.get("recording")
-        return isinstance(plan, Mapping) and plan.get("steps") == "none"
+        return isinstance(plan, Mapping) and plan.get("steps", "all") != "all"
 
     def _json(self, name: str) -> dict[str, Any]:
         return json_object(self.metadata(name).get("json"), f"{self.path}: the metadata {name!r}")

@@ -144,6 +144,25 @@ class Blocks:
         return Block(first, times, rows, first + order, owner, opens, resets, at, over, ends)
 
 
+def check_without_steps(recording: Recording, phase: str, on_block: OnBlock) -> int:
+    """Check the numbers of resets, episodes and actions of a phase whose whole steps were left out.
+
+    Returns the time of its last recorded action in nanoseconds, 0 without any.
+
+    Raises:
+        Inconsistent: they are not numbered consecutively.
+    """
+    for name in ("reset", "episode"):
+        for _ in records_of(recording, f"/{phase}/{name}", on_block):
+            pass
+    expected = last = 0
+    for rows in recording.actions(phase):
+        if rows["step"][0] != expected or (np.diff(rows["log_time"].astype(np.int64)) <= 0).any():
+            raise Inconsistent(f"/{phase}/actions: found step {rows['step'][0]:,}, expected {expected:,}")
+        expected, last = expected + len(rows), int(rows["log_time"][-1])
+    return last
+
+
 class Queue:
     """The records of a topic in order, taken as they are needed."""
 

@@ -22,10 +22,18 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.actions import kept_dtype, unpacked
 from runner.recording.extras import ExtraLayout, Extras, read_layouts
 from runner.recording.labels import read_labels
 from runner.recording.liveness import is_owned
-from runner.recording.messages import QTable, Snapshot, decode_array, decode_q_table, unknown_measures
+from runner.recording.messages import (
+    QTable,
+    Snapshot,
+    decode,
+    decode_array,
+    decode_q_table,
+    unknown_measures,
+)
 from runner.recording.reset_states import ResetState, decode_reset_state
 from runner.recording.run_file import run_title
 from runner.recording.schema import Topic
@@ -90,8 +98,41 @@ class Recording(TopicReader):
 
     @property
     def has_steps(self) -> bool:
-        """Whether any step was recorded."""
+        """Whether any whole step was recorded."""
         return any(self.has_messages(f"/{phase}/step") for phase in schema.PHASES)
+
+    @property
+    def has_actions(self) -> bool:
+        """Whether any action was recorded, with its step or alone."""
+        return any(self.has_actions_of(phase) for phase in schema.PHASES)
+
+    def has_actions_of(self, phase: str) -> bool:
+        """Return whether any action of a phase was recorded."""
+        return self.has_messages(f"/{phase}/step") or self.has_messages(f"/{phase}/actions")
+
+    def step_count(self, phase: str) -> int:
+        """Return how many steps of a phase were recorded, whole or their actions alone."""
+        if self.is_job or not self.has_messages(f"/{phase}/actions"):
+            return self.count(self.topic(f"/{phase}/step"))
+        topic = self.topic(f"/{phase}/actions")
+        last = len(self._chunks(topic)) - 1
+        return max(
+            int(one["step"] + one["count"])
+            for _, one in self._parsed(topic, partial(decode, topic.message), last)
+        )
+
+    def actions(self, phase: str, times: range | None = None) -> Iterator[NDArray[np.void]]:
+        """Yield the steps of a loop's phase of which only the actions were recorded, in blocks.
+
+        Their fields are those of `kept_dtype`; `times` selects blocks by the `log_time` of their last step.
+
+        Raises:
+            RecordingError: they are damaged.
+        """
+        topic = self.topic(f"/{phase}/actions")
+        dtype, where = kept_dtype(self.dtypes[self.topic(f"/{phase}/step")]), f"{self.path}: {topic.name}"
+        for fields in self.decoded(topic, times=times):
+            yield unpacked(fields, dtype, self.environments, where)
 
     def has_messages(self, name: str) -> bool:
         """Return whether the topic of that name has any message."""
@@ -113,7 +154,7 @@ class Recording(TopicReader):
         reset: what comes later may lack its reset, since topics are written one after the other.
         """
         topic, resets = self.topic(f"/{phase}/step"), self.topic(f"/{phase}/reset")
-        n, total = self.environments, self.count(topic)
+        n, total = self.environments, self.step_count(phase)
         if "content_digest" in self.result:
             return total
         if resets in self.dtypes:
@@ -122,6 +163,8 @@ class Recording(TopicReader):
                 (int(block["step"][-1]) for block in self.blocks(resets, count - 1, count)), default=-1
             )
             steps: Iterator[Any] = self.blocks(topic, max(last, 0))
+            if self.has_messages(f"/{phase}/actions"):
+                steps = (block[block["step"] >= last] for block in self.actions(phase))
         else:
             last = max((int(each["step"]) for each in self.decoded(resets)), default=-1)
             steps = (
@@ -158,9 +201,9 @@ class Recording(TopicReader):
         Raises:
             RecordingError: the recording has no such episode, or no steps.
         """
-        topic, episodes = self.topic(f"/{phase}/step"), self.topic(f"/{phase}/episode")
+        episodes = self.topic(f"/{phase}/episode")
         stride, phase_name = self.environments, schema.PHASE_NAMES[phase]
-        total, ended = self.count(topic), self.count(episodes)
+        total, ended = self.step_count(phase), self.count(episodes)
         if not total:
             raise RecordingError(f"{self.path}: has no {phase_name} steps.")
         start = stop = 0

@@ -107,7 +107,7 @@ class Recorder:
         self._reference = reference or Reference()
         sizes = sizes or {topic: topic_sizes(topic, learners, events) for topic in schema.BLOCK_TOPICS}
         self._lanes = {
-            topic: self._lane(topic, own, record_steps or topic.message is not schema.STEP)
+            topic: self._lane(topic, own, record_steps or topic.message not in schema.STEP_MESSAGES)
             for topic, own in sizes.items()
         }
         self.steps = {"train": 0, "eval": 0, "elsewhere": 0}

@@ -280,6 +280,6 @@ def _recorded_counts(result: dict[str, str]) -> dict[str, int]:
     counts = values.get("messages", {})
     if not isinstance(counts, dict) or not all(is_whole(n, 0, _MAX_MESSAGES) for n in counts.values()):
         raise RecordingError("the metadata 'result' does not say how many messages there were")
-    steps = {topic.name for topic in schema.TOPICS if topic.message is schema.STEP}
+    steps = {topic.name for topic in schema.ALL_TOPICS if topic.message in schema.STEP_MESSAGES}
     left_out = set() if values.get("steps_recorded", True) else steps
     return {name: count for name, count in counts.items() if name not in left_out}

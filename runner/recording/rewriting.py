@@ -23,7 +23,7 @@ from runner.recording.records import (
     walk,
 )
 from runner.recording.run_file import Summary
-from runner.recording.schema import STEP, TOPIC_OF, TOPICS, Topic
+from runner.recording.schema import ALL_TOPICS, STEP_MESSAGES, TOPIC_OF, Topic
 from runner.recording.writer import RecordingFile
 from runner.util.files import open_regular
 
@@ -37,6 +37,7 @@ def rewrite(
     change: Change,
     more: Mapping[str, Mapping[str, str]] | None = None,
     left_out: Collection[str] = (),
+    add: Callable[[RecordingFile], None] = lambda _: None,
 ) -> None:
     """Write a recording into a new file with its metadata changed.
 
@@ -48,7 +49,8 @@ def rewrite(
         fresh: the new file.
         change: what becomes of each metadata record.
         more: metadata records to add, by name.
-        left_out: the names of attachments to leave out.
+        left_out: the names of attachments and topics to leave out.
+        add: called with the new file, to add messages.
 
     Raises:
         RecordingError: the recording is damaged, not merely cut off.
@@ -74,7 +76,10 @@ def rewrite(
                     file.add_attachment(*attachment)
             elif opcode == Opcode.CHUNK:
                 chunk = read_chunk(body, offset)
-                file.add_chunk(TOPIC_OF[chunk.summary.channel], copied_chunk(chunk, body, indexed))
+                topic = TOPIC_OF[chunk.summary.channel]
+                if topic.name not in left_out:
+                    file.add_chunk(topic, copied_chunk(chunk, body, indexed))
+        add(file)
         for name, added in (more or {}).items():
             file.add_metadata(name, added)
         file.finish("" if result is None else "result", result)
@@ -127,7 +132,7 @@ def continues(path: Path, earlier: Path) -> bool:
 def _is_stated(result: Summary, seen: dict[str, str]) -> bool:
     """Return whether a result states these digests; those of steps that are not recorded are not compared."""
     if not result.steps_recorded:
-        steps = {topic.name for topic in TOPICS if topic.message is STEP}
+        steps = {topic.name for topic in ALL_TOPICS if topic.message in STEP_MESSAGES}
         seen = seen | {name: digest for name, digest in result.topic_digests.items() if name in steps}
     return dict(result.topic_digests) == seen and combined_digest(seen) == result.content_digest
 

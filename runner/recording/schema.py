@@ -278,6 +278,17 @@ CHECKPOINT = MessageType(
 CLOCK = MessageType("Clock", (Field(1, "started", _DOUBLE), Field(2, "seconds", _DOUBLE)))
 """How much time had passed at its position; `clock` describes its fields."""
 
+ACTIONS = MessageType(
+    "Actions",
+    (
+        Field(1, "step", _SFIXED64),
+        Field(2, "count", _FIXED32),
+        Field(3, "data", _BYTES),
+        Field(4, "digests", _BYTES),
+    ),
+)
+"""A block of steps of which only the actions were recorded; `actions` describes its columns."""
+
 LOG_LEVELS: Final = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
 
 TRAIN_STEP = Topic("/train/step", 1, STEP, "train")
@@ -328,6 +339,9 @@ CLOCK_TOPIC = Topic("/clock", 30, CLOCK, digested=False)
 MACHINE_TOPICS: Final = (CLOCK_TOPIC,)
 """The topics of how the recording went on its machine: other messages each time a job is run."""
 
+TRAIN_ACTIONS = Topic("/train/actions", 40, ACTIONS, "train", digested=False)
+EVAL_ACTIONS = Topic("/eval/actions", 41, ACTIONS, "eval", digested=False)
+
 LOOP_TOPICS: Final = {
     "step": (TRAIN_STEP, EVAL_STEP, TRAIN_RESET, EVAL_RESET),
     "transition": (TRAIN_TRANSITION, EVAL_TRANSITION, TRAIN_RESET, EVAL_RESET),
@@ -344,6 +358,7 @@ _EVERY_LOOP: Final = (
     *(SCALAR_TOPIC, ARRAY_TOPIC, TRAIN_FRAME, EVAL_FRAME, LOG_TOPIC),
     *(TRAIN_RESET_STATE, EVAL_RESET_STATE),
     *(EXTRA_COLUMNS_TOPIC, TRAIN_EXTRA, EVAL_EXTRA, CHECKPOINT_TOPIC),
+    *(TRAIN_ACTIONS, EVAL_ACTIONS),
 )
 KINDS: Final = {
     "job": (*TOPICS, *MACHINE_TOPICS),
@@ -370,6 +385,8 @@ EXTRA_TOPICS: Final = (TRAIN_EXTRA, EVAL_EXTRA)
 UNIFORM_TOPICS: Final = (*ALL_BLOCK_TOPICS, *EXTRA_TOPICS)
 """The topics whose messages have one size within a chunk."""
 
+STEP_MESSAGES: Final = (STEP, TRANSITION)
+"""The messages that are a step."""
 PHASES: Final = {"train": (TRAIN_STEP, TRAIN_EPISODE), "eval": (EVAL_STEP, EVAL_EPISODE)}
 """The step and the episode topic of each phase of a job."""
 PHASE_NAMES: Final = {"train": "training", "eval": "evaluation"}

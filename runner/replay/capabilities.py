@@ -22,7 +22,7 @@ def why_not_redone(recording: Recording, trust: bool = False) -> str:
     """Return why the recorded actions cannot be repeated in the environment; empty if it can be tried."""
     if recording.can_train_again:
         return "The run was trained here: `dualtaxi verify` trains it again instead."
-    if not recording.has_steps:
+    if not recording.has_actions:
         return "No steps were recorded."
     if recording.lost:
         return "A part of the recording was lost, and what follows depends on it."

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from runner.errors import CannotRedo
 from runner.recording import schema
+from runner.recording.actions import EpisodeDigests
 from runner.recording.reader import Recording
 from runner.replay.differences import Difference, differing_value, first_differing_row
 from runner.replay.recorded import RecordedReset
@@ -51,13 +52,14 @@ class Comparison:
 
     def __init__(self, recording: Recording, tolerance: float) -> None:
         self._recording, self._tolerance = recording, tolerance
+        self._digests = {phase: EpisodeDigests() for phase in schema.PHASES}
 
     def of(self, part: Part) -> RedoneSteps:
         """Return steps that were done again, up to the first difference."""
         phase, environment, rows, resets, results = part
-        recorded = _recorded_values(rows)
+        recorded = _recorded_values(rows, results)
         done, resets_done = results.done, results.resets_done
-        place = self._first_row(rows, recorded, results)
+        place = self._first_row(part, recorded)
         failed_reset = self._first_reset(resets, results)
         if place is not None and (failed_reset is None or resets[failed_reset][0] > place[0]):
             done = place[0] + 1
@@ -118,10 +120,9 @@ class Comparison:
         episode, t, step = (int(row[name]) for name in ("episode", "t", "step"))
         return self._difference(phase, environment, episode, t, step, "error", None, got)
 
-    def _first_row(
-        self, rows: NDArray[np.void], recorded: Values, results: Results
-    ) -> tuple[int, str] | None:
+    def _first_row(self, part: Part, recorded: Values) -> tuple[int, str] | None:
         """Return the first row that differs, and the first field of it that does; None if none does."""
+        rows, results = part.rows, part.results
         done, found = results.done, []
         for name in ("observations", "rewards", "terminated", "truncated"):
             was, got = getattr(recorded, name)[:done], getattr(results, name)[:done]
@@ -131,7 +132,24 @@ class Comparison:
             got = getattr(results, name)[:done]
             if len(got) and (rows[name][:done] != got).any():
                 found.append((int(np.argmax(rows[name][:done] != got)), name))
+        if (wrong := self._first_digest(part)) is not None:
+            found.append((wrong, "digest"))
         return min(found, key=lambda place: place[0]) if found else None
+
+    def _first_digest(self, part: Part) -> int | None:
+        """Return the first row at which the episode so far has another digest than was recorded."""
+        phase, environment, rows, _, results = part
+        done, got = results.done, results.values
+        if not done or "digest" not in (rows.dtype.names or ()):
+            return None
+        outcomes = got.observations[:done], got.rewards[:done], got.terminated[:done], got.truncated[:done]
+        recorded = np.ascontiguousarray(rows["digest"][:done])
+        marked = set(np.flatnonzero(recorded.view(np.uint8).reshape(done, -1).any(axis=1)).tolist())
+        digests = self._digests[phase]
+        for row, digest in digests.add(environment, rows["t"][:done], *outcomes, marked):
+            if row in marked and digest != recorded[row].tobytes():
+                return row
+        return None
 
     def _first_reset(self, resets: Sequence[tuple[int, RecordedReset]], results: Results) -> int | None:
         """Return the number of the first reset whose observation differs; None if none does."""
@@ -144,6 +162,10 @@ class Comparison:
     def _row_difference(self, part: Part, recorded: Values, row: int, name: str) -> Difference:
         """Return the difference in a field of a row."""
         phase, environment, rows, _, results = part
+        episode, t, step = (int(rows[row][each]) for each in ("episode", "t", "step"))
+        if name == "digest":
+            field, was = "digest of the episode so far", rows[row]["digest"].tobytes().hex()
+            return self._difference(phase, environment, episode, t, step, field, was, "another one")
         was, got = (
             (rows[name][row], getattr(results, name)[row])
             if name.startswith("agents_")
@@ -160,7 +182,6 @@ class Comparison:
             was, got = float(was[agent]), float(got[agent])
         else:
             field, was, got = name, was.item(), got.item()
-        episode, t, step = (int(rows[row][each]) for each in ("episode", "t", "step"))
         return self._difference(phase, environment, episode, t, step, field, was, got)
 
     def _difference(
@@ -180,8 +201,12 @@ class Comparison:
         return Difference(phase, number, t, step, environment, field, recorded, got)
 
 
-def _recorded_values(rows: NDArray[np.void]) -> Values:
+def _recorded_values(rows: NDArray[np.void], results: Results) -> Values:
+    """Return what was recorded of steps; of observations and rewards without a record what came of them."""
     names = rows.dtype.names or ()
+    if "rewards" not in names:
+        got = results.values
+        return Values(got.observations, got.rewards, rows["terminated"], rows["truncated"])
     observations = rows["next_state" if "next_state" in names else "next_observation"]
     return Values(observations, rows["rewards"], rows["terminated"], rows["truncated"])
 

@@ -157,7 +157,10 @@ def _time_of(recording: Recording, phase: str, number: int, step: int) -> int:
 def _step_time(recording: Recording, phase: str, step: int) -> int:
     """Return the `log_time` of a step of a phase."""
     topic = recording.topic(f"/{phase}/step")
-    if topic in recording.dtypes:
+    if recording.has_messages(f"/{phase}/actions"):
+        found = (block[block["step"] == step] for block in recording.actions(phase))
+        times = (int(block["log_time"][0]) for block in found if len(block))
+    elif topic in recording.dtypes:
         times = (int(block["log_time"][0]) for block in recording.blocks(topic, step, step + 1))
     else:
         times = (int(each["log_time"]) for each in recording.decoded(topic) if each["step"] == step)

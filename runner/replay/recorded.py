@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.actions import kept_dtype
 from runner.recording.reader import Recording
 from runner.recording.reset_states import ResetState
 from runner.recording.schema import STEP_NANOSECONDS
@@ -21,6 +22,7 @@ from runner.recording.schema import STEP_NANOSECONDS
 _ROWS: Final = 1024
 """Steps of varying size in a piece."""
 _FOREVER: Final = 2**63 - 1
+_BLOCK_BYTES: Final = 16 << 20
 _Row = tuple[Any, ...]
 """Number, environment, episode, step, time, seed, whether it has one, and observation of a reset."""
 _Extra = tuple[dict[str, Any] | None, int | None]
@@ -212,7 +214,7 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
     if "content_digest" not in recording.result:
         stop = recording.whole_steps(phase)
         rows = (whole for block in rows if len(whole := block[block["step"] < stop]))
-    nothing = np.empty(0, _row_dtype(recording, recording.topic(f"/{phase}/step")))
+    nothing = np.empty(0, _row_dtype(recording, phase))
     for block in rows:
         first, time = int(block["step"][0]), int(block["log_time"][0]) - STEP_NANOSECONDS
         early = []
@@ -268,7 +270,9 @@ def _blocks(
     """Yield the steps of a phase in blocks, each without steps of the other phase in between."""
     topic = recording.topic(f"/{phase}/step")
     stop = _FOREVER if stop_time is None else stop_time + 1
-    if topic in recording.dtypes:
+    if recording.has_messages(f"/{phase}/actions"):
+        found = _action_blocks(recording, phase, start_time, stop)
+    elif topic in recording.dtypes:
         found = recording.blocks_between(topic, start_time + 1, stop)
     else:
         found = _variable_blocks(recording, topic, range(start_time + 1, stop))
@@ -281,9 +285,27 @@ def _blocks(
             yield block[begin:end]
 
 
+def _action_blocks(recording: Recording, phase: str, start: int, stop: int) -> Iterator[NDArray[np.void]]:
+    """Yield the steps logged after `start` and before `stop` of which only the actions were recorded."""
+    rows_each = capacity_of_steps(recording, phase)
+    for block in recording.actions(phase, range(start + 1, _FOREVER)):
+        times = block["log_time"]
+        if times[0] >= stop:
+            return
+        own = block[(times > start) & (times < stop)]
+        for first in range(0, len(own), rows_each):
+            yield own[first : first + rows_each]
+
+
+def capacity_of_steps(recording: Recording, phase: str) -> int:
+    """Return how many steps of all environments fit into some megabytes when they are whole."""
+    width = recording.dtypes[recording.topic(f"/{phase}/step")].itemsize * recording.environments
+    return max(_BLOCK_BYTES // width, 1) * recording.environments
+
+
 def _variable_blocks(recording: Recording, topic: schema.Topic, times: range) -> Iterator[NDArray[np.void]]:
     """Yield messages of varying size as records, their values of spaces as bytes."""
-    dtype, learners = _row_dtype(recording, topic), len(recording.agents)
+    dtype, learners = _row_dtype(recording, topic.phase), len(recording.agents)
     rows: list[tuple[Any, ...]] = []
     for message in recording.decoded(topic, times=times):
         if len(message["rewards"]) != learners:
@@ -301,8 +323,11 @@ def _variable_blocks(recording: Recording, topic: schema.Topic, times: range) ->
         yield np.array(rows, dtype)
 
 
-def _row_dtype(recording: Recording, topic: schema.Topic) -> np.dtype[np.void]:
-    """Return the dtype of the records of steps."""
+def _row_dtype(recording: Recording, phase: str) -> np.dtype[np.void]:
+    """Return the dtype of the steps in pieces."""
+    topic = recording.topic(f"/{phase}/step")
+    if recording.has_messages(f"/{phase}/actions"):
+        return kept_dtype(recording.dtypes[topic])
     if topic in recording.dtypes:
         return recording.dtypes[topic]
     learners = len(recording.agents)

@@ -64,6 +64,8 @@ def _require_open(run: Run) -> None:
         raise RunnerError(
             f"join: run {run.run_id} is a job, which the runner trains; expected one of runner.record."
         )
+    if (steps := run.file.config.get("recording", {}).get("steps", "all")) != "all":
+        raise RunnerError(f"join: run {run.run_id} is recorded with steps {steps!r}, expected all.")
     if run.status != "running":
         raise RunnerError(
             f"join: run {run.run_id} is {run.status}, expected one that is still being recorded. "

@@ -81,31 +81,40 @@ def resume_command(
 @click.command("rerecord", cls=Command)
 @run_argument
 @recordings_option
+@trust_option
 @json_option
-def rerecord_command(run_name: str, recordings: Path | None, as_json: bool) -> None:
-    """Record the steps of RUN, which was run with recording.steps: none.
+def rerecord_command(run_name: str, recordings: Path | None, trust: bool, as_json: bool) -> None:
+    """Record the steps of RUN, which was recorded without them.
 
-    The run is trained again. The full recording replaces the old one once it is complete and has the same
-    content digest, which proves that these are its steps. Nothing is done for a run that has its steps.
+    A job (recording.steps: none) is trained again. The environment of a loop (steps="actions") takes the
+    recorded actions again, in a process with limits. The full recording replaces the old one once it is
+    complete and has the same content digest, which proves that these are its steps. Nothing is done for a
+    run that has its steps.
 
     Example:
       dualtaxi run quick --set recording.steps=none
       dualtaxi rerecord @latest
     """
-    from runner.execution.rerecord import holds_steps, rerecord
+    from runner.execution.rerecord import holds_steps, is_done_again, rerecord
 
     run = find(run_name, recordings)
     require_over(run)
-    had_steps = run.status == "finished" and holds_steps(run)
-    with job_progress("", run.episodes_to_do or 0) as (report, interrupt):
-        run = rerecord(run, report, interrupt)
+    is_loop = is_done_again(run)
+    had_steps = (is_loop or run.status == "finished") and holds_steps(run)
+    if is_loop:
+        steps = (run.summary.train_steps or 0) + (run.summary.eval_steps or 0)
+        with count_line("steps done again", steps) as count:
+            run = rerecord(run, trust=trust, count=count)
+    else:
+        with job_progress("", run.episodes_to_do or 0) as (report, interrupt):
+            run = rerecord(run, report, interrupt)
     if as_json:
         print_json(run_as_json(run))
     elif not had_steps:
         proof = {"proof": "the content digest is the one that the run had"}
         draw(facts(run_facts(run) | proof | {"next": command_for(run, "play")}))
     if had_steps:
-        say(f"Run {run.run_id} holds its steps already; there is nothing to do.")
+        say(f"Run {run.run_id} leaves no steps out; there is nothing to do.")
 
 
 TRIALS: Final = 200

@@ -20,7 +20,7 @@ from runner.util.humanize import UNKNOWN, size
 
 if TYPE_CHECKING:
     from runner.execution.redo import Redone
-    from runner.execution.verify import Verification
+    from runner.execution.verification import Verification
     from runner.recording.repair import Repair
     from runner.runs.run import Run
 

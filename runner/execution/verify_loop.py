@@ -1,0 +1,161 @@
+"""Verify the recording of a loop: its bytes, and what in it follows from the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import Diverged, RecordingError
+from runner.execution.verification import (
+    LOOP_NOT_COMPARED,
+    NOT_COMPLETE,
+    Verification,
+    compare_names,
+    compare_result,
+    with_difference,
+)
+from runner.recording import schema
+from runner.recording.blocks import message_record
+from runner.recording.consistency import Findings, check_extras, check_phase
+from runner.recording.digest import ContentHash, combined_digest
+from runner.recording.loop_blocks import Inconsistent, check_without_steps
+from runner.recording.reader import Recording
+from runner.runs.checkpoints import read_checkpoints
+
+
+def verify_loop(recording: Recording) -> Verification:
+    """Verify the recording of a user's own loop; `runner.execution.redo` does its steps again.
+
+    Compared are the numbers of its messages, its steps with the environment's outcomes where it is tabular,
+    steps, resets and episodes with one another, and its digest with its messages.
+    """
+    finished = "content_digest" in recording.result
+    notes = [] if finished else [NOT_COMPLETE]
+    if recording.leaves_out_steps:
+        notes.append("whole steps were left out: digests represent their observations and rewards")
+    found = Verification(
+        recording.path,
+        train_steps=recording.step_count("train"),
+        eval_steps=recording.step_count("eval"),
+        not_compared=LOOP_NOT_COMPARED,
+        needs_redo=True,
+    )
+    try:
+        compare_names(recording)
+        content = _Content(recording)
+        phases = {phase: _check_phase(recording, phase, finished, content) for phase in schema.PHASES}
+        for phase in phases:
+            check_extras(recording, phase, finished, content.add)
+        content.add_other_topics()
+        notes += _check_checkpoints(recording)
+        if content.off_table:
+            strange = f"{content.off_table:,} steps"
+            notes.append(f"{strange} are no outcome of the environment's table: it has other rules too")
+        for phase, findings in phases.items():
+            notes += _unusual(recording, phase, findings)
+        steps, last = found.train_steps + found.eval_steps, max(each.last_time for each in phases.values())
+        if finished and steps and last != steps * schema.STEP_NANOSECONDS:
+            taken = last // schema.STEP_NANOSECONDS
+            raise Inconsistent(f"found {steps:,} steps, expected {taken:,} by the time of the last")
+    except Inconsistent as error:
+        return replace(found, notes=tuple(notes), finding=f"{recording.path}: {error}")
+    except Diverged as error:
+        return with_difference(replace(found, notes=tuple(notes)), error)
+    found = replace(found, notes=tuple(notes))
+    if not finished:
+        return found
+    digests, counts = content.digest.topics(), content.counts
+    if recording.leaves_out_steps:
+        stated = recording.result.topic_digests
+        for name in ("/train/step", "/eval/step"):
+            counts[name] = recording.result.messages.get(name, 0)
+            digests |= {each: digest for each, digest in stated.items() if each == name}
+    expected = {
+        "topic_digests": digests,
+        "messages": {name: count for name, count in counts.items() if count},
+        "train_steps": counts["/train/step"],
+        "eval_steps": counts["/eval/step"],
+        "episodes": counts["/train/episode"],
+        "content_digest": combined_digest(digests),
+    }
+    if recording.result.rewards_off_table is not None and not recording.leaves_out_steps:
+        expected["rewards_off_table"] = sum(findings.rewards_off_table for findings in phases.values())
+    return compare_result(found, recording, expected)
+
+
+def _check_phase(recording: Recording, phase: str, finished: bool, content: _Content) -> Findings:
+    """Compare the messages of a phase with one another, and add them to the content."""
+    if recording.leaves_out_steps:
+        return Findings(last_time=check_without_steps(recording, phase, content.add))
+    return check_phase(recording, phase, finished, content.add)
+
+
+class _Content:
+    """Digest and number of the messages of a loop's recording, and its steps outside the outcome table."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self.digest = ContentHash()
+        self.counts = {topic.name: 0 for topic in recording.topics}
+        self.off_table = 0
+
+    def add(self, topic: schema.Topic, block: NDArray[np.void]) -> None:
+        """Add messages of a fixed-width topic."""
+        self.digest.update(topic, np.ascontiguousarray(block).view(np.uint8).data)
+        self.counts[topic.name] += len(block)
+        if topic.message is schema.STEP and self._recording.tabular:
+            outcomes = self._recording.mdp.outcomes_to(block["state"], block["action"], block["next_state"])
+            self.off_table += int(np.count_nonzero(~outcomes.any(axis=1)))
+
+    def add_other_topics(self) -> None:
+        """Add all messages of the topics of varying size whose number a result states."""
+        for topic in self._recording.topics:
+            is_added = topic in self._recording.dtypes or topic.message is schema.EXTRA
+            if is_added or topic in schema.MACHINE_TOPICS:
+                continue
+            for time, payload in self._recording.messages(topic):
+                if topic.digested:
+                    self.digest.update(topic, message_record(topic, time, payload))
+                self.counts[topic.name] += 1
+
+
+def _check_checkpoints(recording: Recording) -> list[str]:
+    """Compare the contents of a run's checkpoints with their digests; return a note if some are not here.
+
+    Raises:
+        Inconsistent: one was changed, or the recording has an invalid one.
+    """
+    missing = []
+    try:
+        for checkpoint in read_checkpoints(recording, recording.path.absolute().parent.parent):
+            if checkpoint.path.exists():
+                checkpoint.check()
+            else:
+                missing.append(checkpoint.reference)
+    except RecordingError as error:
+        raise Inconsistent(str(error)) from error
+    if not missing:
+        return []
+    return [f"the contents of {len(missing):,} checkpoints are not here, the first {missing[0]}"]
+
+
+def _unusual(recording: Recording, phase: str, findings: Findings) -> Iterator[str]:
+    """Yield notes on what is unusual in a phase of a loop, but possible.
+
+    Raises:
+        Inconsistent: the environment cannot have done it.
+    """
+    if findings.rewards_off_table:
+        where = f"/{phase}/step, step {findings.first_off_table}: rewards"
+        if recording.result.rewards_off_table == 0:
+            raise Inconsistent(f"{where}: found one that the environment's table excludes for this step")
+        count = findings.rewards_off_table
+        yield f"{where}: {count:,} steps have rewards that are not in the environment's table"
+    if findings.begun_without:
+        where = f"/{phase}/step, step {findings.first_without}"
+        if findings.begun_by_reset >= findings.begun_without:
+            raise Inconsistent(f"{where}: found an episode without a reset before it, as others have")
+        yield f"{where}: {findings.begun_without:,} episodes began without a reset"

@@ -1,0 +1,98 @@
+"""Records the actions of a loop alone; `actions` describes the messages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.recording import schema
+from runner.recording.actions import ACTION_TOPICS, COLUMNS, MARK, NUMBERS, EpisodeDigests, Rows, kept_dtype
+from runner.recording.messages import encode
+from runner.recording.recorder import Recorder
+from runner.recording.schema import RESET_ONLY, Topic
+
+
+class ActionRecorder:
+    """Records the actions of the steps that a recorder gets and leaves out of the file.
+
+    Args:
+        recorder: takes the messages.
+        environments: how many take turns.
+        block_steps: how many steps a message has, but for those that are flushed by time.
+    """
+
+    def __init__(self, recorder: Recorder, environments: int, block_steps: int) -> None:
+        self._recorder, self._n, self._block_steps = recorder, environments, block_steps
+        self._digests = {phase: EpisodeDigests() for phase in schema.PHASES}
+        self._rows: list[Rows] = []
+        self._phase = ""
+
+    def take_records(self, topic: Topic, records: Rows) -> None:
+        """Take the steps among the records that the recorder gets."""
+        if topic.name not in ACTION_TOPICS:
+            return
+        if topic.phase != self._phase:
+            self.commit()
+            self._phase = topic.phase
+        rows = np.zeros(len(records), kept_dtype(records.dtype))
+        for name in rows.dtype.names or ():
+            if name != "digest":
+                rows[name] = records[name]
+        for environment in range(self._n):
+            own = np.flatnonzero(rows["step"] % self._n == environment) if self._n > 1 else slice(None)
+            at, found = np.arange(len(rows))[own], records[own]
+            taken = found["t"] != RESET_ONLY
+            if not taken.all():
+                at, found = at[taken], found[taken]
+            for row, digest in self._digests[topic.phase].add(environment, *_outcomes(found)):
+                rows["digest"][at[row]] = np.void(digest)
+        self._rows.append(rows)
+        if sum(map(len, self._rows)) >= self._block_steps:
+            self.commit()
+
+    def commit(self) -> None:
+        """Hand what was taken to the recorder.
+
+        Raises:
+            StorageError: the disk is full or failing.
+        """
+        if self._rows:
+            rows, self._rows = np.concatenate(self._rows), []
+            position = int(rows["log_time"][-1]) // schema.STEP_NANOSECONDS
+            topic = ACTION_TOPICS[f"/{self._phase}/step"]
+            self._recorder.append(topic, encode(schema.ACTIONS, _packed(rows, self._n)), position)
+
+
+def _outcomes(rows: Rows) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Return number in the episode, observations, rewards and ends of whole records."""
+    names = rows.dtype.names or ()
+    observations = rows["next_state" if "next_state" in names else "next_observation"]
+    return rows["t"], observations, rows["rewards"], rows["terminated"], rows["truncated"]
+
+
+def _packed(rows: Rows, n: int) -> dict[str, Any]:
+    """Return the fields of a message for a block of steps."""
+    columns = []
+    for name in rows.dtype.names or ():
+        if name in COLUMNS:
+            values = np.ascontiguousarray(rows[name])
+            if name in NUMBERS:
+                values[n:] -= values[:-n].copy()
+            columns.append(values.view(np.uint8).reshape(len(rows), -1).T.tobytes())
+    last = np.zeros(len(rows), np.bool_)  # of an episode, in the block
+    digests = rows["digest"].copy().view(np.uint8).reshape(len(rows), -1)
+    for environment in range(n):
+        own = np.flatnonzero((rows["step"] % n == environment) & digests.any(axis=1))
+        if len(own):
+            episode = rows["episode"][own]
+            last[own] = np.append(episode[1:] != episode[:-1], True)
+    marks = np.zeros(int(last.sum()), MARK)
+    marks["row"], marks["digest"] = np.flatnonzero(last), rows["digest"][last]
+    return {
+        "step": int(rows["step"][0]),
+        "count": len(rows),
+        "data": b"".join(columns),
+        "digests": marks.tobytes(),
+    }

@@ -1,0 +1,130 @@
+"""Steps recorded by their actions alone: everything else comes again when the environment takes them.
+
+A message has a block of consecutive steps in columns: the action, the place in the episode, the ends. The
+observations and rewards are represented by digests: one for each episode up to its last step in the block.
+Episodes and steps are numbered in each environment by itself, so numbers are stored as differences from the
+step before of the same environment; and every column byte by byte, as that compresses best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+from blake3 import blake3
+from numpy.typing import NDArray
+
+from runner.errors import RecordingError
+from runner.recording import schema
+
+DIGEST_BYTES: Final = 16
+COLUMNS: Final = (
+    *("action", "episode", "t", "terminated", "truncated", "acted"),
+    *("agents_terminated", "agents_truncated", "log_time"),
+)
+"""The fields of a step that are kept, in the order of a message."""
+NUMBERS: Final = ("episode", "t", "log_time")
+"""Those that are stored as differences."""
+MARK: Final = np.dtype([("row", "<u4"), ("digest", f"V{DIGEST_BYTES}")])
+_MAX_BLOCK_BYTES: Final = 64 << 20
+
+Rows = NDArray[np.void]
+
+
+def kept_dtype(step: np.dtype[np.void]) -> np.dtype[np.void]:
+    """Return the dtype of steps of which the actions were recorded.
+
+    `digest` is that of the episode up to this step, or all zeros where none was recorded.
+
+    Args:
+        step: the dtype of whole records.
+    """
+    kept = [(name, step[name]) for name in COLUMNS if name in (step.names or ())]
+    return np.dtype([("step", "<i8"), *kept, ("digest", f"V{DIGEST_BYTES}")])
+
+
+class EpisodeDigests:
+    """The running digests of the episodes of some environments, over what their steps brought."""
+
+    def __init__(self) -> None:
+        self._running: dict[int, Any] = {}
+
+    def add(
+        self,
+        environment: int,
+        t: NDArray[Any],
+        observations: NDArray[Any],
+        rewards: NDArray[Any],
+        terminated: NDArray[Any],
+        truncated: NDArray[Any],
+        at: Iterable[int] = (),
+    ) -> Iterator[tuple[int, bytes]]:
+        """Yield rows of consecutive steps of an environment, each with the digest of its episode so far.
+
+        The rows are the last of each episode, and those in `at`. Episodes whose beginning was not among the
+        steps so far are left out. A digest is BLAKE3 over the steps from the first on: observation, rewards
+        (float64), terminated, truncated.
+        """
+        rows = len(t)
+        dtype = [("o", observations.dtype, observations.shape[1:]), ("r", "<f8", rewards.shape[1:])]
+        whole = np.empty(rows, np.dtype([*dtype, ("e", "?", (2,))]))
+        whole["o"], whole["r"] = observations, rewards
+        whole["e"][:, 0], whole["e"][:, 1] = terminated, truncated
+        edges = sorted({0, *np.flatnonzero(t == 0).tolist(), *(row + 1 for row in at), rows})
+        data, size = whole.view(np.uint8).data, whole.itemsize
+        for first, stop in pairwise(edges):
+            if t[first] == 0:
+                self._running[environment] = blake3()
+            if (running := self._running.get(environment)) is not None:
+                running.update(data[first * size : stop * size])
+                yield stop - 1, running.digest(DIGEST_BYTES)
+
+
+def unpacked(fields: Mapping[str, Any], dtype: np.dtype[np.void], n: int, where: str) -> Rows:
+    """Return the steps in a message.
+
+    Args:
+        fields: of the message.
+        dtype: as `kept_dtype` returns it.
+        n: how many environments take turns.
+        where: for errors.
+
+    Raises:
+        RecordingError: the message is damaged.
+    """
+    count, data = fields["count"], fields["data"]
+    names = [name for name in dtype.names or () if name in COLUMNS]
+    width = sum(dtype[name].itemsize for name in names)
+    if count * dtype.itemsize > _MAX_BLOCK_BYTES or len(data) != count * width or not count:
+        raise RecordingError(f"{where}: found {len(data):,} bytes for {count:,} steps of {width} bytes")
+    if len(fields["digests"]) % MARK.itemsize:
+        raise RecordingError(f"{where}: found digests of {len(fields['digests']):,} bytes")
+    rows = np.zeros(count, dtype)
+    rows["step"] = fields["step"] + np.arange(count)
+    at = 0
+    for name in names:
+        size = dtype[name].itemsize
+        planes = np.frombuffer(data, np.uint8, count * size, at).reshape(size, count)
+        values = np.ascontiguousarray(planes.T).view(dtype[name].base).reshape(count, *dtype[name].shape)
+        if name in NUMBERS:
+            values = _summed(values, n)
+        rows[name] = values
+        at += count * size
+    marks = np.frombuffer(fields["digests"], MARK)
+    if (marks["row"] >= count).any():
+        raise RecordingError(f"{where}: found the digest of a step that it does not have")
+    rows["digest"][marks["row"]] = marks["digest"]
+    return rows
+
+
+def _summed(values: NDArray[Any], n: int) -> NDArray[Any]:
+    """Return the numbers whose differences from n rows before these are."""
+    padded = np.zeros(-(-len(values) // n) * n, values.dtype)
+    padded[: len(values)] = values
+    return padded.reshape(-1, n).cumsum(axis=0, dtype=values.dtype).reshape(-1)[: len(values)]
+
+
+ACTION_TOPICS: Final = {"/train/step": schema.TRAIN_ACTIONS, "/eval/step": schema.EVAL_ACTIONS}
+"""Where the actions of the steps of a topic are recorded."""

@@ -1,0 +1,247 @@
+"""Loops of which only the actions were recorded: what is left, what comes again, and what is refused."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import textwrap
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import SyncVectorEnv
+from making import Rooms
+
+import runner
+from runner.errors import CannotRedo, ConfigError, Diverged, RunnerError
+from runner.execution.redo import verify_by_redoing
+from runner.execution.rerecord import rerecord
+from runner.execution.verify import verify
+from runner.recording.reader import open_recording
+from tests.waiting import until
+
+
+def single(env_id, steps=1500):
+    """Return a function that records training with resets in between, and evaluation."""
+
+    def play(folder, **options):
+        with runner.record(gymnasium.make(env_id), folder, seed=3, **options) as rec:
+            rec.action_space.seed(0)
+            over = True
+            for k in range(steps):
+                if over or k % 97 == 0:
+                    rec.reset(seed=5 if k == 0 else None)
+                *_, terminated, truncated, _ = rec.step(rec.action_space.sample())
+                over = terminated or truncated
+                if k % 400 == 399:
+                    with rec.phase("eval"):
+                        rec.reset(seed=k)
+                        for _ in range(7):
+                            rec.step(rec.action_space.sample())
+                    over = True
+        return rec.run
+
+    return play
+
+
+def vector(mode):
+    def play(folder, **options):
+        envs = SyncVectorEnv([lambda: gymnasium.make("CartPole-v1")] * 3, autoreset_mode=mode)
+        with runner.record_vector(envs, folder, **options) as rec:
+            rec.reset(seed=1)
+            rec.action_space.seed(0)
+            for k in range(300):
+                rec.step(rec.action_space.sample())
+                if k == 150:
+                    rec.reset()
+        return rec.run
+
+    return play
+
+
+def game(folder, **options):
+    from mpe2 import simple_spread_v3
+
+    with runner.record_parallel(simple_spread_v3.parallel_env(max_cycles=12), folder, **options) as rec:
+        for agent in rec.possible_agents:
+            rec.action_space(agent).seed(0)
+        for episode in range(5):
+            rec.reset(seed=episode)
+            while rec.agents:
+                rec.step({agent: rec.action_space(agent).sample() for agent in rec.agents})
+    return rec.run
+
+
+LOOPS = {
+    "states": single("Taxi-v4"),
+    "arrays": single("CartPole-v1"),
+    "continuous": single("Pendulum-v1"),
+    "next step": vector("NextStep"),
+    "same step": vector("SameStep"),
+    "game": game,
+}
+
+
+@pytest.fixture(scope="module", params=LOOPS)
+def runs(request, tmp_path_factory):
+    """Return a loop recorded whole, and the same by its actions alone."""
+    folder, play = tmp_path_factory.mktemp("actions"), LOOPS[request.param]
+    return play(folder, name="whole"), play(folder, name="actions", steps="actions")
+
+
+def test_the_content_is_that_of_whole_steps_which_come_again(runs, tmp_path):
+    whole, actions = runs
+    digest = whole.summary["content_digest"]
+    assert actions.summary["content_digest"] == digest
+    with open_recording(actions.recording) as recording, open_recording(whole.recording) as full:
+        assert not recording.has_steps
+        for phase in ("train", "eval"):
+            assert recording.step_count(phase) == full.count(full.topic(f"/{phase}/step"))
+            kept = list(recording.actions(phase))
+            steps = list(full.blocks(full.topic(f"/{phase}/step")))
+            for name in kept[0].dtype.names if kept else ():
+                if name != "digest":
+                    found = np.concatenate([block[name] for block in kept])
+                    assert found.tobytes() == np.concatenate([block[name] for block in steps]).tobytes()
+    assert verify(actions.recording).sound
+    redone = verify_by_redoing(actions.recording)
+    assert (redone.verdict, redone.left_out) == ("reproduced", 0)
+    assert redone.steps == verify_by_redoing(whole.recording).steps
+    after = rerecord(actions)
+    assert after.summary["content_digest"] == digest
+    assert verify(after.recording).content_digest == digest
+    with open_recording(after.recording) as recording, open_recording(whole.recording) as full:
+        assert not recording.leaves_out_steps
+        for phase in ("train", "eval"):
+            topic = full.topic(f"/{phase}/step")
+            parts = [[block.tobytes() for block in each.blocks(topic)] for each in (recording, full)]
+            assert b"".join(parts[0]) == b"".join(parts[1])
+    assert rerecord(after).summary == after.summary, "there is nothing left to do"
+
+
+def test_one_episode_comes_again_alone(tmp_path):
+    run = single("CartPole-v1")(tmp_path, steps="actions")
+    with open_recording(run.recording) as recording:
+        (steps,) = runner.replay.environment.redo(recording, "train", [9])
+        assert steps.difference is None
+        assert len(steps.recorded.rewards) == recording.episodes("train", 9, 10)["length"][0]
+
+
+class Other(gymnasium.Wrapper):
+    """Gives another reward at one step."""
+
+    def __init__(self, env, at=-1):
+        super().__init__(env)
+        self.at, self.taken = at, 0
+
+    def step(self, action):
+        observation, reward, *rest = self.env.step(action)
+        self.taken += 1
+        return observation, reward + (self.taken == self.at), *rest
+
+
+def test_another_reward_is_found_in_its_episode(tmp_path, monkeypatch):
+    with runner.record(Other(gymnasium.make("CartPole-v1"), at=70), tmp_path, steps="actions") as rec:
+        rec.reset(seed=0)
+        for _ in range(200):
+            *_, terminated, truncated, _ = rec.step(1)
+            if terminated or truncated:
+                rec.reset()
+    with open_recording(rec.run.recording) as recording:
+        make = lambda: gymnasium.make("CartPole-v1")  # noqa: E731
+        difference = [steps.difference for steps in runner.replay.environment.redo(recording, make=make)][-1]
+        ends = recording.episodes("train")["last_step"]
+    assert difference.field == "digest of the episode so far"
+    assert difference.step == ends[np.searchsorted(ends, 69)]
+
+
+def test_without_actions_nothing_comes_again(tmp_path):
+    play = single("CartPole-v1")
+    run, whole = play(tmp_path, steps="none"), play(tmp_path)
+    assert run.summary["content_digest"] == whole.summary["content_digest"]
+    assert verify(run.recording).sound
+    with pytest.raises(RunnerError, match="without its actions"):
+        rerecord(run)
+    redone = verify_by_redoing(run.recording)
+    assert (redone.verdict, redone.reason) == ("impossible", "No steps were recorded.")
+
+
+def test_values_that_vary_in_size_need_whole_steps(tmp_path):
+    with pytest.raises(ConfigError, match="vary in size"):
+        runner.record(Rooms(with_text=True), tmp_path, steps="actions")
+    with pytest.raises(ConfigError, match="steps: found 'some', expected all, actions or none"):
+        runner.record(gymnasium.make("CartPole-v1"), tmp_path, steps="some")
+    assert not runner.list_runs(tmp_path)
+
+
+def test_an_environment_of_ones_own_is_not_imported(tmp_path):
+    with runner.record(Rooms(), tmp_path, steps="actions") as rec:
+        rec.reset(seed=0)
+        rec.step(rec.action_space.sample())
+    before = rec.run.recording.read_bytes()
+    with pytest.raises(CannotRedo):
+        rerecord(rec.run)
+    assert rec.run.recording.read_bytes() == before
+    assert [path.name for path in rec.run.folder.iterdir() if "rerecording" in path.name] == []
+
+
+def test_a_killed_loop_keeps_its_actions_up_to_the_last_second(tmp_path):
+    script = textwrap.dedent("""
+        import sys, time, gymnasium, runner
+        with runner.record(gymnasium.make("CartPole-v1"), sys.argv[1], steps="actions") as rec:
+            rec.action_space.seed(0)
+            rec.reset(seed=0)
+            while True:
+                *_, terminated, truncated, _ = rec.step(rec.action_space.sample())
+                if terminated or truncated:
+                    rec.reset()
+                time.sleep(0.0005)
+        """)
+    process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)])
+    try:
+        until(
+            lambda runs: runs and runs[0].recording.stat().st_size > 40_000,
+            lambda: runner.list_runs(tmp_path),
+        )
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    (run,) = runner.list_runs(tmp_path)
+    redone = verify_by_redoing(run.recording)
+    assert redone.verdict == "reproduced"
+    assert redone.steps > 100
+    with pytest.raises(RunnerError, match="cut off"):
+        rerecord(run)
+
+
+def test_it_takes_less_than_a_byte_a_step_in_long_episodes(tmp_path):
+    def size(steps):
+        with runner.record(gymnasium.make("Acrobot-v1"), tmp_path, steps="actions") as rec:
+            rec.action_space.seed(0)
+            for k in range(steps):
+                if k % 500 == 0:
+                    rec.reset(seed=0 if k == 0 else None)
+                rec.step(rec.action_space.sample())
+        return rec.run.recording.stat().st_size
+
+    assert (size(40_000) - size(20_000)) / 20_000 < 1
+
+
+def test_a_changed_action_is_found(tmp_path, monkeypatch):
+    run = single("CartPole-v1", steps=300)(tmp_path, steps="actions")
+    from runner.replay import recorded
+
+    original = recorded.pieces
+
+    def changed(*arguments, **keywords):
+        for piece in original(*arguments, **keywords):
+            if piece.phase == "train" and len(piece.rows) > 50:
+                piece.rows["action"][40] ^= 1
+            yield piece
+
+    monkeypatch.setattr("runner.execution.rerecord_loop.pieces", changed)
+    from runner.execution.rerecord_loop import _write
+
+    with pytest.raises((CannotRedo, Diverged)):
+        _write(run.recording, tmp_path / "fresh.mcap", trust=False)
