@@ -56,7 +56,8 @@ def why_no_steps(recording: Recording) -> str:
     """Return why a recording has no steps, and the command that records them."""
     if recording.leaves_out_steps:
         return (
-            f"they were left out (recording.steps: none); `dualtaxi rerecord {recording.run_id}` records them"
+            f"they were left out (steps: {recording.config['recording']['steps']}); "
+            f"`dualtaxi rerecord {recording.run_id}` records them"
         )
     return "it ended before one was recorded"
 
