@@ -79,7 +79,7 @@ class Loop(Generic[R]):
         batch: (N,) for N environments that step at once, else ().
 
     Raises:
-        ConfigError: steps are to be left out whose values vary in size.
+        ConfigError: the steps of this environment, or of a shard, cannot be left out.
         StorageError: the recordings folder cannot be written.
     """
 
@@ -91,9 +91,6 @@ class Loop(Generic[R]):
         make_rows: Callable[[Recorder, Described, str, Callable[[Any], None]], R],
         batch: tuple[int, ...] = (),
     ) -> None:
-        if options.steps != "all" and (described.kind == "variable" or options.join is not None):
-            reason = "a shard has whole steps" if options.join else "the environment's values vary in size"
-            raise ConfigError(f"steps: found {options.steps!r}, expected all: {reason}.")
         is_shard = options.join is not None
         client = connect(str(options.recordings)) if is_server(options.recordings) and not is_shard else None
         self._started = time.monotonic()
@@ -137,10 +134,11 @@ class Loop(Generic[R]):
             watch=self._watch,
             before=self._describe,
         )
-        self._actions = None
-        if options.steps == "actions":
-            steps = options.packing.chunk_steps
-            self._actions = ActionRecorder(self._recorder, described.environments, steps)
+        self._actions = (
+            ActionRecorder(self._recorder, described.environments, options.packing.chunk_steps)
+            if options.steps == "actions"
+            else None
+        )
         self.extras = Extras(self._recorder, batch)
         self.messages = Messages(
             self,

@@ -71,7 +71,14 @@ class Options:
         checked_run_name(self.name)
 
     def config(self, described: Described) -> dict[str, Any]:
-        """Return the configuration that the recording carries."""
+        """Return the configuration that the recording carries.
+
+        Raises:
+            ConfigError: the steps of this environment, or of a shard, cannot be left out.
+        """
+        if self.steps != "all" and (described.kind == "variable" or self.join is not None):
+            reason = "a shard has whole steps" if self.join else "the environment's values vary in size"
+            raise ConfigError(f"steps: found {self.steps!r}, expected all: {reason}.")
         return {
             "name": self.name or described.env_id.rpartition("/")[2].rpartition(":")[2],
             "made_by": MADE_BY,
