@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from runner.errors import RecordingError, RunnerError, nearest
+from runner.recording.clock import read_clock
 from runner.recording.reader import Recording
-from runner.recording.schema import SCALAR_TOPIC
+from runner.recording.schema import SCALAR_TOPIC, STEP_NANOSECONDS, TRAIN_EPISODE
 
 Values = NDArray[np.float64]
 
@@ -47,7 +48,8 @@ class Axis:
 EPISODES: Final = Axis("episodes", "training episodes", whole=True)
 STEPS: Final = Axis("steps", "training steps", whole=True)
 UPDATES: Final = Axis("updates", "updates", whole=True)
-AXES: Final = {axis.name: axis for axis in (EPISODES, STEPS, UPDATES)}
+TIME: Final = Axis("time", "wall time", whole=False)
+AXES: Final = {axis.name: axis for axis in (EPISODES, STEPS, UPDATES, TIME)}
 
 
 def axis_of(name: str) -> Axis:
@@ -103,6 +105,8 @@ def positions(recording: Recording, axis: Axis) -> Positions:
         if recording.has_reports:  # each training step of a job updates its tables
             return Positions(STEPS, steps, values)
         steps, values = _updates(recording)
+    elif axis is TIME:
+        steps, values = _times(recording)
     return Positions(axis, steps, values)
 
 
@@ -133,6 +137,31 @@ def edges_of(axis: Axis, last: float, parts: int) -> Values:
     scale = next(factor for factor in (1, 2, 5, 10, 20) if factor * 10.0**power >= width * (1 - 1e-12))
     width = scale * 10.0**power
     return np.arange(max(math.ceil(last / width * (1 - 1e-12)), 1) + 1, dtype=np.float64) * width
+
+
+def _times(recording: Recording) -> tuple[Values, Values]:
+    """Return training steps, and the seconds that had passed when they were taken.
+
+    The clock counts the steps of evaluations too. In a run that has any, it is read at the ends of training
+    episodes, so that an evaluation is at the time at which it began.
+    """
+    clock = read_clock(recording)
+    if clock is None:
+        raise RecordingError(
+            f"{recording.path}: has no axis of wall time: no clock was recorded, as by earlier versions."
+        )
+    done = recording.done()
+    if not done["eval_steps"]:
+        return clock.positions.astype(np.float64), clock.seconds
+    stride = max(1, math.ceil(done["episodes"] / _MAX_KNOWN))
+    steps, values = [np.zeros(1)], [np.zeros(1)]
+    for block in recording.blocks(TRAIN_EPISODE):
+        known = block[block["episode"] % stride == 0]
+        steps.append(known["last_step"] + 1.0)
+        values.append(clock.seconds_at((known["log_time"] // STEP_NANOSECONDS).astype(np.int64)))
+    if len(steps) == 1:
+        return clock.positions.astype(np.float64), clock.seconds
+    return np.concatenate(steps), np.concatenate(values)
 
 
 def _updates(recording: Recording) -> tuple[Values, Values]:

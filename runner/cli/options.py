@@ -205,7 +205,7 @@ NUMBERS: Final = Parsed("numbers", "numbers such as 1000,49000", _numbers)
 PICTURE_SIZE: Final = Parsed("WxH", "WIDTHxHEIGHT up to 8192x8192, such as 1600x900", _picture_size)
 GRID: Final = Parsed("RxC", "ROWSxCOLUMNS up to 8x8, such as 3x3", _grid)
 TARGET: Final = Parsed("METRIC=LEVEL", "METRIC=LEVEL such as success_percent=80", _target)
-AXIS: Final = Parsed("axis", "episodes, steps or updates", _axis)
+AXIS: Final = Parsed("axis", "episodes, steps, updates or time", _axis)
 STEP: Final = Parsed("step", "EPISODE:T, or eval:N:TRIAL:T", _step)
 DIRECTORY: Final = click.Path(file_okay=False, path_type=Path)
 FILE: Final = click.Path(dir_okay=False, path_type=Path)
@@ -288,8 +288,8 @@ axis_option: Final = click.option(
     type=AXIS,
     default="episodes",
     show_default=True,
-    metavar="episodes|steps|updates",
-    help="Read metrics over training episodes, training steps, or updates as a loop logged them.",
+    metavar="episodes|steps|updates|time",
+    help="Read metrics over training episodes, training steps, updates as a loop logged them, or wall time.",
 )
 all_option: Final = click.option(
     "--all", "everything", is_flag=True, help="Include everything, not only a selection."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 
 import gymnasium
 import numpy as np
@@ -10,11 +11,12 @@ import pytest
 from click.testing import CliRunner
 
 import runner
-from runner.analysis.axes import AXES, EPISODES, STEPS, UPDATES, axis_of, edges_of
+from runner.analysis.axes import AXES, EPISODES, STEPS, TIME, UPDATES, axis_of, edges_of
 from runner.analysis.series import read_series
 from runner.cli import cli
 from runner.errors import RecordingError, RunnerError
 from runner.recording import schema
+from runner.recording.clock import read_clock
 from runner.recording.reader import open_recording
 
 STEPS_TAKEN = 2_000
@@ -125,6 +127,41 @@ def test_a_run_without_the_axis_is_refused_with_advice(folder, tmp_path):
     assert refused.exit_code == 2
     assert "has no axis of updates" in refused.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_wall_time_is_that_of_the_clock(tmp_path):
+    env = runner.record(gymnasium.make("CartPole-v1"), recordings=tmp_path, name="slow", seed=1)
+    env.reset(seed=1)
+    for step in range(1, 60):
+        *_, terminated, truncated, _ = env.step(step % 2)
+        if step == 30:
+            time.sleep(1.2)
+        if terminated or truncated:
+            env.reset()
+    env.close()
+    (run,) = runner.list_runs(tmp_path)
+    with open_recording(run.recording) as recording:
+        clock, episodes = read_clock(recording), recording.episodes("train")
+        over_time = read_series(recording, TIME)
+    ends = clock.seconds_at(episodes["last_step"] + 1)
+    assert clock.duration >= 1.2
+    edges = edges_of(TIME, clock.duration, 200)
+    assert [place for place, _ in over_time.training] == edges[
+        np.unique(np.searchsorted(edges, ends))
+    ].tolist()
+    assert 0 < edges[1] < 1
+
+
+def test_an_evaluation_is_at_the_time_at_which_it_began(taxis):
+    with open_recording(taxis.recording) as recording:
+        clock = read_clock(recording)
+        over_time = read_series(recording, TIME)
+        began = [
+            recording.episodes("train", e - 1, e)["log_time"][0] if e else 0
+            for e in (one["episode"] for one in recording.metrics("eval"))
+        ]
+    times = clock.seconds_at(np.array(began, np.int64) // schema.STEP_NANOSECONDS)
+    assert [place for place, _ in over_time.evaluation] == pytest.approx(times.tolist(), abs=1e-3)
 
 
 def test_updates_that_go_back_or_are_no_numbers_are_no_axis(tmp_path):

@@ -124,7 +124,7 @@ def test_metrics_are_complete_or_marked_as_thinned(client, recording):
 
 def test_metrics_are_read_over_any_axis_that_the_run_has(client, recording):
     over_steps = client.get(f"{RUN}/metrics", params={"axis": "steps", "metric": "success_percent"}).json()
-    assert [axis["name"] for axis in over_steps["axes"]] == ["episodes", "steps", "updates"]
+    assert [axis["name"] for axis in over_steps["axes"]] == ["episodes", "steps", "updates", "time"]
     (curve,) = over_steps["curves"]
     assert curve["positions"] == [record["step"] for record in recording.metrics("eval")]
     refused = client.get(f"{RUN}/metrics", params={"axis": "stops"})
