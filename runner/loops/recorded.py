@@ -152,7 +152,7 @@ class Recorded(Generic[R]):
             self.env.close()
         finally:
             if self._owner is None:
-                self._loop.close(*_ending(raised[1]))
+                self._loop.close(*ending_of(raised[1]))
         return False
 
     def _enter(self, phase: str) -> None:
@@ -172,7 +172,7 @@ class Recorded(Generic[R]):
         self._enter(self._phase)
 
 
-def _ending(error: BaseException | None) -> tuple[str, str]:
+def ending_of(error: BaseException | None) -> tuple[str, str]:
     """Return the status of a run that ended with this error, and the text of the error."""
     if error is None:
         return "finished", ""
@@ -188,7 +188,7 @@ def _close_abandoned(loop: Loop[Any]) -> None:
     """
     error = getattr(sys, "last_value", None)
     is_interactive = bool(sys.flags.interactive) or hasattr(sys, "ps1")
-    loop.close(*(("interrupted", "") if error is None or is_interactive else _ending(error)))
+    loop.close(*(("interrupted", "") if error is None or is_interactive else ending_of(error)))
 
 
 def given(**arguments: Any) -> dict[str, Any]:

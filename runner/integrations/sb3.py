@@ -1,0 +1,310 @@
+"""Stable-Baselines3 and sb3-contrib: `model.learn(100_000, callback=runner.integrations.sb3.Recording())`.
+
+The library resets the environments before it calls a callback. `learn` of every model is therefore made to
+announce itself to the callbacks of this module, when the module is imported; it is not changed otherwise.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final, Self
+
+import numpy as np
+
+from runner.errors import ConfigError, RunnerError
+from runner.integrations.libraries import require_tested
+from runner.loops.options import options_of
+from runner.loops.recorded import ending_of
+from runner.loops.values import warn_user
+from runner.loops.vector import RecordedVector
+from runner.runs.run import Run
+from runner.util.jsonable import as_mapping
+from runner.util.values import is_whole
+
+require_tested("stable_baselines3", "sb3", ("2.9", "2.9"))
+
+from stable_baselines3.common.base_class import BaseAlgorithm  # noqa: E402
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList  # noqa: E402
+from stable_baselines3.common.logger import KVWriter  # noqa: E402
+from stable_baselines3.common.vec_env import DummyVecEnv  # noqa: E402
+
+from runner.loops.recorded_vec_env import RecordedVecEnv  # noqa: E402
+
+_CLOCKS: Final = ("time/fps", "time/time_elapsed")
+"""What is not logged, because it differs between two runs that are otherwise the same."""
+_NOT_SETTINGS: Final = ("self", "env", "verbose", "tensorboard_log", "_init_setup_model", "logger")
+_MAX_TEXT: Final = 1_000
+
+
+class Recording(BaseCallback):  # type: ignore[misc]
+    """A callback that records what a model learns from, and what it logs.
+
+        model = PPO("MlpPolicy", "CartPole-v1", seed=0)
+        model.learn(100_000, callback=runner.integrations.sb3.Recording(name="ppo"))
+
+    Every environment is recorded as it is inside of the wrappers of its `VecEnv`: actions, observations and
+    rewards before `VecNormalize`, `VecFrameStack` and others change them, and the terminal observations of
+    episodes. Training is not changed: the weights are the same with and without.
+
+    Each `learn` is a run, which ends with it. `with Recording() as recording:` makes one run of all `learn`s
+    in the block that take the same environments.
+
+    Args:
+        recordings: as for `runner.record`, as are all others but the last one.
+        name: the name of the run; the environment's unless given.
+        seed: the seed that the run is listed with; the model's unless given.
+        config: your own settings, next to the model's.
+        info: names of fields of the infos to record.
+        frames_every: render a picture of each environment after this many steps.
+        frame_format: `png` or `jpeg`.
+        frames_of: the number of the environment to render, or several; all unless given.
+        make: a function that makes one of the environments, where it cannot be made from what is recorded.
+        checkpoint_every: keep the policy's parameters as the checkpoint `policy` after this many steps of
+            environments, and at the end; 0 for none.
+        packing: as for `runner.record`.
+
+    Raises:
+        ConfigError: an argument cannot be used.
+    """
+
+    def __init__(
+        self,
+        recordings: str | os.PathLike[str] | None = None,
+        *,
+        name: str | None = None,
+        seed: int | None = None,
+        config: object = None,
+        info: Sequence[str] = (),
+        frames_every: int = 0,
+        frame_format: str = "png",
+        frames_of: int | Sequence[int] | None = None,
+        make: str | Callable[[], Any] | None = None,
+        checkpoint_every: int = 0,
+        **packing: Any,
+    ) -> None:
+        super().__init__()
+        options_of(recordings, name, seed, config, info, packing, frames_every, frame_format)  # are valid
+        if not is_whole(checkpoint_every, 0, 2**62):
+            raise ConfigError(f"checkpoint_every: found {checkpoint_every!r}, expected a whole number from 0")
+        self._options = {"recordings": recordings, "name": name, "info": info, "make": make, **packing}
+        self._options |= {"frames_every": frames_every, "frame_format": frame_format, "frames_of": frames_of}
+        self._seed, self._config, self._checkpoint_every = seed, config, checkpoint_every
+        self._has_options = bool(config or frames_every or packing or info)
+        self._has_options |= any(one is not None for one in (recordings, name, seed, frames_of, make))
+        self._envs: RecordedVecEnv | None = None
+        self._is_own = False
+        """Whether this callback recorded the environments, and not `runner.record` before it."""
+        self._stays_open = False
+        self._next_checkpoint = 0
+
+    @property
+    def recorded(self) -> RecordedVector:
+        """What `runner.record` returns for the environments: `recorded.log("name", 1.0)`.
+
+        Raises:
+            RunnerError: `learn` was not called yet.
+        """
+        if self._envs is None:
+            raise RunnerError("found no run yet, expected one: it begins with model.learn(callback=...)")
+        return self._envs.recorded
+
+    @property
+    def run(self) -> Run:
+        """The run of the last `learn`; it has a `summary` once that is over."""
+        return self.recorded.run
+
+    def __enter__(self) -> Self:
+        self._stays_open = True
+        return self
+
+    def __exit__(self, *raised: Any) -> None:
+        self._stays_open = False
+        self._end(raised[1])
+
+    def _end(self, error: BaseException | None = None) -> None:
+        """End the run, unless `runner.record` began it."""
+        if self._is_own and self._envs is not None:
+            self._envs.restore_methods()
+            self.recorded._loop.close(*ending_of(error))
+
+    def begin(self, model: BaseAlgorithm, is_continued: bool) -> None:
+        """Record the environments of a model from now on; called by its `learn`.
+
+        Args:
+            model: the model.
+            is_continued: whether it continues episodes in progress.
+
+        Raises:
+            ConfigError: its environments cannot be recorded with these arguments, or not from here.
+            EnvironmentNotUsable: a space cannot be recorded.
+            StorageError: the recordings folder cannot be written.
+        """
+        base = model.get_env().unwrapped
+        if isinstance(base, RecordedVecEnv):
+            if self._has_options:
+                raise ConfigError(
+                    "found arguments of Recording for environments that runner.record records, expected "
+                    "checkpoint_every at most: give the others to runner.record"
+                )
+            self._envs, self._is_own = base, False
+            return
+        earlier = getattr(vars(base).get("step_wait"), "__self__", None)
+        if isinstance(earlier, RecordedVecEnv):
+            if earlier is self._envs and self._stays_open:
+                return
+            earlier.restore_methods()  # an error ended the `learn` before
+            earlier.recorded._loop.close("interrupted")
+        observations = _observations_in_progress(model, base) if is_continued else None
+        seed = model.seed if self._seed is None else self._seed
+        config = {**settings_of(model), **(as_mapping(self._config) or {})}
+        self._envs = RecordedVecEnv(base, {**self._options, "seed": seed, "config": config})
+        self._is_own = True
+        self._envs.replace_methods()
+        if is_continued:
+            self.recorded.record_reset(observations, [])
+
+    def _init_callback(self) -> None:
+        if self._envs is None:
+            raise RunnerError(
+                f"found that {type(self.model).__name__}.learn does not call BaseAlgorithm._setup_learn, as "
+                "others do. Record its environments instead, by runner.record(envs)."
+            )
+        formats = self.logger.output_formats
+        formats[:] = [one for one in formats if not isinstance(one, _LogWriter)]
+        formats.append(_LogWriter(self.recorded))
+
+    def _on_training_start(self) -> None:
+        self._next_checkpoint = self.num_timesteps + self._checkpoint_every
+
+    def _on_step(self) -> bool:
+        if self._checkpoint_every and self.num_timesteps >= self._next_checkpoint:
+            self._checkpoint()
+            self._next_checkpoint = self.num_timesteps + self._checkpoint_every
+        return True
+
+    def _on_training_end(self) -> None:
+        logger = self.logger
+        for writer in [one for one in logger.output_formats if isinstance(one, _LogWriter)]:
+            writer.write(logger.name_to_value, {})  # of the last update, which the library does not write
+            logger.output_formats.remove(writer)
+        if self._checkpoint_every:
+            self._checkpoint()
+        if not self._stays_open:
+            self._end()
+
+    def _checkpoint(self) -> None:
+        self.recorded.checkpoint("policy", self.model.policy.state_dict())
+
+
+class _LogWriter(KVWriter):  # type: ignore[misc]
+    """Records what the library's logger writes: numbers and texts."""
+
+    def __init__(self, recorded: RecordedVector) -> None:
+        self._recorded = recorded
+
+    def write(self, key_values: Mapping[str, Any], key_excluded: Any, step: int = 0) -> None:  # noqa: ARG002
+        """Record numbers and texts by name; figures, pictures, films and histograms are left out."""
+        for name, value in key_values.items():
+            is_number = isinstance(value, int | float | np.number) or (
+                hasattr(value, "item") and np.size(value) == 1
+            )
+            if (is_number or isinstance(value, str)) and name not in _CLOCKS:
+                self._recorded.log(name, value)
+
+    def close(self) -> None:
+        """Do nothing: the run is closed by the callback."""
+
+
+def settings_of(model: BaseAlgorithm) -> dict[str, Any]:
+    """Return a model's hyperparameters: the arguments of its class, as far as the model still has them.
+
+    A schedule that is constant is its number; another one is its first and last value.
+    """
+    names: dict[str, None] = {}
+    for kind in type(model).__mro__:
+        if "__init__" in vars(kind):
+            names |= dict.fromkeys(inspect.signature(kind.__init__).parameters)  # type: ignore[misc]
+    found = {
+        "algorithm": type(model).__name__,
+        "policy": getattr(model, "policy_class", type(model.policy)).__name__,
+    }
+    for name in names:
+        if name not in {*_NOT_SETTINGS, *found} and hasattr(model, name):
+            found[name] = _setting(getattr(model, name))
+    return found
+
+
+def _setting(value: Any) -> Any:
+    """Return a hyperparameter as JSON holds it; what JSON cannot hold, such as a class, by its name."""
+    if isinstance(value, Mapping):
+        return {str(key): _setting(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_setting(part) for part in value]
+    if value is None or isinstance(value, bool | int | float | str | np.generic | np.ndarray):
+        return value
+    if callable(value) and not isinstance(value, type):
+        try:
+            first, last = float(value(1.0)), float(value(0.0))
+        except Exception:  # it is no schedule, but any function
+            return getattr(value, "__qualname__", type(value).__name__)
+        return first if first == last else {"first": first, "last": last}
+    text = value.__name__ if isinstance(value, type) else str(value)
+    return type(value).__name__ if " object at 0x" in text else text[:_MAX_TEXT]
+
+
+def _observations_in_progress(model: BaseAlgorithm, base: Any) -> Any:
+    """Return the last observations of environments whose episodes are in progress.
+
+    Raises:
+        ConfigError: only their wrappers have them.
+    """
+    warn_user(
+        "learn(reset_num_timesteps=False) continues episodes that were not recorded from their beginning: "
+        "they are recorded from here, and cannot be reproduced. To record several learn() as one run: "
+        "with Recording(...) as recording."
+    )
+    if isinstance(base, DummyVecEnv):
+        return base._obs_from_buf()
+    if model.get_env() is base:
+        return model._last_obs
+    raise ConfigError(
+        f"found episodes in progress in a {type(base).__name__} with wrappers, expected to record from the "
+        "first learn(): with Recording(...) as recording."
+    )
+
+
+def _recordings_in(callback: Any) -> Iterator[Recording]:
+    """Yield the callbacks of this module in what `learn` takes."""
+    if isinstance(callback, Recording):
+        yield callback
+    elif isinstance(callback, list | tuple | CallbackList):
+        for part in callback.callbacks if isinstance(callback, CallbackList) else callback:
+            yield from _recordings_in(part)
+
+
+def _announce(setup_learn: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that begins recordings, and then does what `setup_learn` does."""
+
+    @functools.wraps(setup_learn)
+    def setup(
+        model: BaseAlgorithm,
+        total_timesteps: int,
+        callback: Any = None,
+        reset_num_timesteps: bool = True,
+        *arguments: Any,
+        **named: Any,
+    ) -> Any:
+        recordings = list(_recordings_in(callback))
+        if len(recordings) > 1:
+            raise ConfigError(f"found {len(recordings)} callbacks Recording, expected one")
+        for recording in recordings:
+            recording.begin(model, is_continued=not reset_num_timesteps and model._last_obs is not None)
+        return setup_learn(model, total_timesteps, callback, reset_num_timesteps, *arguments, **named)
+
+    return setup
+
+
+BaseAlgorithm._setup_learn = _announce(BaseAlgorithm._setup_learn)
