@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 from runner.archive.places import at_hand
 from runner.cli.output import draw, facts, print_json, say
 from runner.cli.progress import progress_line, steps_line
-from runner.errors import RecordingError, RunnerError, RunNotFound
+from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
 from runner.runs.resolve import find_run, find_runs
-from runner.runs.run import RECORDING_FILE, RUN_FILE, recordings_folder
+from runner.runs.run import RECORDING_FILE, RUN_FILE, SHARDS_FOLDER, recordings_folder
 from runner.util.humanize import UNKNOWN, duration, size
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 def find(name: str, recordings: Path | None) -> Run:
     """Return the run of a name or path in a recordings folder."""
-    return find_run(name, recordings, report=say)
+    return folded(find_run(name, recordings, report=say))
 
 
 def find_recorded(name: str, recordings: Path | None) -> Run:
@@ -42,8 +42,30 @@ def find_all_recorded(names: Iterable[str], recordings: Path | None) -> list[Run
     runs: dict[Path, Run] = {}
     for name in names:
         for run in find_runs(name, recordings_folder(recordings), say):
-            runs.setdefault(run.recording.absolute(), run)
+            runs.setdefault(run.recording.absolute(), folded(run))
     return [recorded(run) for run in runs.values()]
+
+
+def folded(run: Run) -> Run:
+    """Return a run with the shards of processes that were killed; print how many shards are still open."""
+    if not (run.folder / SHARDS_FOLDER).is_dir():
+        return run
+    from runner.loops.folding import fold_if_over
+    from runner.runs.shards import are_over, shards_of
+
+    shards = shards_of(run)
+    what = f"{len(shards)} shard{'s' if len(shards) != 1 else ''}"
+    if not are_over(run):
+        say(f"Run {run.run_id} has {what} of other processes, which are added when all of them have ended.")
+        return run
+    try:
+        with steps_line(f"adding {what} to {run.run_id}") as report:
+            run = fold_if_over(run, report=lambda done, _: report(done))
+    except StorageError as error:
+        say(f"Run {run.run_id} is shown without {what}: {error}")
+        return run
+    say(f"Added {what} to run {run.run_id}, whose processes had been killed.")
+    return run
 
 
 def recorded(run: Run) -> Run:

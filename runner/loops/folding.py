@@ -38,8 +38,8 @@ from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.shards import SHARD_MAKER, Shard
 from runner.recording.writer import create_recording
 from runner.runs.listing import run_at
-from runner.runs.run import RECORDING_FILE, Run
-from runner.runs.shards import SHARDS_FOLDER, are_over, shards_locked, shards_of
+from runner.runs.run import RECORDING_FILE, SHARDS_FOLDER, Run
+from runner.runs.shards import are_over, shards_locked, shards_of
 from runner.util.files import open_regular, storage_errors
 
 OWNER_WAITS: Final = 5.0
@@ -96,7 +96,7 @@ def _fold(run: Run, report: Report) -> Run:
 
 
 def _sources(run: Run, stack: ExitStack) -> list[Source]:
-    """Open what each process recorded; leave out those that ended before they recorded anything.
+    """Open what each process recorded; leave out those that joined and recorded nothing.
 
     Raises:
         RecordingError: one is damaged.
@@ -109,6 +109,9 @@ def _sources(run: Run, stack: ExitStack) -> list[Source]:
         except RecordingError:
             if _has_messages(part.folder / RECORDING_FILE):
                 raise
+            continue
+        has_content = any(recording.has_messages(topic.name) for topic in recording.topics if topic.digested)
+        if name and not has_content:
             continue
         sources.append(Source(name, recording, len(sources), first, part.facts.get("placed") is True))
         first += recording.environments

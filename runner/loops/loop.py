@@ -367,12 +367,18 @@ class Loop(Generic[R]):
                 self._file.close()
             made_by = self._code.made_by(self.run)
             self.run = self.run.update(status=status, summary=summary, provenance=made_by)
-        if self.options.join is not None:
-            fold_if_over(self.options.join)
-        else:
-            if os.environ.get(RUN_VARIABLE) == os.path.abspath(self.run.folder):  # noqa: PTH100
-                del os.environ[RUN_VARIABLE]
-            self.run = fold_if_over(self.run, OWNER_WAITS)
+        if os.environ.get(RUN_VARIABLE) == os.path.abspath(self.run.folder):  # noqa: PTH100
+            del os.environ[RUN_VARIABLE]
+        joined = self.options.join
+        try:
+            whole = fold_if_over(joined or self.run, 0 if joined else OWNER_WAITS)
+            self.run = self.run if joined else whole
+        except RunnerError as failure:
+            run = joined or self.run
+            warn_user(
+                f"run {run.run_id}: what its processes recorded was not put together: {failure} All of it is "
+                f"kept in {run.folder}; `dualtaxi show {run.run_id}` tries again."
+            )
         if self._follower:
             self._follower.finish(self.run)
         return self.run

@@ -140,6 +140,8 @@ class Source:
     def steps(self, phase: str, unit: Any) -> Iterator[tuple[Any, NDArray[np.int64]]]:
         """Yield the steps of a unit in pieces, with their numbers in the phase of its process."""
         first, stop = int(unit["first"]), int(unit["stop"])
+        if first >= stop:
+            return
         if not self._is_fixed:
             stream = self._stream(f"/{phase}/step")
             for begin in range(first, stop, 1024):

@@ -35,6 +35,8 @@ if TYPE_CHECKING:  # listing runs must be quick
 
 RUN_FILE: Final = "run.json"
 RECORDING_FILE: Final = "recording.mcap"
+SHARDS_FOLDER: Final = "shards"
+"""The folder, in that of a run, of what processes that joined it record until the run is over."""
 MADE_BY: Final = ("host", "git", "dualtaxi")
 """The provenance in `run.json`; the recording has all of it."""
 RECORDINGS_VARIABLE: Final = "DUALTAXI_RECORDINGS"

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import multiprocessing
 import os
 import re
 from collections.abc import Iterator, Mapping
@@ -19,10 +18,9 @@ from typing import Any, Final
 from runner.errors import ConfigError, RunnerError, RunNotFound
 from runner.runs.listing import run_at, run_entries, run_in
 from runner.runs.resolve import find_run
-from runner.runs.run import Run, new_run
+from runner.runs.run import SHARDS_FOLDER, Run, new_run
 from runner.util.files import storage_errors
 
-SHARDS_FOLDER: Final = "shards"
 RUN_VARIABLE: Final = "DUALTAXI_RUN"
 """The folder of the run that this process recorded last, which its child processes can join."""
 _NAME: Final = re.compile(r"[\w.-]{1,80}")
@@ -89,8 +87,10 @@ def new_shard(joined: Run, name: str | None, config: Mapping[str, Any], seed: in
         StorageError: the run's folder cannot be written.
     """
     if name is None:
+        import multiprocessing
+
         process = multiprocessing.current_process().name
-        name = re.sub(r"[^\w.-]+", "-", process).strip("-.")[:60] or "process"
+        name = re.sub(r"[^\w.]+", "-", process).strip("-.")[:60] or "process"
     if not isinstance(name, str) or not _NAME.fullmatch(name) or not name.strip("."):
         raise ConfigError(f"shard: found {name!r}, expected 1 to 80 letters, digits, _, . and -")
     names = itertools.chain([name], (f"{name}-{n}" for n in itertools.count(2)))

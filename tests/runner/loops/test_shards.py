@@ -1,0 +1,426 @@
+"""Several processes that record one run: joining, the order of what they recorded, killed processes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+
+import runner
+from runner.errors import ConfigError, RunnerError
+from runner.execution.redo import verify_by_redoing
+from runner.loops.folding import fold_if_over
+from runner.recording.reader import open_recording
+from runner.runs.listing import list_runs, run_at
+from runner.runs.shards import RUN_VARIABLE, shards_of
+from tests.runner.loops.making import Rooms
+
+SPAWN = multiprocessing.get_context("spawn")
+pytestmark = pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+
+
+def play(rec, steps: int, seed: int | None, delay: float = 0.0, log: bool = True) -> None:
+    """Take steps with random actions in an environment, with resets, extras and logged numbers."""
+    chance, generator = random.Random(), np.random.default_rng(seed)
+    rec.reset(seed=seed)
+    for step in range(steps):
+        if delay and step % 40 == 0:
+            time.sleep(chance.random() * delay)
+        action = int(generator.integers(rec.action_space.n))
+        _, _, terminated, truncated, _ = rec.step(action, {"value": step / 2})
+        if terminated or truncated:
+            rec.reset()
+        if log and step % 50 == 0:
+            rec.log("loss", 1 / (step + 1))
+
+
+def work(run, shard, steps, seed, delay=0.0, env_id="CartPole-v1", phase="train", at=None):
+    """Join a run and take steps, in a process of its own."""
+    env = gymnasium.make(env_id)
+    with runner.record(env, join=run, shard=shard, phase=phase) as rec:
+        if at is not None:
+            rec.at_step(at)
+        play(rec, steps, seed, delay)
+
+
+def run_all(*processes) -> None:
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(60)
+        assert process.exitcode == 0
+
+
+def started(*arguments, **keywords):
+    return SPAWN.Process(target=work, args=arguments, kwargs=keywords)
+
+
+def together(folder: Path, delay: float) -> runner.Run:
+    """Record a run by its owner and four more processes, of which one evaluates."""
+    with runner.record(gymnasium.make("CartPole-v1"), folder, name="joined", config={"lr": 1}) as rec:
+        processes = [started(rec.run.folder, f"w{k}", 200 + 70 * k, k, delay) for k in (1, 2, 10)]
+        processes.append(started(rec.run.folder, "eval", 120, 7, delay, phase="eval", at=500))
+        for process in processes:
+            process.start()
+        play(rec, 250, 0, delay)
+        for process in processes:
+            process.join(60)
+            assert process.exitcode == 0
+    return rec.run
+
+
+def test_a_run_is_the_same_whichever_process_is_faster(tmp_path):
+    runs = [together(tmp_path, 0.0), together(tmp_path, 0.05)]
+    assert runs[0].summary.content_digest == runs[1].summary.content_digest
+    assert runs[0].status == "finished"
+    with open_recording(runs[0].recording) as recording:
+        assert [shard.name for shard in recording.shards] == ["", "eval", "w1", "w2", "w10"]
+        assert recording.done()["train_steps"] == 250 + 270 + 340 + 900
+        assert recording.done()["eval_steps"] == 120
+        # The evaluation stands where its process said, after 500 training steps and those of episodes begun.
+        first = next(recording.blocks(recording.topic("/eval/reset")))[0]
+        assert 500 <= first["log_time"] // 10**8 < 800
+        values = recording.extras("train").of_episode(3)["value"]
+        assert np.array_equal(np.diff(values), np.full(len(values) - 1, 0.5))
+        times = [one["log_time"] for one in recording.decoded(recording.topic("/scalar"))]
+        assert times == sorted(times)
+        assert len(times) == 3 + sum(-(-steps // 50) for steps in (250, 270, 340, 900))
+    assert not shards_of(runs[0])
+    assert verify_by_redoing(runs[0].recording).verdict == "reproduced"
+
+
+def test_episodes_are_put_in_order_of_the_steps_of_their_processes(tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="order") as rec:
+        for shard in ("b", "a"):  # the order in which they come does not matter
+            work(rec.run, shard, 300, 3)
+    with open_recording(rec.run.recording) as recording:
+        resets = np.concatenate(list(recording.blocks(recording.topic("/train/reset"))))
+    # Both did the same, so each episode of `a` is followed by that of `b`.
+    assert resets["environment"].tolist() == [1, 2] * (len(resets) // 2)
+    assert (resets["observation"][::2] == resets["observation"][1::2]).all()
+
+
+MODES = [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED]
+
+
+@pytest.mark.parametrize("mode", MODES, ids=[mode.name for mode in MODES])
+def test_vectors_and_single_environments_share_a_run(tmp_path, mode):
+    def envs(n):
+        return SyncVectorEnv([lambda: gymnasium.make("CartPole-v1")] * n, autoreset_mode=mode)
+
+    def step(rec, steps, seed):
+        rec.action_space.seed(seed)
+        rec.reset(seed=seed)
+        for _ in range(steps):
+            _, _, terminated, truncated, _ = rec.step(rec.action_space.sample())
+            if mode == AutoresetMode.DISABLED and (over := terminated | truncated).any():
+                rec.reset(options={"reset_mask": over})
+
+    with runner.record_vector(envs(3), tmp_path, name="vectors") as rec:
+        with runner.record_vector(envs(2), join=rec.run, shard="two") as two:
+            step(two, 90, 5)
+        work(rec.run, "one", 100, 6, phase="eval")
+        step(rec, 120, 1)
+    assert rec.run.status == "finished"
+    with open_recording(rec.run.recording) as recording:
+        assert [(shard.name, shard.environments) for shard in recording.shards] == [
+            ("", 3),
+            ("one", 1),
+            ("two", 2),
+        ]
+        steps = recording.done()["train_steps"]
+        assert steps == 120 * 3 + 90 * 2 if mode != AutoresetMode.NEXT_STEP else steps < 120 * 3 + 90 * 2
+    redone = verify_by_redoing(rec.run.recording)
+    assert (redone.verdict, redone.steps, redone.left_out) == ("reproduced", steps + 100, 0)
+
+
+class Wide(gymnasium.Env):
+    """Takes float32 actions, and any others."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.random(2, np.float32), {}
+
+    def step(self, action):
+        return (
+            self.np_random.random(2, np.float32),
+            float(action[0]),
+            False,
+            self.np_random.random() < 0.1,
+            {},
+        )
+
+
+def test_the_widest_actions_and_all_extras_are_kept(tmp_path):
+    with runner.record(Wide(), tmp_path, name="wide") as rec:
+        other = runner.record(Wide(), join=rec.run, shard="other")
+        for own, kind, name in ((rec, np.float32, "a"), (other, np.float64, "b")):
+            own.reset(seed=0)
+            for k in range(30):
+                if any(own.step(np.array([k / 7], kind), {name: k})[2:4]):
+                    own.reset()
+        other.close()
+    with open_recording(rec.run.recording) as recording:
+        actions = np.concatenate(
+            [block["action"] for block in recording.blocks(recording.topic("/train/step"))]
+        )
+        extras = recording.extras("train").at(np.arange(60))
+    assert actions.dtype == np.float64
+    expected = [np.float32(k / 7) for k in range(30)] + [k / 7 for k in range(30)]
+    assert sorted(actions.ravel()) == sorted(map(float, expected))
+    assert extras["a"].count() == extras["b"].count() == 30
+    assert (extras["a"].mask != extras["b"].mask).all()
+
+
+def test_texts_infos_options_frames_and_checkpoints_come_along(tmp_path):
+    def do(rec, seed):
+        rec.reset(seed=seed, options={"start": seed})
+        rec.action_space.seed(seed)
+        for _ in range(20):
+            if any(rec.step(rec.action_space.sample())[2:4]):
+                rec.reset()
+        rec.log("note", f"of {seed}")
+        rec.snapshot("weights", np.arange(seed))
+        rec.checkpoint("policy", bytes([seed]))
+
+    options = {"info": ["*"], "frames_every": 1}
+    with runner.record(Rooms(with_text=True), tmp_path, name="rooms", **options) as rec:
+        do(rec, 1)
+        with runner.record(Rooms(with_text=True), join=rec.run, shard="two", **options) as two:
+            do(two, 2)
+    with open_recording(rec.run.recording) as recording:
+        infos = [one["json"] for one in recording.decoded(recording.topic("/train/info"))]
+        assert sum('"start": 1' in info for info in infos) == sum('"start": 2' in info for info in infos) == 1
+        logs = [one["message"] for one in recording.decoded(recording.topic("/log"))]
+        assert sorted(logs) == ["of 1", "of 2"]
+        frames = recording.count(recording.topic("/train/frame"))
+        resets = recording.count(recording.topic("/train/reset"))
+        assert frames == 40 + resets
+        missions = {step["next_observation"]["mission"] for step in recording.transitions("train")}
+        assert missions
+    checkpoints = rec.run.checkpoints()
+    assert sorted(checkpoint.load() for checkpoint in checkpoints) == [b"\1", b"\2"]
+    with open_recording(rec.run.recording) as recording:
+        for episode in range(recording.count(recording.topic("/train/episode"))):
+            from runner.replay.steps import recorded_frames
+
+            assert len(list(recorded_frames(recording, "train", episode))) > 1
+
+
+# --- processes that are killed ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("after", [0.0, 0.3, 1.2])
+def test_a_killed_shard_loses_its_last_second_at_most(tmp_path, after):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="killed") as rec:
+        process = started(rec.run.folder, "victim", 10**7, 1)
+        process.start()
+        deadline = time.monotonic() + 30
+        while not shards_of(rec.run) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        begun = time.monotonic()
+        time.sleep(after)
+        os.kill(process.pid, signal.SIGKILL)
+        lasted = time.monotonic() - begun
+        process.join(30)
+        play(rec, 100, 0)
+    run = run_at(rec.run.folder)
+    assert not shards_of(run)
+    with open_recording(run.recording) as recording:
+        victim = next((shard for shard in recording.shards if shard.name == "victim"), None)
+        steps = 0 if victim is None else victim.train_steps
+        assert recording.done()["train_steps"] == 100 + steps
+        if lasted > 1.1:
+            assert steps > 100
+            assert victim.status == "interrupted"
+    assert verify_by_redoing(run.recording, sample=5).verdict == "reproduced"
+
+
+OWNER = """
+import sys, time, gymnasium, runner
+rec = runner.record(gymnasium.make("CartPole-v1"), sys.argv[1], name="owner")
+rec.reset(seed=0)
+print(rec.run.run_id, flush=True)
+while True:
+    if any(rec.step(0)[2:4]):
+        rec.reset()
+    time.sleep(0.001)
+"""
+
+
+def owner(folder) -> tuple[subprocess.Popen, runner.Run]:
+    process = subprocess.Popen([sys.executable, "-c", OWNER, str(folder)], stdout=subprocess.PIPE, text=True)
+    with process.stdout as output:
+        return process, run_at(Path(folder) / output.readline().strip())
+
+
+def test_the_last_process_folds_when_the_owner_was_killed(tmp_path):
+    process, run = owner(tmp_path)
+    rec = runner.record(gymnasium.make("CartPole-v1"), join=run, shard="w")
+    play(rec, 100, 1)
+    time.sleep(0.8)
+    process.kill()
+    process.wait()
+    rec.close()
+    run = run_at(run.folder)
+    assert run.status == "interrupted"
+    assert run.summary.train_steps > 150
+    assert not shards_of(run)
+    assert verify_by_redoing(run.recording).verdict == "reproduced"
+
+
+def test_the_next_command_folds_when_all_were_killed(tmp_path):
+    process, run = owner(tmp_path)
+    worker = started(run.folder, "w", 10**7, 1)
+    worker.start()
+    deadline = time.monotonic() + 30
+    while not shards_of(run) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    time.sleep(1.2)
+    process.kill()
+    worker.kill()
+    process.wait()
+    worker.join()
+    assert [shard.status for shard in shards_of(run)] == ["interrupted"]
+    shown = subprocess.run(
+        [sys.executable, "-m", "runner", "show", run.run_id, "--recordings", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "1 shard" in shown.stderr
+    run = run_at(run.folder)
+    assert not shards_of(run)
+    assert run.summary.train_steps > 300
+    assert run.summary.content_digest
+
+
+def test_a_fold_that_was_killed_is_done_again(tmp_path, monkeypatch):
+    rec = runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="fold")
+    work(rec.run, "w", 100, 1)
+    play(rec, 100, 2)
+    from runner.loops import folding
+
+    real = folding.shutil.rmtree
+    monkeypatch.setattr(folding.shutil, "rmtree", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        rec.close()  # all was written, but the shards are still there
+    monkeypatch.setattr(folding.shutil, "rmtree", real)
+    (rec.run.folder / ".recording.mcap.folding").write_bytes(b"half")
+    run = fold_if_over(run_at(rec.run.folder))
+    assert not shards_of(run)
+    with open_recording(run.recording) as recording:
+        assert recording.done()["train_steps"] == 200
+
+
+# --- joining ----------------------------------------------------------------------------------------------
+
+
+def test_sixteen_processes_join_at_once(tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="many") as rec:
+        context = multiprocessing.get_context("fork")
+        run_all(*(context.Process(target=work, args=(rec.run, "same", 20, k)) for k in range(16)))
+        names = [shard.run_id for shard in shards_of(rec.run)]
+        assert names == ["same", *(f"same-{n}" for n in range(2, 17))]
+    with open_recording(rec.run.recording) as recording:
+        assert len(recording.shards) == 17
+        assert recording.done()["train_steps"] == 320
+    assert len(list_runs(tmp_path)) == 1
+
+
+def test_a_run_is_joined_by_id_prefix_name_folder_or_variable(tmp_path, monkeypatch):
+    monkeypatch.setenv("DUALTAXI_RECORDINGS", str(tmp_path))
+    with runner.record(gymnasium.make("CartPole-v1"), name="named") as rec:
+        assert os.environ[RUN_VARIABLE] == str(rec.run.folder.absolute())
+        run = rec.run
+        ways = [run.run_id, run.run_id[:5], "named", str(run.folder), run.folder, run, True]
+        for k, way in enumerate(ways):
+            work(way, f"w{k}", 10, k)
+    assert RUN_VARIABLE not in os.environ
+    with open_recording(rec.run.recording) as recording:
+        assert len(recording.shards) == 1 + len(ways)
+
+
+def recorded_here(run):
+    return lambda: runner.record(gymnasium.make("CartPole-v1"), join=run)
+
+
+def test_the_workers_of_an_async_vector_are_named_by_their_numbers(tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="async") as rec:
+        envs = AsyncVectorEnv([recorded_here(rec.run)] * 3, context="fork")
+        envs.action_space.seed(0)
+        envs.reset(seed=0)
+        for _ in range(50):
+            envs.step(envs.action_space.sample())
+        envs.close()
+    with open_recording(rec.run.recording) as recording:
+        names = [shard.name for shard in recording.shards]
+    assert names == ["", *(f"Worker-AsyncVectorEnv-{k}" for k in range(3))]
+
+
+def test_mistakes_of_joining_are_named(tmp_path, monkeypatch):
+    def env():
+        return gymnasium.make("CartPole-v1")
+
+    monkeypatch.delenv(RUN_VARIABLE, raising=False)
+    with pytest.raises(ConfigError, match="found no DUALTAXI_RUN"):
+        runner.record(env(), join=True)
+    with pytest.raises(RunnerError, match="no run 'nothing'"):
+        runner.record(env(), tmp_path, join="nothing")
+    rec = runner.record(env(), tmp_path, name="mistakes")
+    with pytest.raises(ConfigError, match="expected the spaces and agents of run"):
+        runner.record(gymnasium.make("MountainCar-v0"), join=rec.run)
+    with pytest.raises(ConfigError, match="name, seed or config"):
+        runner.record(env(), join=rec.run, name="other")
+    with pytest.raises(ConfigError, match="without join"):
+        runner.record(env(), shard="w")
+    with pytest.raises(ConfigError, match="1 to 80 letters"):
+        runner.record(env(), join=rec.run, shard="a/b")
+    with pytest.raises(ConfigError, match="join: found 3"):
+        runner.record(env(), join=3)
+    two = runner.record(env(), join=rec.run, shard="w")
+    with pytest.raises(ConfigError, match="at_step: found -1"):
+        two.at_step(-1)
+    two.reset(seed=0)
+    two.step(0)
+    with pytest.raises(RunnerError, match="found training steps of this process"):
+        two.at_step(5)
+    two.close()
+    rec.close()
+    with pytest.raises(RunnerError, match="is finished, expected one that is still being recorded"):
+        runner.record(env(), join=rec.run)
+
+
+def test_a_job_cannot_be_joined(tmp_path):
+    job = runner.run("quick", overrides=["episodes=2", "evaluation=null"], recordings=tmp_path)
+    with pytest.raises(RunnerError, match="is a job"):
+        runner.record(gymnasium.make("Taxi-v4"), join=job)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
+def test_the_owner_may_end_before_its_shards(tmp_path, monkeypatch):
+    monkeypatch.setattr("runner.loops.loop.OWNER_WAITS", 0.1)
+    rec = runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="early")
+    two = runner.record(gymnasium.make("CartPole-v1"), join=rec.run, shard="late")
+    play(two, 50, 1)
+    play(rec, 50, 2)
+    rec.close()
+    assert rec.run.summary.train_steps == 50
+    assert len(shards_of(rec.run)) == 1
+    play(two, 50, 1)
+    two.close()
+    run = run_at(rec.run.folder)
+    assert (run.status, run.summary.train_steps) == ("finished", 150)
