@@ -60,7 +60,10 @@ class Shape:
 
         steps = table(layout.STEPS, "/train/step", "/eval/step")
         episodes = table(layout.EPISODES, "/train/episode", "/eval/episode")
-        log = table(layout.LOG, schema.LOG_TOPIC.name), table(layout.CLOCK, schema.CLOCK_TOPIC.name)
+        log = (
+            *(table(layout.LOG, "/log"), table(layout.CLOCK, "/clock"), table(layout.HOST, "/host")),
+            table(layout.CONSOLE, "/console"),
+        )
         if self.kind == "job":
             return (
                 *(steps, episodes),

@@ -17,7 +17,9 @@
     <run id>/checkpoints.parquet     the references to checkpoints,
     <run id>/checkpoints/<digest>    and their contents
     <run id>/log.parquet             lines of text
-    <run id>/clock.parquet           the time that had passed after some steps
+    <run id>/clock.parquet           the time that had passed after some steps,
+    <run id>/host.parquet            what was used of the machine,
+    <run id>/console.parquet         the output
     <run id>/run.parquet             one row: what the run is, its configuration and provenance
     <run id>/transitions.parquet     the environment's possible outcomes, with their events
     <run id>/states.parquet          a description of each state
@@ -68,6 +70,8 @@ CONTENTS: Final = "checkpoints/"
 """The folder of the contents of checkpoints, named by their digests."""
 LOG: Final = "log.parquet"
 CLOCK: Final = "clock.parquet"
+HOST: Final = "host.parquet"
+CONSOLE: Final = "console.parquet"
 FRAME_ID: Final = "frame_id"
 """A column that archives of earlier versions do not have."""
 RUN: Final = "run.parquet"
@@ -83,7 +87,7 @@ TEXT: Final = pa.dictionary(pa.int8(), pa.string())
 """Repeated text: a category in pandas and Polars, plain text in DuckDB."""
 
 
-def _metrics(topic: Topic) -> pa.Schema:
+def _numbers(topic: Topic) -> pa.Schema:
     kinds = {"d": pa.float64(), "q": pa.int64()}
     fields = [("run_id", TEXT), ("position", pa.int64())]
     for one in topic.message.fields:
@@ -96,11 +100,18 @@ _PLACED: Final = (("run_id", TEXT), ("position", pa.int64()))
 PLACED_IN_PHASE: Final = (("run_id", TEXT), ("phase", TEXT), ("position", pa.int64()))
 _LOGGED: Final = (("name", pa.string()), ("step", pa.int64()), ("episode", pa.int64()))
 SCHEMAS: Final = {
-    TRAIN_METRICS: _metrics(schema.TRAIN_METRICS_TOPIC),
-    EVAL_METRICS: _metrics(schema.EVAL_METRICS_TOPIC),
-    OPTIMALITY: _metrics(schema.OPTIMALITY_TOPIC),
+    TRAIN_METRICS: _numbers(schema.TRAIN_METRICS_TOPIC),
+    EVAL_METRICS: _numbers(schema.EVAL_METRICS_TOPIC),
+    OPTIMALITY: _numbers(schema.OPTIMALITY_TOPIC),
     LOG: pa.schema([*_PLACED, *((name, pa.string()) for name in ("name", "level", "message"))]),
-    CLOCK: pa.schema([*_PLACED, ("started", pa.float64()), ("seconds", pa.float64())]),
+    CLOCK: _numbers(schema.CLOCK_TOPIC),
+    HOST: _numbers(schema.HOST_TOPIC),
+    CONSOLE: pa.schema(
+        [
+            *(*_PLACED, ("started", pa.float64()), ("seconds", pa.float64())),
+            *(("stream", pa.int64()), ("line", pa.int64()), ("text", pa.string())),
+        ]
+    ),
     Q_TABLES: pa.schema(
         [
             *_PLACED,
@@ -139,7 +150,7 @@ SCHEMAS: Final = {
 }
 """The columns of the tables that are the same in every archive."""
 
-LEFT_OUT_IF_EMPTY: Final = frozenset({EXTRA_COLUMNS, EXTRAS, RESET_STATES, CHECKPOINTS, CLOCK})
+LEFT_OUT_IF_EMPTY: Final = frozenset({EXTRA_COLUMNS, EXTRAS, RESET_STATES, CHECKPOINTS, CLOCK, HOST, CONSOLE})
 """The tables that an archive need not have."""
 EXTRA_PREFIX: Final = "extra_"
 _MAY_BE_NULL: Final = frozenset({"data", "seed"})

@@ -192,6 +192,13 @@ class Recording(Section):
         default=True,
         description="Whether to record the code that runs: git commit and changes, script, arguments.",
     )
+    system: bool = Field(
+        default=True,
+        description="Whether to record the use of processor, memory, GPUs, disk and network, once a second.",
+    )
+    console: bool = Field(
+        default=True, description="Whether to record the output of the process, at most 10 MB of it."
+    )
 
     @model_validator(mode="after")
     def _level_goes_with_zstd(self) -> Self:

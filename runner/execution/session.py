@@ -366,6 +366,8 @@ def recorder_for(
         beat=beat,
         threads=threads,
         clock=clock,
+        system=options.system,
+        console=options.console,
     )
 
 

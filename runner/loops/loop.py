@@ -133,6 +133,8 @@ class Loop(Generic[R]):
             sizes=sizes_of(self._facts, str(path)),
             watch=self._watch,
             before=self._describe,
+            system=options.packing.system,
+            console=options.packing.console,
         )
         self._actions = (
             ActionRecorder(self._recorder, described.environments, options.packing.chunk_steps)

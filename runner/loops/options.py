@@ -23,7 +23,7 @@ from runner.util.values import checked_run_name, is_whole
 MADE_BY: Final = "runner.record"
 ALL_INFO: Final = "*"
 """Among the names of info fields: all of them."""
-PACKING: Final = ("compression", "level", "index", "chunk_steps", "code")
+PACKING: Final = ("compression", "level", "index", "chunk_steps", "code", "system", "console")
 _STEPS: Final = ("all", "actions", "none")
 
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -23,15 +24,21 @@ from runner.recording.topic_reader import TopicReader
 SAMPLE_SECONDS: Final = 1.0
 _SAMPLES_A_DURATION: Final = 3600
 """After an hour samples become rarer, so that their interval stays this fraction of the duration."""
-_MAX_SAMPLES: Final = 1 << 20
+MAX_SAMPLES: Final = 1 << 20
 _MAX_SECONDS: Final = 1e10
+
+
+def interval(seconds: float) -> float:
+    """Return after how many seconds the next sample is due in a session that has lasted `seconds`."""
+    return max(SAMPLE_SECONDS, seconds / _SAMPLES_A_DURATION)
 
 
 class Stopwatch:
     """Measures a session, which begins at the first call of `begin`."""
 
     def __init__(self) -> None:
-        self._started = 0.0
+        self.started = 0.0
+        """When the session began, in seconds since 1970, UTC."""
         self._origin: float | None = None
         self._next = 0.0
 
@@ -39,7 +46,7 @@ class Stopwatch:
         """Begin the session, unless it has begun; return whether it begins now."""
         if self._origin is not None:
             return False
-        self._started, self._origin = time.time(), time.monotonic()
+        self.started, self._origin = time.time(), time.monotonic()
         self._next = SAMPLE_SECONDS
         return True
 
@@ -47,17 +54,26 @@ class Stopwatch:
         """Return whether it is time for another sample, and plan the next one."""
         if self.seconds < self._next:
             return False
-        self._next = self.seconds + max(SAMPLE_SECONDS, self.seconds / _SAMPLES_A_DURATION)
+        self._next = self.seconds + interval(self.seconds)
         return True
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether the session has begun."""
+        return self._origin is not None
 
     @property
     def seconds(self) -> float:
         """Seconds since the beginning of the session; 0 before."""
         return 0.0 if self._origin is None else time.monotonic() - self._origin
 
+    def seconds_at(self, monotonic: float) -> float:
+        """Return the seconds since the beginning of the session at a time of `time.monotonic`."""
+        return -math.inf if self._origin is None else monotonic - self._origin
+
     def sample(self) -> bytes:
         """Return a `dualtaxi.Clock`: the time now."""
-        return encode(schema.CLOCK, {"started": self._started, "seconds": self.seconds})
+        return encode(schema.CLOCK, {"started": self.started, "seconds": self.seconds})
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +86,8 @@ class Clock:
     """[samples], never decreasing."""
     started: NDArray[np.float64]
     """[samples]: when the session of the sample began, in seconds since 1970, UTC."""
+    earlier: Mapping[float, float] = field(default_factory=dict)
+    """When each session began -> the seconds that had been recorded before."""
 
     @property
     def duration(self) -> float:
@@ -97,6 +115,10 @@ class Clock:
         passed = self.seconds[i] - self.seconds[before]
         return np.asarray(self.seconds[before] + np.clip(done, 0.0, 1.0) * passed)
 
+    def run_seconds(self, started: NDArray[np.float64], seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the seconds of the run for those of its sessions; both [n], as messages have them."""
+        return seconds + [self.earlier.get(each, 0.0) for each in started.tolist()]
+
 
 def read_clock(recording: TopicReader) -> Clock | None:
     """Return the clock of a recording; None if it has no samples, as those of earlier versions.
@@ -107,10 +129,10 @@ def read_clock(recording: TopicReader) -> Clock | None:
     rows: list[tuple[int, float, float]] = []
     for fields in recording.decoded(schema.CLOCK_TOPIC, max_bytes=1024):
         row = (fields["log_time"] // STEP_NANOSECONDS, fields["seconds"], fields["started"])
-        if len(rows) == _MAX_SAMPLES or not all(map(math.isfinite, row)) or not 0 <= row[1] < _MAX_SECONDS:
+        if len(rows) == MAX_SAMPLES or not all(map(math.isfinite, row)) or not 0 <= row[1] < _MAX_SECONDS:
             raise RecordingError(
                 f"{recording.path}: {schema.CLOCK_TOPIC.name}: found {fields['seconds']} seconds in sample "
-                f"{len(rows)}, expected at most {_MAX_SAMPLES:,} samples of less than {_MAX_SECONDS:g} s."
+                f"{len(rows)}, expected at most {MAX_SAMPLES:,} samples of less than {_MAX_SECONDS:g} s."
             )
         rows.append(row)
     if not rows:
@@ -118,9 +140,10 @@ def read_clock(recording: TopicReader) -> Clock | None:
     positions = np.array([row[0] for row in rows], np.int64)
     seconds, started = np.array([row[1:] for row in rows]).T
     ends = np.flatnonzero(started[1:] != started[:-1])
-    pauses = np.zeros(len(rows))
-    pauses[ends + 1] = seconds[ends]
-    seconds = seconds + np.cumsum(pauses)
+    earlier = np.zeros(len(rows))
+    earlier[ends + 1] = seconds[ends]
+    earlier = np.cumsum(earlier)
+    seconds = seconds + earlier
     if (np.diff(positions) < 0).any() or (np.diff(seconds) < 0).any():
         raise RecordingError(f"{recording.path}: {schema.CLOCK_TOPIC.name}: found a clock that goes back.")
-    return Clock(positions, seconds, started)
+    return Clock(positions, seconds, started, dict(zip(started.tolist(), earlier.tolist(), strict=True)))

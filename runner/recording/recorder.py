@@ -20,6 +20,7 @@ from runner.recording import schema
 from runner.recording.blocks import Sizes, blank_records, message_record, record_dtype, topic_sizes
 from runner.recording.clock import Stopwatch
 from runner.recording.digest import combined_digest
+from runner.recording.observer import Observer
 from runner.recording.pipeline import MessageBatches, Pipeline
 from runner.recording.reference import Reference
 from runner.recording.schema import STEP_NANOSECONDS, Topic
@@ -82,6 +83,8 @@ class Recorder:
         before: called once, before the first message is written. With it, threads are started and messages
             written only when some have gathered, or by `release`, so that a short recording costs little.
         clock: whether to record the time that passes.
+        system: whether to record what the process uses of its machine; only with the clock.
+        console: whether to record the process's output; only with the clock.
     """
 
     def __init__(
@@ -98,6 +101,8 @@ class Recorder:
         watch: Callable[[Topic, NDArray[np.void]], None] = lambda *_: None,
         before: Callable[[], None] | None = None,
         clock: bool = True,
+        system: bool = False,
+        console: bool = False,
     ) -> None:
         packing = packing or Packing()
         self._file = file
@@ -117,9 +122,13 @@ class Recorder:
         self._last_flush = time.monotonic()
         self._pipeline = Pipeline(file, packing, beat, threads, before)
         self._batches = MessageBatches(self._pipeline.send)
-        is_timed = clock and file is not None and schema.CLOCK_TOPIC in file.topics
-        self._stopwatch = Stopwatch() if is_timed else None
-        self._record_time()
+        self._stopwatch: Stopwatch | None = None
+        self._observer: Observer | None = None
+        if clock and file is not None and schema.CLOCK_TOPIC in file.topics:
+            self._stopwatch = Stopwatch()
+            self._record_machine()
+            if (system or console) and schema.HOST_TOPIC in file.topics:
+                self._observer = Observer(file.path.parent, self._stopwatch, system, console)
 
     def _lane(self, topic: Topic, sizes: Sizes, write: bool) -> _Lane:
         return _Lane(topic, sizes, capacity_of(topic, sizes, self._chunk_steps), write)
@@ -242,7 +251,7 @@ class Recorder:
 
     def flush(self) -> None:
         """Write every open block and batch now; records that were not taken must be put down again."""
-        self._record_time()
+        self._record_machine()
         self._batches.flush()
         for lane in self._lanes.values():
             if lane.open is not None and lane.open.filled:
@@ -255,7 +264,7 @@ class Recorder:
         Raises:
             StorageError: the disk is full or failing; everything before is kept.
         """
-        self._record_time(is_last=True)
+        self._record_machine(is_last=True)
         self.flush()
         self._pipeline.close()
         self._pipeline.raise_failure()
@@ -274,15 +283,26 @@ class Recorder:
     def abandon(self) -> None:
         """Write what was committed, unless writing failed, and stop the threads of a run that failed."""
         if self._file is not None and self._pipeline.is_open and self._pipeline.failure is None:
+            self._record_machine(is_last=True)
             self.flush()
+        elif self._observer is not None:
+            self._observer.take(is_last=True)
         self._pipeline.close()
 
-    def _record_time(self, is_last: bool = False) -> None:
-        """Record a sample of the clock, if one is due; a resumed run has none before it has new steps."""
+    def _record_machine(self, is_last: bool = False) -> None:
+        """Record the time, if that is due, and what was seen of the machine and the output.
+
+        A resumed run has none of it before it has new steps.
+        """
         watch = self._stopwatch
-        if watch is not None and self._reference.exhausted and (watch.begin() or is_last or watch.is_due()):
-            position = sum(self.steps.values()) * STEP_NANOSECONDS
-            self._batches.extend(schema.CLOCK_TOPIC, [position], [watch.sample()])
+        if watch is None or not self._reference.exhausted:
+            return
+        messages = [] if self._observer is None else self._observer.take(is_last)
+        if watch.begin() or is_last or watch.is_due():
+            messages.append((schema.CLOCK_TOPIC, watch.sample()))
+        position = sum(self.steps.values()) * STEP_NANOSECONDS
+        for topic, message in messages:
+            self._batches.extend(topic, [position], [message])
 
     def take(self, topic: Topic, positions: NDArray[np.uint64]) -> None:
         """Take the next filled records of the topic's block: set their times, compare or keep them.

@@ -277,6 +277,38 @@ CHECKPOINT = MessageType(
 """A reference to content in the store next to the recordings, by its BLAKE3."""
 CLOCK = MessageType("Clock", (Field(1, "started", _DOUBLE), Field(2, "seconds", _DOUBLE)))
 """How much time had passed at its position; `clock` describes its fields."""
+HOST = MessageType(
+    "Host",
+    (
+        Field(1, "started", _DOUBLE),
+        Field(2, "seconds", _DOUBLE),
+        Field(3, "cpu_percent", _DOUBLE),
+        Field(4, "memory_bytes", _DOUBLE),
+        Field(5, "host_cpu_percent", _DOUBLE),
+        Field(6, "host_memory_bytes", _DOUBLE),
+        Field(7, "host_memory_total", _DOUBLE),
+        Field(8, "disk_read_bytes", _DOUBLE),
+        Field(9, "disk_written_bytes", _DOUBLE),
+        Field(10, "disk_free_bytes", _DOUBLE),
+        Field(11, "network_received_bytes", _DOUBLE),
+        Field(12, "network_sent_bytes", _DOUBLE),
+        Field(13, "gpu_percent", _DOUBLE, repeated=True),
+        Field(14, "gpu_memory_bytes", _DOUBLE, repeated=True),
+        Field(15, "gpu_memory_total", _DOUBLE, repeated=True),
+    ),
+)
+"""What the process and its host used at a moment; NaN is unknown. `host` describes its fields."""
+CONSOLE = MessageType(
+    "Console",
+    (
+        Field(1, "started", _DOUBLE),
+        Field(2, "seconds", _DOUBLE),
+        Field(3, "stream", _FIXED32),
+        Field(4, "line", _SFIXED64),
+        Field(5, "text", _STRING),
+    ),
+)
+"""A line of the process's output; one of the same number, stream and session replaces it."""
 
 ACTIONS = MessageType(
     "Actions",
@@ -336,7 +368,9 @@ TRAIN_EXTRA = Topic("/train/extra", 27, EXTRA, "train")
 EVAL_EXTRA = Topic("/eval/extra", 28, EXTRA, "eval")
 CHECKPOINT_TOPIC = Topic("/checkpoint", 29, CHECKPOINT)
 CLOCK_TOPIC = Topic("/clock", 30, CLOCK, digested=False)
-MACHINE_TOPICS: Final = (CLOCK_TOPIC,)
+HOST_TOPIC = Topic("/host", 31, HOST, digested=False)
+CONSOLE_TOPIC = Topic("/console", 32, CONSOLE, digested=False)
+MACHINE_TOPICS: Final = (CLOCK_TOPIC, HOST_TOPIC, CONSOLE_TOPIC)
 """The topics of how the recording went on its machine: other messages each time a job is run."""
 
 TRAIN_ACTIONS = Topic("/train/actions", 40, ACTIONS, "train", digested=False)

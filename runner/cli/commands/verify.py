@@ -218,6 +218,8 @@ _MESSAGES: Final = {
     "/train/reset_state": "states before resets",
     "/eval/reset_state": "states before evaluation resets",
     "/clock": "samples of the clock",
+    "/host": "samples of the machine",
+    "/console": "lines of output",
 }
 
 
@@ -272,7 +274,7 @@ def _repair(repaired: Repair, run: Run | None) -> dict[str, str]:
         counts = [
             f"{count:,} {_MESSAGES[topic]}"
             for topic, count in repaired.kept.items()
-            if topic not in ("/log", "/clock")
+            if topic not in ("/log", "/clock", "/host", "/console")
         ]
         rows["verdict"] = "repaired" if repaired.lossless else "repaired, but not all could be saved"
         rows["kept"] = ", ".join(counts) or "nothing but the description: it ended before its first message"

@@ -46,7 +46,8 @@ def digest_of(path: Path) -> tuple[str, dict[str, str]]:
                 message.log_time,
             )
             hashes.setdefault(channel.topic, blake3()).update(record + message.data)
-    del hashes["/log"], hashes["/clock"]
+    for topic in ("/log", "/clock", "/host", "/console"):
+        hashes.pop(topic, None)
     topics = {topic: hashes[topic].hexdigest() for topic in sorted(hashes)}
     whole = blake3(b"dualtaxi content 0\n")
     for topic, found in topics.items():

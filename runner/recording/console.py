@@ -1,0 +1,258 @@
+"""The output of the process that records: stdout and stderr by line, of a progress bar its last state.
+
+`Tee` replaces the method `write` of `sys.stdout` and `sys.stderr` while a run is recorded: the stream writes
+first, as ever, and its text is kept for the recording. So nothing is swallowed or delayed, and the streams
+stay the same objects. What is written to other objects, or by a library in C to the descriptors, is not seen.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.clock import Clock
+from runner.recording.topic_reader import TopicReader
+
+STREAMS: Final = ("", "stdout", "stderr")
+"""The streams by number; 0 is the recorder's own note."""
+MAX_CONSOLE_BYTES: Final = 10 << 20
+"""The most text of a run that is recorded."""
+MAX_LINES: Final = 1 << 18
+"""The most messages that are read."""
+_LINE_BYTES: Final = 64
+"""Counted for each line, so that the number of lines is bounded as well."""
+_MAX_COLUMNS: Final = 4096
+"""A longer line continues in the next one."""
+_MAX_WAITING: Final = 4 << 20
+"""The most characters that wait to be taken, with `_LINE_BYTES` for each line; what is beyond is left out."""
+_WINDOW: Final = 64
+"""How many lines above the last one the cursor can still reach."""
+_FIRST_SECONDS: Final = 2.0
+"""A line without an end is recorded when it is this old, such as a progress bar,"""
+_AGAIN_SECONDS: Final = 10.0
+"""and a line that changed after it was recorded, when it is this long ago."""
+_MAX_MESSAGE: Final = 1 << 16
+
+_CONTROL: Final = re.compile(
+    r"\x1b\[([0-9;?]*)[ -/]*([@-~])"  # a sequence with its numbers and its letter
+    r"|\x1b\][^\x07\x1b]*(?:\x07|\x1b\\)?"  # a title or a link
+    r"|\x1b[ -/]*[0-~]?"
+    r"|[\x00-\x1f\x7f-\x9f]"
+)
+_NOTE: Final = f"Console output beyond {MAX_CONSOLE_BYTES >> 20} MB is not recorded."
+
+
+class Tee:
+    """Keeps what is written to `sys.stdout` and `sys.stderr`, between `start` and `stop`."""
+
+    def __init__(self) -> None:
+        self._writes: deque[tuple[float, int, str]] = deque()
+        self._waiting = self._left_out = 0
+        self._is_on = False
+        self._patched: list[tuple[Any, Any, Any]] = []
+        """Streams, the method that each had as its own attribute (None if it had not), and the one it has."""
+
+    def start(self) -> None:
+        """Keep what is written from now on."""
+        self._is_on = True
+        streams = [sys.stdout, sys.stderr]
+        for number, stream in enumerate(streams[: 1 + (streams[1] is not streams[0])], start=1):
+            if stream is not None:
+                with contextlib.suppress(Exception):  # a stream of somebody's own may forbid it
+                    own, write = vars(stream).get("write"), self._writer(number, stream.write)
+                    stream.write = write  # type: ignore[method-assign]
+                    self._patched.append((stream, own, write))
+
+    def _writer(self, number: int, original: Callable[[str], Any]) -> Callable[[str], Any]:
+        """Return a method `write` that calls the original one, and keeps the text."""
+
+        def write(text: str) -> Any:
+            written = original(text)
+            if self._is_on and isinstance(text, str):
+                size = len(text) + _LINE_BYTES * text.count("\n")
+                if self._waiting + size > _MAX_WAITING:
+                    self._left_out += len(text)
+                else:
+                    self._waiting += size
+                    self._writes.append((time.monotonic(), number, text))
+            return written
+
+        return write
+
+    def stop(self) -> None:
+        """Keep nothing more; give the streams their methods back, unless somebody has replaced them since."""
+        self._is_on = False
+        for stream, own, write in self._patched:
+            with contextlib.suppress(Exception):
+                if vars(stream).get("write") is not write:
+                    continue
+                if own is None:
+                    del stream.write
+                else:
+                    stream.write = own
+        self._patched.clear()
+
+    def take(self) -> list[tuple[float, int, str]]:
+        """Return (time of `time.monotonic`, stream, text) of what was written since the last call."""
+        writes = [self._writes.popleft() for _ in range(len(self._writes))]
+        if left_out := self._left_out:
+            note = f"{left_out:,} characters are left out here: too many were printed in a second.\n"
+            writes.append((time.monotonic(), 0, note))
+        self._waiting = self._left_out = 0
+        return writes
+
+
+@dataclass
+class _Row:
+    """A line on the screen."""
+
+    begun: float
+    text: str = ""
+    is_new: bool = True
+    """Whether it changed since it was recorded."""
+    recorded: float | None = None
+
+
+class Screen:
+    """The lines of one stream, as a terminal would show them: it knows the cursor, not the width."""
+
+    def __init__(self) -> None:
+        self._rows: dict[int, _Row] = {}
+        self._row = self._column = self._last = 0
+
+    def write(self, now: float, text: str) -> None:
+        """Show text that was written at some time."""
+        at = 0
+        for control in _CONTROL.finditer(text):
+            if control.start() > at:
+                self._put(now, text[at : control.start()])
+            at = control.end()
+            self._obey(now, control)
+        if at < len(text):
+            self._put(now, text[at:])
+
+    def _put(self, now: float, text: str) -> None:
+        while text:
+            row = self._rows.setdefault(self._row, _Row(now))
+            part, text = text[: _MAX_COLUMNS - self._column], text[_MAX_COLUMNS - self._column :]
+            end = self._column + len(part)
+            row.text = row.text[: self._column].ljust(self._column) + part + row.text[end:]
+            row.is_new, self._column = True, end
+            if text:
+                self._move_to(now, self._row + 1)
+
+    def _obey(self, now: float, control: re.Match[str]) -> None:
+        """Move the cursor, or erase; colours and all else have no effect."""
+        numbers, letter = control[1] or "", control[2]
+        count = int(numbers) if numbers.isdecimal() and len(numbers) < 6 else 1
+        if control[0] == "\n":
+            self._move_to(now, self._row + 1)
+        elif control[0] == "\r" or (letter == "G" and count == 1):
+            self._column = 0
+        elif control[0] == "\b":
+            self._column = max(0, self._column - 1)
+        elif control[0] == "\t":
+            self._put(now, " " * (8 - self._column % 8))
+        elif letter == "A":
+            self._row = max(self._row - count, self._last - _WINDOW + 1, 0)
+        elif letter == "B":
+            self._row = min(self._row + count, self._last)
+        elif letter == "K" and (row := self._rows.get(self._row)) is not None:
+            row.text = row.text[: self._column] if numbers in ("", "0") else ""
+            row.is_new = True
+
+    def _move_to(self, now: float, row: int) -> None:
+        """Move the cursor to the beginning of a row."""
+        self._rows.setdefault(self._row, _Row(now))
+        self._row, self._column = row, 0
+        self._last = max(self._last, row)
+
+    def take(self, now: float, is_last: bool = False) -> Iterator[tuple[float, int, str]]:
+        """Yield (when it was begun, number, text) of the lines that are to be recorded now."""
+        for number, row in list(self._rows.items()):
+            if row.recorded is None:
+                due = number < self._last or now - row.begun > _FIRST_SECONDS
+            else:
+                due = now - row.recorded > _AGAIN_SECONDS
+            if (
+                row.is_new
+                and (due or is_last)
+                and (row.text or row.recorded is not None or number < self._last)
+            ):
+                row.is_new, row.recorded = False, now
+                yield row.begun, number, row.text.rstrip()
+            if number <= self._last - _WINDOW and not row.is_new:
+                del self._rows[number]
+
+
+class ConsoleLog:
+    """What of the output goes into one recording."""
+
+    def __init__(self) -> None:
+        self._screens = {number: Screen() for number in range(len(STREAMS))}
+        self._bytes = 0
+        self.is_full = False
+        """Whether nothing more is recorded."""
+
+    def write(self, now: float, stream: int, text: str) -> None:
+        """Take in text that was written at some time."""
+        if not self.is_full:
+            self._screens[stream].write(now, text)
+
+    def take(self, now: float, is_last: bool = False) -> Iterator[tuple[float, dict[str, Any]]]:
+        """Yield when they were begun, and the fields `stream`, `line` and `text` of the lines to record."""
+        for stream, screen in () if self.is_full else self._screens.items():
+            for begun, line, text in screen.take(now, is_last):
+                encoded = text.encode(errors="replace")  # no surrogates
+                self._bytes += len(encoded) + _LINE_BYTES
+                yield begun, {"stream": stream, "line": line, "text": encoded.decode()}
+                if self._bytes > MAX_CONSOLE_BYTES:
+                    self.is_full = True
+                    yield now, {"line": -1, "text": _NOTE}
+                    return
+
+
+@dataclass(frozen=True)
+class ConsoleLine:
+    """A line of output."""
+
+    seconds: float
+    """When it began, in seconds of the run, as in its clock."""
+    position: int
+    """The number of steps executed when it was recorded, about a second later."""
+    stream: str
+    """`stdout`, `stderr`, or empty for a note of the recorder."""
+    text: str
+
+
+def read_console(recording: TopicReader, clock: Clock | None) -> list[ConsoleLine]:
+    """Return the recorded output of a run, in the order in which lines began.
+
+    Args:
+        recording: the recording.
+        clock: its clock.
+
+    Raises:
+        RecordingError: a line is damaged, or there are too many.
+    """
+    lines: dict[tuple[float, int, int], ConsoleLine] = {}
+    for count, fields in enumerate(recording.decoded(schema.CONSOLE_TOPIC, max_bytes=_MAX_MESSAGE)):
+        number, started, seconds = (fields[name] for name in ("stream", "started", "seconds"))
+        if count == MAX_LINES or number >= len(STREAMS) or not abs(seconds) < float("inf"):
+            raise RecordingError(
+                f"{recording.path}: {schema.CONSOLE_TOPIC.name}: found stream {number} after {seconds} s in "
+                f"message {count}, expected at most {MAX_LINES:,} of the streams 0 to {len(STREAMS) - 1}."
+            )
+        earlier = 0.0 if clock is None else clock.earlier.get(started, 0.0)
+        position = fields["log_time"] // schema.STEP_NANOSECONDS
+        line = ConsoleLine(earlier + seconds, position, STREAMS[number], fields["text"])
+        lines[started, number, fields["line"]] = line
+    return sorted(lines.values(), key=lambda line: line.seconds)

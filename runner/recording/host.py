@@ -1,0 +1,196 @@
+"""What a training uses of its machine: processor, memory, GPUs, disk and network.
+
+Measured about once a second by the thread of `observer`, for all runs of a process at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.clock import MAX_SAMPLES, Clock
+from runner.recording.schema import STEP_NANOSECONDS
+from runner.recording.topic_reader import TopicReader
+
+MAX_GPUS: Final = 64
+_CHILDREN_SECONDS: Final = 10.0
+"""Interval at which child processes are looked for, which takes milliseconds where many processes run."""
+_BYTES: Final = 8192
+"""The largest message that is read."""
+_STAMPS: Final = ("started", "seconds")
+GPU_FIELDS: Final = tuple(each.name for each in schema.HOST.fields if each.repeated)
+FIELDS: Final = tuple(
+    each.name for each in schema.HOST.fields if not each.repeated and each.name not in _STAMPS
+)
+
+
+class HostSampler:
+    """Measures this process, its children and the host. Not thread-safe."""
+
+    def __init__(self) -> None:
+        import psutil
+
+        self._psutil = psutil
+        self._process = psutil.Process()
+        self._children: list[Any] = []
+        self._looked = -math.inf
+        self._before: tuple[float, float] | None = None
+        """When the last sample was taken, and the processor time until then."""
+        psutil.cpu_percent()  # the next call measures from here
+        self._gpus = _Gpus()
+        self.sample()
+
+    def sample(self) -> dict[str, float | list[float]]:
+        """Return the values of `FIELDS` and `GPU_FIELDS`, but `disk_free_bytes`; NaN where one is unknown.
+
+        Percentages of the processor are means since the last call.
+        """
+        psutil, now = self._psutil, time.monotonic()
+        if now - self._looked > _CHILDREN_SECONDS:
+            self._looked = now
+            with contextlib.suppress(psutil.Error, OSError):
+                self._children = self._process.children(recursive=True)
+        processor, memory = self._used()
+        cpu = math.nan
+        if self._before is not None and now > self._before[0]:
+            cpu = max(0.0, 100 * (processor - self._before[1]) / (now - self._before[0]))
+        self._before = (now, processor)
+        values: dict[str, float | list[float]] = dict.fromkeys(FIELDS, math.nan)
+        values |= {"cpu_percent": cpu, "memory_bytes": memory}
+        # The system may hide each of these, as in a container.
+        with contextlib.suppress(psutil.Error, OSError, RuntimeError, NotImplementedError):
+            host = psutil.virtual_memory()
+            values |= {
+                "host_memory_bytes": float(host.total - host.available),
+                "host_memory_total": float(host.total),
+            }
+            values["host_cpu_percent"] = float(psutil.cpu_percent())
+        with contextlib.suppress(psutil.Error, OSError, RuntimeError, NotImplementedError):
+            if (disk := psutil.disk_io_counters()) is not None:
+                values |= {
+                    "disk_read_bytes": float(disk.read_bytes),
+                    "disk_written_bytes": float(disk.write_bytes),
+                }
+        with contextlib.suppress(psutil.Error, OSError, RuntimeError, NotImplementedError):
+            if (network := psutil.net_io_counters()) is not None:
+                values |= {
+                    "network_received_bytes": float(network.bytes_recv),
+                    "network_sent_bytes": float(network.bytes_sent),
+                }
+        return values | self._gpus.sample()
+
+    def _used(self) -> tuple[float, float]:
+        """Return processor time in seconds and resident memory in bytes, of the process and its children."""
+        processor = memory = 0.0
+        for process in (self._process, *self._children):
+            with contextlib.suppress(self._psutil.Error, OSError), process.oneshot():
+                times = process.cpu_times()
+                processor += times.user + times.system
+                if process is self._process:  # of children that have ended
+                    processor += times.children_user + times.children_system
+                memory += process.memory_info().rss
+        return processor, memory
+
+
+class _Gpus:
+    """The GPUs of NVIDIA; none without its driver or without the library (the extra `gpu`)."""
+
+    def __init__(self) -> None:
+        self._handles: list[Any] = []
+        try:
+            import pynvml
+
+            self._nvml = pynvml
+            pynvml.nvmlInit()
+            count = min(pynvml.nvmlDeviceGetCount(), MAX_GPUS)
+            self._handles = [pynvml.nvmlDeviceGetHandleByIndex(k) for k in range(count)]
+        except Exception:  # the library may be of another version, or another package of its name
+            self._handles = []
+
+    def sample(self) -> dict[str, list[float]]:
+        """Return the values of `GPU_FIELDS`, one a GPU."""
+        values: dict[str, list[float]] = {name: [] for name in GPU_FIELDS}
+        for handle in self._handles:
+            use = used = total = math.nan
+            with contextlib.suppress(Exception):  # each of its errors is a class of its own
+                memory = self._nvml.nvmlDeviceGetMemoryInfo(handle)
+                used, total = float(memory.used), float(memory.total)
+                use = float(self._nvml.nvmlDeviceGetUtilizationRates(handle).gpu)
+            for name, value in zip(GPU_FIELDS, (use, used, total), strict=True):
+                values[name].append(value)
+        return values
+
+
+@dataclass(frozen=True, eq=False)
+class HostMetrics:
+    """What a run used of its machine; NaN where a value is unknown."""
+
+    positions: NDArray[np.int64]
+    """[samples]: steps executed so far, of training and evaluation together."""
+    seconds: NDArray[np.float64]
+    """[samples]: as in the clock."""
+    values: Mapping[str, NDArray[np.float64]]
+    """Each of `FIELDS`, [samples]; each of `GPU_FIELDS`, [samples, GPUs]."""
+    started: NDArray[np.float64] = field(repr=False)
+    """[samples]: when the session of the sample began."""
+
+    @cached_property
+    def gpus(self) -> int:
+        """The number of GPUs."""
+        return int(self.values[GPU_FIELDS[0]].shape[1])
+
+    def rate(self, name: str) -> NDArray[np.float64]:
+        """Return the bytes a second of a counter, [samples]; NaN for the first sample of a session."""
+        counts = self.values[name]
+        rate = np.full(len(counts), np.nan)
+        passed = np.diff(self.seconds)
+        same = (np.diff(self.started) == 0) & (passed > 0)
+        rate[1:][same] = np.diff(counts)[same] / passed[same]
+        return np.where(rate < 0, np.nan, rate)
+
+
+def read_host(recording: TopicReader, clock: Clock | None) -> HostMetrics | None:
+    """Return what a run used of its machine; None if that was not recorded.
+
+    Args:
+        recording: the recording.
+        clock: its clock.
+
+    Raises:
+        RecordingError: samples are damaged, or too many.
+    """
+    rows: list[tuple[float, ...]] = []
+    gpus: list[list[list[float]]] = []
+    name = schema.HOST_TOPIC.name
+    for fields in recording.decoded(schema.HOST_TOPIC, max_bytes=_BYTES):
+        own = [fields[name] for name in GPU_FIELDS]
+        if len(rows) == MAX_SAMPLES or len({len(each) for each in own}) > 1 or len(own[0]) > MAX_GPUS:
+            raise RecordingError(
+                f"{recording.path}: {name}: found {[len(each) for each in own]} values of GPUs in sample "
+                f"{len(rows)}, expected at most {MAX_SAMPLES:,} samples, with at most {MAX_GPUS} GPUs each."
+            )
+        rows.append((fields["log_time"] // STEP_NANOSECONDS, *(fields[name] for name in (*_STAMPS, *FIELDS))))
+        gpus.append(own)
+    if not rows:
+        return None
+    positions = np.array([row[0] for row in rows], np.int64)
+    started, seconds, *columns = np.array([row[1:] for row in rows]).T
+    if not np.isfinite([started, seconds]).all():
+        raise RecordingError(f"{recording.path}: {name}: found a time that is not finite.")
+    widest = max(len(own[0]) for own in gpus)
+    per_gpu = np.full((len(GPU_FIELDS), len(rows), widest), np.nan)
+    for k, own in enumerate(gpus):
+        per_gpu[:, k, : len(own[0])] = own
+    values = dict(zip(FIELDS, columns, strict=True)) | dict(zip(GPU_FIELDS, per_gpu, strict=True))
+    seconds = seconds if clock is None else clock.run_seconds(started, seconds)
+    return HostMetrics(positions, seconds, values, started)
