@@ -56,15 +56,18 @@ class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
         A name keeps the dtype and the shape of its first value; a step need not have all names.
         """
         result = self._env_step(action)
-        observation, reward, terminated, truncated, info = result
-        with self._lock:
-            if self._loop.active is not self._rows:
-                self._loop.activate(self._rows)
-            self._take(action, observation, reward, terminated, truncated)
-            if extras is not None:
-                self._take_extras(extras)
-        if self._has_messages:
-            self._record_messages(info, terminated or truncated)
+        try:
+            observation, reward, terminated, truncated, info = result
+            with self._lock:
+                if self._loop.active is not self._rows:
+                    self._loop.activate(self._rows)
+                self._take(action, observation, reward, terminated, truncated)
+                if extras is not None:
+                    self._take_extras(extras)
+            if self._has_messages:
+                self._record_messages(info, terminated or truncated)
+        except Exception as error:
+            self._loop.fail(error)
         return result
 
     def reset(
@@ -95,6 +98,7 @@ def record(
     make: str | Callable[[], Any] | None = None,
     join: Run | str | os.PathLike[str] | Literal[True] | None = None,
     shard: str | None = None,
+    on_error: Literal["raise", "warn"] = "raise",
     **packing: Any,
 ) -> RecordedEnv:
     """Return the environment, with everything that a loop does with it recorded.
@@ -128,7 +132,12 @@ def record(
             that started this one: this process records a shard of it. It has no name, seed and config then.
         shard: the name of this process in that run, which determines the order of processes in it; by default
             the name that `multiprocessing` gave it.
-        packing: `compression`, `level`, `index`, `chunk_steps`, as in the section `recording` of a file.
+        on_error: what happens if recording fails while the loop runs, because the disk is full or a value
+            cannot be recorded: `raise` the error, or `warn` once and go on without recording; the run then
+            has the status failed and says so. A value of `log` and the like that cannot be recorded is left
+            out. Mistakes in these arguments are always raised.
+        packing: `compression`, `level`, `index`, `chunk_steps` and `code`, as in the section `recording` of a
+            file; `code=False` records neither the script nor the state of its git repository.
 
     Raises:
         EnvironmentNotUsable: a space cannot be recorded.
@@ -160,7 +169,17 @@ def record(
         return _record_into_run(env, into, phase, checked_make(make))
     described = describe(env, env.observation_space, env.action_space)
     options = options_of(
-        recordings, name, seed, config, info, packing, frames_every, frame_format, join=join, shard=shard
+        recordings,
+        name,
+        seed,
+        config,
+        info,
+        packing,
+        frames_every,
+        frame_format,
+        join=join,
+        shard=shard,
+        on_error=on_error,
     )
     if frames_every:
         require_pictures(env)

@@ -106,7 +106,9 @@ class Loop(Generic[R]):
         self.lock = threading.RLock()
         self.closed = False
         self.is_foreign = False
-        """Whether this process was forked from the one that records."""
+        """Whether this process records nothing: it was forked from the one that does, or recording failed."""
+        self._failure = ""
+        """Why recording stopped, if it did and `on_error` is "warn"."""
         self.views: weakref.WeakSet[Any] = weakref.WeakSet()
         """The recorded environments; `_detach` of each is called in a forked process."""
         self._warnings: set[str] = set()
@@ -155,7 +157,7 @@ class Loop(Generic[R]):
                 self._describe()
             except BaseException as error:
                 self._file.close()
-                self._mark_failed(error)
+                self._mark_failed(truncated_message(error))
                 raise
         self._follower = Follower(client, self.run, lambda: self._file.size) if client else None
         if not is_shard:
@@ -324,7 +326,7 @@ class Loop(Generic[R]):
 
     def records(self) -> bool:
         """Return whether this process records, and warn if it was forked from the one that does."""
-        if self.is_foreign:
+        if self.is_foreign and not self._failure:
             self.warn_once(
                 f"run {self.run.run_id} is recorded by the process that this one was forked from, and not "
                 "here. To record what this process does into the same run, join it here: "
@@ -337,6 +339,37 @@ class Loop(Generic[R]):
         if message not in self._warnings:
             self._warnings.add(message)
             warn_user(message)
+
+    def leave_out(self, error: Exception) -> None:
+        """Raise the error of a value that cannot be recorded; with `on_error="warn"`, warn of it instead.
+
+        It is called where the error is handled.
+        """
+        if self.options.on_error == "raise" or not isinstance(error, ConfigError):
+            self.fail(error)
+        else:
+            self.warn_once(f"run {self.run.run_id}: a value was left out: {error}")
+
+    def fail(self, error: Exception) -> None:
+        """Raise an error of the recorder; with `on_error="warn"`, warn of it and stop recording instead.
+
+        It is called where the error is handled. The run then has the status `failed`, with the reason.
+        """
+        if self.options.on_error == "raise":
+            raise  # noqa: PLE0704 - what the caller handles
+        with self.lock:
+            if self.is_foreign:
+                return
+            if self.closed:
+                self._failure = str(error)
+            else:
+                self._failure = (
+                    f"recording stopped at step {self.position:,}, and the loop went on without it: "
+                    f"{type(error).__name__}: {error}"
+                )
+            self.close("failed", self._failure)
+            self.disown()
+        self.warn_once(f"run {self.run.run_id}: {self._failure}")
 
     # --- the end --------------------------------------------------------------------------------------
 
@@ -356,19 +389,24 @@ class Loop(Generic[R]):
             try:
                 summary = self._finish(status, error)
             except BaseException as failure:
-                self._recorder.abandon()
-                with contextlib.suppress(StorageError):
-                    write_result(self._file, "failed", {"error": truncated_message(failure)})
-                self._mark_failed(failure)
-                if self._follower:
-                    self._follower.stop()
-                raise
+                reason = truncated_message(self._failure or failure)
+                self._abandon(reason)
+                if self.options.on_error == "raise" or not isinstance(failure, Exception):
+                    raise
+                if not self._failure:
+                    self.warn_once(f"run {self.run.run_id} could not be completed: {reason}")
+                return self.run
             finally:
                 self.closed, self.active = True, None
                 self._rows.clear()
                 self._file.close()
             made_by = self._code.made_by(self.run)
-            self.run = self.run.update(status=status, summary=summary, provenance=made_by)
+            try:
+                self.run = self.run.update(status=status, summary=summary, provenance=made_by)
+            except StorageError as failure:
+                if self.options.on_error == "raise":
+                    raise
+                self.warn_once(f"run {self.run.run_id}: its status could not be written: {failure}")
         if os.environ.get(RUN_VARIABLE) == os.path.abspath(self.run.folder):  # noqa: PTH100
             del os.environ[RUN_VARIABLE]
         joined = self.options.join
@@ -385,9 +423,19 @@ class Loop(Generic[R]):
             self._follower.finish(self.run)
         return self.run
 
-    def _mark_failed(self, error: BaseException) -> None:
+    def _abandon(self, reason: str) -> None:
+        """Close what could not be finished, with as much as can be written."""
+        with contextlib.suppress(Exception):  # the first error is the one that matters
+            self._recorder.abandon()
         with contextlib.suppress(StorageError):
-            self.run = self.run.update(status="failed", summary={"error": truncated_message(error)})
+            write_result(self._file, "failed", {"error": reason})
+        self._mark_failed(reason)
+        if self._follower:
+            self._follower.stop()
+
+    def _mark_failed(self, reason: str) -> None:
+        with contextlib.suppress(StorageError):
+            self.run = self.run.update(status="failed", summary={"error": reason})
 
     def _finish(self, status: str, error: str) -> dict[str, Any]:
         self._commit()

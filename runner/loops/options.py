@@ -51,6 +51,7 @@ class Options:
     shard: str | None = None
     steps: str = "all"
     """What is recorded of a step: `all`, `actions` or `none`."""
+    on_error: str = "raise"
 
     def __post_init__(self) -> None:
         expectations = (
@@ -64,6 +65,7 @@ class Options:
             ("frames_every", "a whole number from 0", is_whole(self.frames_every, 0, 2**31)),
             ("frame_format", "png or jpeg", self.frame_format in ("png", "jpeg")),
             ("steps", "all, actions or none", self.steps in _STEPS),
+            ("on_error", "raise or warn", self.on_error in ("raise", "warn")),
         )
         for key, expected, holds in expectations:
             if not holds:
@@ -104,6 +106,7 @@ def options_of(
     frames_of: tuple[int, ...] | None = None,
     join: object = None,
     shard: str | None = None,
+    on_error: str = "raise",
 ) -> Options:
     """Return the options for the arguments of `record`.
 
@@ -155,6 +158,7 @@ def options_of(
         join=None if join is None else find_joined(join, recordings),
         shard=shard,
         steps=steps,
+        on_error=on_error,
     )
 
 

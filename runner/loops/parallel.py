@@ -50,17 +50,20 @@ class RecordedParallel(RecordedAlone[AgentRows]):
     ) -> tuple[Any, Any, Any, Any, Any]:
         """Take a step of all agents, and record it, with values of your own by agent and name."""
         result = self.env.step(actions)
-        observations, rewards, terminated, truncated, infos = result
-        with self._loop.lock:
-            self._loop.activate(self._rows)
-            over = not self.env.agents
-            self._rows.take_game(actions, observations, rewards, terminated, truncated, over)
-            if extras is not None:
-                self._take_extras(self._extras_by_name(extras))
-        if self._options.info:
-            self._messages.info(self._phase, self._info_by_field(infos))
-        if self._options.frames_every:
-            self._record_frame(is_over=over)
+        try:
+            observations, rewards, terminated, truncated, infos = result
+            with self._loop.lock:
+                self._loop.activate(self._rows)
+                over = not self.env.agents
+                self._rows.take_game(actions, observations, rewards, terminated, truncated, over)
+                if extras is not None:
+                    self._take_extras(self._extras_by_name(extras))
+            if self._options.info:
+                self._messages.info(self._phase, self._info_by_field(infos))
+            if self._options.frames_every:
+                self._record_frame(is_over=over)
+        except Exception as error:
+            self._loop.fail(error)
         return result  # type: ignore[no-any-return]
 
     def _extras_by_name(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -96,6 +99,7 @@ def record_parallel(
     make: str | Callable[[], Any] | None = None,
     join: Run | str | os.PathLike[str] | Literal[True] | None = None,
     shard: str | None = None,
+    on_error: Literal["raise", "warn"] = "raise",
     **packing: Any,
 ) -> RecordedParallel:
     """Return a PettingZoo parallel environment, with everything that a loop does with it recorded.
@@ -116,6 +120,7 @@ def record_parallel(
         make: as for `record`.
         join: as for `record`.
         shard: as for `record`.
+        on_error: as for `record`.
         packing: as for `record`.
 
     Raises:
@@ -138,7 +143,17 @@ def record_parallel(
     if frames_every:
         require_pictures(env)
     options = options_of(
-        recordings, name, seed, config, info, packing, frames_every, frame_format, join=join, shard=shard
+        recordings,
+        name,
+        seed,
+        config,
+        info,
+        packing,
+        frames_every,
+        frame_format,
+        join=join,
+        shard=shard,
+        on_error=on_error,
     )
     maker = game_maker_of(env, checked_make(make))
     return RecordedParallel(env, Loop(described, options, maker, AgentRows), phase)

@@ -44,16 +44,20 @@ class Recorded(Generic[R]):
         Raises:
             ConfigError: it is neither.
         """
-        if isinstance(name, str):
-            self._messages.log(self._phase, name, value)
+        try:
+            if isinstance(name, str):
+                self._messages.log(self._phase, name, value)
+                return
+            if not isinstance(name, Mapping) or value is not None:
+                raise ConfigError(f"log: found {name!r}, expected a name and a value, or a mapping of them")
+        except Exception as error:
+            self._loop.leave_out(error)
             return
-        if not isinstance(name, Mapping) or value is not None:
-            raise ConfigError(f"log: found {name!r}, expected a name and a value, or a mapping of them")
         for key, own in name.items():
             if isinstance(own, Mapping):
                 self.log({f"{key}/{inner}": part for inner, part in own.items()})
             else:
-                self._messages.log(self._phase, key, own)
+                self.log(key, own)
 
     def snapshot(self, name: str, array: Any) -> None:
         """Record an array of numbers, or each of a mapping of arrays, as it is now: `rec.snapshot("q", q)`.
@@ -64,7 +68,10 @@ class Recorded(Generic[R]):
         Raises:
             ConfigError: it holds something else, or an array is larger than 64 MB.
         """
-        self._messages.snapshot(self._phase, name, array)
+        try:
+            self._messages.snapshot(self._phase, name, array)
+        except Exception as error:
+            self._loop.leave_out(error)
 
     def checkpoint(self, name: str, value: Any, *, pickle: bool = False) -> str:
         """Keep the agent's parameters as they are now: `rec.checkpoint("policy", model.state_dict())`.
@@ -78,14 +85,18 @@ class Recorded(Generic[R]):
             pickle: record any object by pickling it; it can be loaded only by those who trust it.
 
         Returns:
-            The digest of the content, in hexadecimal.
+            The digest of the content, in hexadecimal; empty if it could not be kept, with `on_error="warn"`.
 
         Raises:
             ConfigError: the name or the value cannot be recorded.
             MissingExtra: a mapping needs safetensors, which is not installed.
             StorageError: the file cannot be read, or the store cannot be written.
         """
-        return self._messages.checkpoint(self._phase, name, value, pickle)
+        try:
+            return self._messages.checkpoint(self._phase, name, value, pickle)
+        except Exception as error:
+            self._loop.leave_out(error)
+            return ""
 
     def note_step(self, values: Mapping[str, Any] | None = None, /, **more: Any) -> None:
         """Record values with the last step, as `step(action, extras={...})` does.
@@ -100,7 +111,10 @@ class Recorded(Generic[R]):
             ConfigError: a name or a value cannot be recorded.
             RunnerError: no step of this phase was taken since the last step of the other phase.
         """
-        self._loop.note(self._phase, self._rows, self._extras_by_name({**(values or {}), **more}))
+        try:
+            self._loop.note(self._phase, self._rows, self._extras_by_name({**(values or {}), **more}))
+        except Exception as error:
+            self._loop.leave_out(error)
 
     def _extras_by_name(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
         return values
@@ -223,15 +237,18 @@ class RecordedAlone(Recorded[S]):
         before = dict(options) if options else None  # the environment may change them
         state = self._watch.before(self._steps_so_far()) if seed is None else None
         result: tuple[Any, Any] = self.env.reset(**given(seed=seed, options=options))
-        state = self._watch.after(state, seed)
-        observation, info = result
-        with self._loop.lock:
-            self._loop.activate(self._rows)
-            self._rows.reset(observation, seed)
-            if state is not None:
-                self._messages.reset_state(self._phase, state._replace(reset=self._rows.resets - 1))
-        self._messages.reset_info(self._phase, self._info_by_field(info), before, seed)
-        self._record_frame(is_reset=True)
+        try:
+            state = self._watch.after(state, seed)
+            observation, info = result
+            with self._loop.lock:
+                self._loop.activate(self._rows)
+                self._rows.reset(observation, seed)
+                if state is not None:
+                    self._messages.reset_state(self._phase, state._replace(reset=self._rows.resets - 1))
+            self._messages.reset_info(self._phase, self._info_by_field(info), before, seed)
+            self._record_frame(is_reset=True)
+        except Exception as error:
+            self._loop.fail(error)
         return result
 
     def _info_by_field(self, info: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -70,6 +70,24 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
             if watch.steps > watch.due:
                 states = watch.before_step(over)
         result = self.env.step(actions)
+        try:
+            self._record_step(actions, result, extras, over, states)
+        except Exception as error:
+            self._loop.fail(error)
+        return result
+
+    def _record_step(
+        self, actions: Any, result: Any, extras: Mapping[str, Any] | None, over: Any, states: States | None
+    ) -> None:
+        """Record a step of all environments.
+
+        Args:
+            actions: of all.
+            result: what the vector returned.
+            extras: the user's own arrays by name.
+            over: [N], whether their episodes were over before; None where that does not matter.
+            states: what resets within the step depended on.
+        """
         observations, rewards, terminated, truncated, infos = result
         final = _final_observations(infos) if self._mode == AutoresetMode.SAME_STEP else None
         with self._loop.lock:
@@ -80,7 +98,7 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
                 self._take_extras(extras)
         if self._options.info:
             self._messages.info(self._phase, _by_environment(infos))
-        if frames_every:
+        if self._options.frames_every:
             ended = np.logical_or(terminated, truncated)
             self._until_frame -= 1
             if self._mode == AutoresetMode.SAME_STEP:
@@ -89,7 +107,6 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
                 self._record_frames(resets=over, ends=ended)
             else:
                 self._record_frames(ends=ended)
-        return result
 
     def _record_frames(self, resets: Any = False, ends: Any = False) -> None:
         """Record pictures of the environments that were reset or whose episode ended, now and then of all."""
@@ -119,7 +136,10 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
         states = self._watch.before_reset(which, seeds)
         result = self.env.reset(**given(seed=seed, options=options))
         states = self._watch.after_reset(states, which, seeds)
-        self.record_reset(*result, seeds, which, states, others)
+        try:
+            self.record_reset(*result, seeds, which, states, others)
+        except Exception as error:
+            self._loop.fail(error)
         return result
 
     def record_reset(
@@ -166,6 +186,7 @@ def record_vector(
     make: str | Callable[[], Any] | None = None,
     join: Run | str | os.PathLike[str] | Literal[True] | None = None,
     shard: str | None = None,
+    on_error: Literal["raise", "warn"] = "raise",
     **packing: Any,
 ) -> RecordedVector:
     """Return a vector environment, with everything that a loop does with it recorded.
@@ -194,6 +215,7 @@ def record_vector(
         make: as for `record`; the function makes the vector environment.
         join: as for `record`.
         shard: as for `record`.
+        on_error: as for `record`.
         packing: as for `record`.
 
     Raises:
@@ -232,6 +254,7 @@ def record_vector(
         chosen,
         join=join,
         shard=shard,
+        on_error=on_error,
     )
     rows = partial(VectorRows, next_step=mode == AutoresetMode.NEXT_STEP)
     loop = Loop(described, options, maker, rows, (described.environments,))
