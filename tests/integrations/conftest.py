@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # PyTorch reads it: its threads wait for one another otherwise
 HERE = Path(__file__).parent
 
 
