@@ -73,7 +73,8 @@ class Shape:
         return (
             *(steps, episodes, table(layout.RESETS, "/train/reset", "/eval/reset")),
             *(table(layout.INFOS, "/train/info", "/eval/info"), table(layout.SCALARS, "/scalar")),
-            *(table(layout.ARRAYS, "/array"), table(layout.FRAMES, "/train/frame", "/eval/frame"), *log),
+            table(layout.ARRAYS, "/array"),
+            *(table(layout.FRAMES, "/train/frame", "/eval/frame", "/image"), *log),
             *(table(layout.CHECKPOINTS, "/checkpoint"), table(layout.EXTRA_COLUMNS, "/extra")),
             *((table(layout.EXTRAS, "/train/extra", "/eval/extra"),) if self.extras else ()),
             table(layout.RESET_STATES, "/train/reset_state", "/eval/reset_state"),

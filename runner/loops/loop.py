@@ -93,7 +93,7 @@ class Loop(Generic[R]):
     ) -> None:
         is_shard = options.join is not None
         client = connect(str(options.recordings)) if is_server(options.recordings) and not is_shard else None
-        self._started = time.monotonic()
+        self.started = time.monotonic()
         self._config = options.config(described)
         self._maker = maker
         self._own_makers: dict[str, EnvironmentMaker] = {}
@@ -174,7 +174,7 @@ class Loop(Generic[R]):
         options, config = self.options, self._config
         if options.join is None:
             folder = folder or recordings_folder(options.recordings)
-            return new_run(folder, config, options.seed, config["name"], **facts)
+            return new_run(folder, config, options.seed, config["name"], options.run_id, **facts)
         expected = options.join.facts.get("spaces")
         if facts["spaces"] != expected:
             raise ConfigError(
@@ -274,6 +274,11 @@ class Loop(Generic[R]):
                     "note_step: found that the last step was one of another phase, expected one of this phase"
                 )
             self.extras.extend(phase, rows, values)
+
+    @property
+    def active_phase(self) -> str:
+        """The phase of the last step; `train` before any."""
+        return next((phase for phase, rows in self._rows.items() if rows is self.active), "train")
 
     @property
     def position(self) -> int:
@@ -451,7 +456,7 @@ class Loop(Generic[R]):
             result["error"] = truncated_message(error)
         self._code.write(self._file, wait=True)
         write_result(self._file, status, result, self._own_makers)
-        seconds = round(time.monotonic() - self._started, 3)
+        seconds = round(time.monotonic() - self.started, 3)
         return result | {"seconds": seconds, "bytes": self._file.size}
 
     def _commit(self) -> None:
@@ -473,7 +478,7 @@ class Loop(Generic[R]):
         try:
             if self.closed or self.is_foreign:
                 return False
-            age = time.monotonic() - self._started
+            age = time.monotonic() - self.started
             if age < FLUSH_SECONDS:
                 return True
             if not self._is_settled and not self.messages.has_logged and age < _UNDECIDED_SECONDS:
@@ -538,6 +543,12 @@ class _Flusher:
 
 
 _flusher = _Flusher()
+
+
+def open_loops() -> list[Loop[Any]]:
+    """Return the loops that this process records, the oldest first."""
+    loops = [loop for loop in _flusher.loops if not loop.closed and not loop.is_foreign]
+    return sorted(loops, key=lambda loop: loop.started)
 
 
 def _after_fork() -> None:

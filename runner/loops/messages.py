@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import threading
 from collections.abc import Callable, Mapping
@@ -10,12 +9,12 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.errors import ConfigError
 from runner.loops.checkpointing import content_of
 from runner.loops.options import ALL_INFO, Options, pillow
 from runner.loops.outcomes import Outcomes
+from runner.loops.pictures import Picture, image_bytes
 from runner.loops.rows import MAX_SEED, PhaseRows
 from runner.loops.values import MAX_ARRAY_BYTES, arrays_of, check_log_name, logged_number
 from runner.recording import schema
@@ -36,7 +35,6 @@ _MAX_SERIES: Final = 4096
 """The most names of logged numbers whose encoders are kept at hand."""
 _LONG_NAME: Final = 200
 """Numbers under longer names do not wait, because together they would be large."""
-_JPEG_QUALITY: Final = 90
 
 
 class LoopState(Protocol):
@@ -274,14 +272,25 @@ class Messages:
             place = frame_id(phase, environment, is_reset)
 
             def make() -> bytes:
-                return encode_image(_image_bytes(pixels, kind), kind, position, place)
+                return encode_image(image_bytes(pixels, kind), kind, position, place)
 
             self._recorder.submit(self._topics[f"/{phase}/frame"], make, position)
 
+    def picture(self, name: str, picture: Picture) -> None:
+        """Record a picture or a film under a name, at this moment; another thread encodes it.
 
-def _image_bytes(pixels: NDArray[np.uint8], kind: str) -> bytes:
-    """Return a picture, [height, width, 3], as `png` (exact) or `jpeg` (smaller, and not exact)."""
-    buffer = io.BytesIO()
-    options: dict[str, Any] = {"compress_level": 1} if kind == "png" else {"quality": _JPEG_QUALITY}
-    pillow().fromarray(pixels).save(buffer, kind, **options)
-    return buffer.getvalue()
+        Raises:
+            ConfigError: the name is not valid.
+            MissingExtra: Pillow is not installed.
+        """
+        check_log_name(name, "a picture")
+        pillow()
+        with self._loop.lock:
+            if self._loop.records():
+                position = self._loop.position
+                self.has_logged = True
+
+                def make() -> bytes:
+                    return encode_image(picture.encoded(), picture.format, position, name)
+
+                self._recorder.submit(schema.IMAGE_TOPIC, make, position)

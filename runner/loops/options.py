@@ -52,6 +52,8 @@ class Options:
     steps: str = "all"
     """What is recorded of a step: `all`, `actions` or `none`."""
     on_error: str = "raise"
+    run_id: str | None = None
+    """The id of the run, from `new_run_id`; another one is made if it is taken by then."""
 
     def __post_init__(self) -> None:
         expectations = (
@@ -119,6 +121,7 @@ def options_of(
     steps = packing.pop("steps", "all")
     if steps == "actions":  # an index of messages would take more than they do
         packing = {"index": "chunk"} | packing
+    run_id = packing.pop("run_id", None)
     if unknown := sorted(set(packing) - set(PACKING)):
         expected = ", ".join(("steps", *PACKING))
         raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {expected}")
@@ -159,6 +162,7 @@ def options_of(
         shard=shard,
         steps=steps,
         on_error=on_error,
+        run_id=run_id,
     )
 
 

@@ -63,7 +63,7 @@ def are_readable(folder: Path) -> bool:
 def labels_from(values: Mapping[str, Any]) -> Labels:
     """Return the labels in a JSON object; invalid ones are ignored."""
     name, tags, note = values.get("name"), values.get("tags"), values.get("note")
-    valid = {tag for tag in tags if _is_tag(tag)} if isinstance(tags, list) else set()
+    valid = {tag for tag in tags if is_tag(tag)} if isinstance(tags, list) else set()
     return Labels(
         name if isinstance(name, str) and name.isprintable() and len(name) <= 100 else "",
         tuple(sorted(valid)[:MAX_TAGS]),
@@ -105,13 +105,14 @@ def as_json(labels: Labels) -> dict[str, Any]:
     return {key: value for key, value in values.items() if value}
 
 
-def _is_tag(text: Any) -> bool:
+def is_tag(text: Any) -> bool:
+    """Return whether a run can have this tag."""
     return isinstance(text, str) and _TAG.fullmatch(text) is not None
 
 
 def _check(labels: Labels) -> None:
     for tag in labels.tags:
-        if not _is_tag(tag):
+        if not is_tag(tag):
             raise RunnerError(f"tag: found {tag!r}, expected {TAG_EXPECTED}.")
     if len(labels.tags) > MAX_TAGS:
         raise RunnerError(f"tag: found {len(labels.tags)} tags, expected at most {MAX_TAGS}.")

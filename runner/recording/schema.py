@@ -372,6 +372,8 @@ HOST_TOPIC = Topic("/host", 31, HOST, digested=False)
 CONSOLE_TOPIC = Topic("/console", 32, CONSOLE, digested=False)
 MACHINE_TOPICS: Final = (CLOCK_TOPIC, HOST_TOPIC, CONSOLE_TOPIC)
 """The topics of how the recording went on its machine: other messages each time a job is run."""
+IMAGE_TOPIC = Topic("/image", 50, IMAGE, digested=False)
+"""Pictures that were logged under a name, which is their `frame_id`; a film is an animated WebP."""
 
 TRAIN_ACTIONS = Topic("/train/actions", 40, ACTIONS, "train", digested=False)
 EVAL_ACTIONS = Topic("/eval/actions", 41, ACTIONS, "eval", digested=False)
@@ -392,7 +394,7 @@ _EVERY_LOOP: Final = (
     *(SCALAR_TOPIC, ARRAY_TOPIC, TRAIN_FRAME, EVAL_FRAME, LOG_TOPIC),
     *(TRAIN_RESET_STATE, EVAL_RESET_STATE),
     *(EXTRA_COLUMNS_TOPIC, TRAIN_EXTRA, EVAL_EXTRA, CHECKPOINT_TOPIC),
-    *(TRAIN_ACTIONS, EVAL_ACTIONS),
+    *(TRAIN_ACTIONS, EVAL_ACTIONS, IMAGE_TOPIC),
 )
 KINDS: Final = {
     "job": (*TOPICS, *MACHINE_TOPICS),

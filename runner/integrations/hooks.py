@@ -1,0 +1,193 @@
+"""The environments of a script, recorded without being handed over: the first one that it resets.
+
+Every class of environments of Gymnasium gets a `reset` that first looks for a run that waits for one. The
+outermost environment that the script resets is then stepped through its recorded twin.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import sys
+import weakref
+from collections.abc import Callable, Mapping
+from types import FrameType, MethodType
+from typing import Any, Final, Protocol
+
+import gymnasium
+from gymnasium.vector import VectorEnv
+
+from runner.loops.recorded import Recorded
+
+_VECTORS_OF_OTHERS: Final = {
+    "stable_baselines3": "runner.integrations.sb3.Recording",
+    "torchrl": "runner.integrations.torchrl",
+    "ray": "runner.integrations.rllib",
+}
+"""Libraries that step several environments one by one, and what records these."""
+
+
+class WaitingRun(Protocol):
+    """The run of a script that is not closed."""
+
+    run_id: str
+
+    @property
+    def waits_for_environment(self) -> bool:
+        """Whether the next environment that is reset is this run's."""
+
+    @property
+    def has_environment(self) -> bool:
+        """Whether it records one that the script did not hand over."""
+
+    def begin_with(self, env: Any) -> None:
+        """Begin to record an environment that is about to be reset."""
+
+    def warn_once(self, message: str) -> None:
+        """Warn the user of something once."""
+
+    def disown(self) -> None:
+        """Leave the run to the process that this one was just forked from."""
+
+
+class WatchedEnvironment:
+    """An environment of a script whose resets and steps go through its recorded twin.
+
+    The script keeps its own object, whose `step` and `reset` call the twin; the twin calls what they were.
+    """
+
+    def __init__(self, env: Any, recorded: Recorded[Any]) -> None:
+        self._env = env
+        self._recorded: Any = recorded
+        self.is_inside = False
+        """Whether the twin is being called, so that calls of the environment are its own."""
+        _watched[id(env)] = self
+        object.__setattr__(env, "step", MethodType(_step, env))
+
+    def call(self, name: str, original: Callable[..., Any], arguments: Any, named: Mapping[str, Any]) -> Any:
+        """Call `step` or `reset` of the twin, or the environment's own if the twin is being called."""
+        if self.is_inside:
+            return original(*arguments, **named)
+        self.is_inside = True
+        try:
+            return getattr(self._recorded, name)(*arguments, **named)
+        finally:
+            self.is_inside = False
+
+    def release(self) -> None:
+        """Record nothing more."""
+        _watched.pop(id(self._env), None)
+        with contextlib.suppress(AttributeError):
+            object.__delattr__(self._env, "step")
+
+
+open_runs: list[WaitingRun] = []
+"""The runs of scripts that are not closed, the oldest first."""
+_watched: dict[int, WatchedEnvironment] = {}
+"""By the id of the environment; a copy of it is not one of them."""
+_hooked: weakref.WeakSet[Any] = weakref.WeakSet()
+"""The classes whose `reset` looks for a run that waits."""
+
+
+def _step(env: Any, *arguments: Any, **named: Any) -> Any:
+    """Take a step in an environment that is recorded; in a copy of it, which is not, just take it."""
+    original = MethodType(type(env).step, env)
+    watched = _watched.get(id(env))
+    return (
+        original(*arguments, **named) if watched is None else watched.call("step", original, arguments, named)
+    )
+
+
+_step.__name__ = "step"  # by which a pickled environment finds its own
+
+
+def _reset(env: Any, original: Callable[..., Any], arguments: Any, named: Mapping[str, Any]) -> Any:
+    """Reset an environment; begin to record it if a run waits for one."""
+    watched = _watched.get(id(env))
+    if watched is None and open_runs and not any(each.is_inside for each in _watched.values()):
+        _find_run(env)
+        watched = _watched.get(id(env))
+    if watched is None:
+        return original(env, *arguments, **named)
+    return watched.call("reset", MethodType(original, env), arguments, named)
+
+
+def _find_run(env: Any) -> None:
+    """Give an environment that is about to be reset to the run that waits for one, if any."""
+    waiting = [run for run in open_runs if run.waits_for_environment]
+    library = _library_that_resets() if waiting else None
+    if library is not None:
+        for run in waiting:
+            run.warn_once(
+                f"environments that {library} steps are not recorded by this run, but by "
+                f"{_VECTORS_OF_OTHERS[library]}, into whose recording its values go then."
+            )
+    elif waiting:
+        waiting[0].begin_with(env)
+    elif not isinstance(env, Recorded):
+        for run in open_runs:
+            if run.has_environment:
+                run.warn_once(
+                    f"run {run.run_id} records the environment that was reset first, and not the others: "
+                    f"{env} is not recorded. runner.record(env) records it in a run of its own."
+                )
+
+
+def _library_that_resets() -> str | None:
+    """Return the library of vectors of its own whose code resets the environment, if one does."""
+    if not any(name in sys.modules for name in _VECTORS_OF_OTHERS):
+        return None
+    frame: FrameType | None = sys._getframe(2)
+    while frame is not None:
+        top = str(frame.f_globals.get("__name__")).partition(".")[0]
+        if top in _VECTORS_OF_OTHERS:
+            return top
+        frame = frame.f_back
+    return None
+
+
+def hook_environments() -> None:
+    """Let every class of environments look for a run that waits when one is reset."""
+    if _hooked:
+        return
+    for base in (gymnasium.Env, VectorEnv):
+        classes = [base]
+        while classes:
+            cls = classes.pop()
+            _hook(cls)
+            classes += cls.__subclasses__()
+        _hook_subclasses(base)
+
+
+def _hook_subclasses(base: Any) -> None:
+    def hook_subclass(cls: Any, /, **named: Any) -> None:
+        super(base, cls).__init_subclass__(**named)
+        _hook(cls)
+
+    base.__init_subclass__ = classmethod(hook_subclass)
+
+
+def _hook(cls: Any) -> None:
+    original = vars(cls).get("reset")
+    if cls in _hooked or not callable(original):
+        return
+    _hooked.add(cls)
+
+    @functools.wraps(original)
+    def reset(self: Any, *arguments: Any, **named: Any) -> Any:
+        return _reset(self, original, arguments, named)
+
+    cls.reset = reset
+
+
+def _after_fork() -> None:
+    """In a forked process: the runs belong to the other process."""
+    for run in open_runs:
+        run.disown()
+    open_runs.clear()
+    _watched.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)

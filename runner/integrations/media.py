@@ -1,0 +1,188 @@
+"""Pictures, films, histograms and tables as scripts give them to a logger, as a recording holds them."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import ConfigError
+from runner.loops.options import pillow
+from runner.loops.pictures import Picture
+from runner.loops.values import as_array
+from runner.util.extras import require
+from runner.util.jsonable import as_json
+
+BINS: Final = 64
+_MAX_TABLE: Final = 1 << 20
+
+
+def picture_of(value: Any, layout: str = "HWC", fps: float = 4.0) -> Picture:
+    """Return an array, tensor, Pillow image, Matplotlib figure or image file as a picture or film.
+
+    Floats are taken as 0 to 1, whole numbers as 0 to 255, booleans as black and white. Gray becomes RGB, and
+    the alpha channel of RGBA is dropped.
+
+    Args:
+        value: the picture.
+        layout: what the axes of an array are, in TensorBoard's letters: N or T (frames), C, H, W.
+        fps: frames per second of a film.
+
+    Raises:
+        ConfigError: it is no picture.
+        MissingExtra: Pillow is not installed.
+    """
+    if isinstance(value, str | os.PathLike):
+        try:
+            value = pillow().open(value)
+        except OSError as error:
+            raise ConfigError(f"picture: {os.fspath(value)} cannot be read as one ({error})") from error
+    if callable(save := getattr(value, "savefig", None)):
+        save(drawn := io.BytesIO(), format="png")
+        value = pillow().open(drawn)
+    if callable(convert := getattr(value, "convert", None)):
+        value, layout = np.asarray(convert("RGB")), "HWC"
+    return Picture(_pixels(_numbers(value), layout), fps)
+
+
+def film_of(value: Any, layout: str, fps: float | None) -> Picture:
+    """Return a film: an array or tensor, or the path of a video file.
+
+    Raises:
+        ConfigError: it is no film.
+        MissingExtra: PyAV, which reads video files, is not installed.
+    """
+    if not isinstance(value, str | os.PathLike):
+        return picture_of(value, layout, fps or 4.0)
+    av = require("av", extra="film", purpose="reading a video file")
+    try:
+        with av.open(os.fspath(value)) as file:
+            frames = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+            own_fps = float(file.streams.video[0].average_rate or 30)
+    except (OSError, IndexError, av.FFmpegError) as error:
+        raise ConfigError(f"film: {os.fspath(value)} cannot be read as one ({error})") from error
+    if not frames:
+        raise ConfigError(f"film: {os.fspath(value)} has no frames")
+    return Picture(np.stack(frames), fps or own_fps)
+
+
+def grid_of(value: Any, layout: str) -> NDArray[Any]:
+    """Return several pictures as one, next to each other in rows: [height, width, channels]."""
+    array = _numbers(value)
+    if array.ndim != 4 or sorted(layout) != sorted("NCHW"):
+        raise ConfigError(
+            f"images: found shape {list(array.shape)} as {layout}, expected four axes of N, C, H, W"
+        )
+    images = array.transpose([layout.index(axis) for axis in "NHWC"])
+    return _tiled(images)
+
+
+def histogram_of(values: Any) -> dict[str, NDArray[Any]]:
+    """Return counts [bins] and edges [bins + 1] of numbers; those that are not finite are left out."""
+    array = _numbers(values).astype(np.float64).ravel()
+    finite = array[np.isfinite(array)]
+    counts, edges = np.histogram(finite, bins=BINS)
+    return {"counts": counts, "edges": edges}
+
+
+def _numbers(value: Any) -> NDArray[Any]:
+    try:
+        array = as_array(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ConfigError(f"found {type(value).__name__}, expected an array of numbers ({error})") from error
+    if array.dtype.kind not in "biuf":
+        raise ConfigError(f"found {type(value).__name__} of {array.dtype}, expected an array of numbers")
+    return array
+
+
+def _tiled(images: NDArray[Any]) -> NDArray[Any]:
+    """Return pictures [n, ..., height, width, channels] as a grid [..., rows, columns, channels]."""
+    n = len(images)
+    columns = int(np.ceil(np.sqrt(n)))
+    rows = -(-n // columns)
+    empty = np.zeros((rows * columns - n, *images.shape[1:]), images.dtype)
+    cells = np.concatenate([images, empty]).reshape(rows, columns, *images.shape[1:])
+    return np.concatenate([np.concatenate(list(row), axis=-2) for row in cells], axis=-3)
+
+
+def _pixels(array: NDArray[Any], layout: str) -> NDArray[np.uint8]:
+    """Return an array as [frames, height, width, 3] of uint8."""
+    if layout == "HWC" and array.ndim == 2:
+        layout = "HW"
+    if (
+        len(layout) != array.ndim
+        or len(set(layout)) != len(layout)
+        or not set("HW") <= set(layout) <= set("NTCHW")
+    ):
+        raise ConfigError(f"picture: found shape {list(array.shape)}, expected the axes {layout}")
+    for axis in "TNC":  # T before N: the films of a batch are tiled
+        if axis not in layout:
+            array, layout = array[np.newaxis], axis + layout
+    array = _tiled(array.transpose([layout.index(axis) for axis in "NTHWC"]))
+    if array.shape[-1] not in (1, 3, 4):
+        raise ConfigError(f"picture: found {array.shape[-1]} channels, expected 1, 3 or 4")
+    if array.dtype.kind == "f":
+        array = np.nan_to_num(array, nan=0.0, posinf=1.0, neginf=0.0) * 255
+    elif array.dtype.kind == "b":
+        array = array * np.uint8(255)
+    array = array.clip(0, 255).astype(np.uint8)[..., :3]
+    return np.broadcast_to(array, (*array.shape[:-1], 3))
+
+
+# --- as wandb names them ------------------------------------------------------------------------------
+
+
+class Image:
+    """A picture: an array [height, width] or [height, width, channels], Pillow's, Matplotlib's, or a file."""
+
+    def __init__(self, data_or_path: Any, *_: Any, caption: str | None = None, **__: Any) -> None:
+        layout = "CHW" if hasattr(data_or_path, "detach") and np.ndim(data_or_path) == 3 else "HWC"
+        self.picture, self.caption = picture_of(data_or_path, layout), caption
+
+
+class Video:
+    """A film: an array [frames, channels, height, width], or a batch of them; or a file."""
+
+    def __init__(
+        self,
+        data_or_path: Any,
+        caption: str | None = None,
+        fps: float | None = None,
+        format: str | None = None,  # noqa: A002, ARG002
+    ) -> None:
+        layout = "NTCHW" if np.ndim(data_or_path) == 5 else "TCHW"
+        self.picture, self.caption = film_of(data_or_path, layout, fps), caption
+
+
+class Histogram:
+    """A histogram: of numbers, or counts and edges as `numpy.histogram` returns them."""
+
+    def __init__(self, sequence: Any = None, np_histogram: Any = None, num_bins: int = 64) -> None:  # noqa: ARG002
+        if np_histogram is None:
+            self.arrays = histogram_of(sequence)
+        else:
+            self.arrays = dict(zip(("counts", "edges"), map(np.asarray, np_histogram), strict=True))
+
+
+class Table:
+    """Rows, recorded as a text."""
+
+    def __init__(self, columns: Sequence[Any] | None = None, data: Any = None, **_: Any) -> None:
+        self.columns = list(columns or ())
+        self.data = [list(row) for row in (() if data is None else data)]
+
+    def add_data(self, *row: Any) -> None:
+        """Add a row."""
+        self.data.append(list(row))
+
+    def text(self) -> str:
+        """Return columns and rows as JSON."""
+        text = json.dumps(as_json({"columns": self.columns, "data": self.data}))
+        if len(text) > _MAX_TABLE:
+            raise ConfigError(f"log: found a table of {len(text):,} bytes, expected at most {_MAX_TABLE:,}")
+        return text

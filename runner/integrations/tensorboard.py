@@ -1,0 +1,344 @@
+"""A `SummaryWriter` with TensorBoard's interface, which writes into a recording.
+
+    from runner.integrations.tensorboard import SummaryWriter
+
+The import is the whole change of a script. The environment that it resets first after it made the writer is
+recorded, every step of it, and what is written goes into that recording, with the step that the script gives
+as `global_step`. `runner.integrations.script` has the rules.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import socket
+import sys
+from collections.abc import Callable, Mapping
+from datetime import datetime
+from functools import wraps
+from pathlib import Path
+from typing import Any, Final, Literal, Self
+
+import numpy as np
+
+from runner.errors import ConfigError
+from runner.integrations.hooks import hook_environments, open_runs
+from runner.integrations.media import film_of, grid_of, histogram_of, picture_of
+from runner.integrations.script import ScriptRun
+from runner.loops.recorded import ending_of
+from runner.loops.values import as_array
+from runner.runs.run import Run
+from runner.util.values import RUN_NAME_PATTERN
+
+_NOT_RECORDED: Final = (
+    *("add_audio", "add_custom_scalars", "add_custom_scalars_marginchart"),
+    *("add_custom_scalars_multilinechart", "add_embedding", "add_graph", "add_histogram_raw"),
+    *("add_image_with_boxes", "add_mesh", "add_onnx_graph", "add_pr_curve", "add_pr_curve_raw"),
+)
+_HYPERPARAMETERS: Final = re.compile(r"\|param\|value\|\n\|-\|-\|\n", re.ASCII)
+"""How the tables begin in which CleanRL's scripts write their settings."""
+_WRITERS: Final = ("torch.utils.tensorboard.writer", "tensorboardX.writer")
+"""The modules of the writers from which `forward` takes values."""
+
+
+class SummaryWriter:
+    """Records what is written as TensorBoard's own writer would log it; a context manager.
+
+        writer = SummaryWriter("runs/CartPole-v1__ppo__1")
+        writer.add_scalar("losses/value_loss", loss, global_step)
+
+    Args:
+        log_dir: names the run, without a leading `runs/`; the folder is made, for files of the script's own.
+        comment: is added to the name if there is no log_dir.
+        purge_step: ignored, like max_queue, flush_secs and filename_suffix.
+        max_queue: ignored.
+        flush_secs: ignored.
+        filename_suffix: ignored.
+        recordings: the recordings folder or a server, as for `runner.record`.
+        monitor_gym: whether to record an environment.
+        **more: ignored: what only other writers take.
+    """
+
+    def __init__(
+        self,
+        log_dir: str | os.PathLike[str] | None = None,
+        comment: str = "",
+        purge_step: int | None = None,  # noqa: ARG002
+        max_queue: int = 10,  # noqa: ARG002
+        flush_secs: int = 120,  # noqa: ARG002
+        filename_suffix: str = "",  # noqa: ARG002
+        *,
+        recordings: str | os.PathLike[str] | None = None,
+        monitor_gym: bool = True,
+        **more: Any,  # noqa: ARG002
+    ) -> None:
+        if log_dir is None:
+            self.log_dir = f"runs/{datetime.now():%b%d_%H-%M-%S}_{socket.gethostname()}{comment}"
+        else:
+            self.log_dir = os.fspath(log_dir)
+            Path(self.log_dir).mkdir(parents=True, exist_ok=True)
+        self.logdir = self.log_dir
+        tracked = [run for run in open_runs if isinstance(run, ScriptRun) and run.takes_writers]
+        self._is_own = not tracked
+        if tracked:
+            self._run = tracked[-1]
+            self._run.has_writer = True
+        else:
+            name = None if log_dir is None else run_name(self.log_dir)
+            self._run = ScriptRun(recordings, name, has_environment=monitor_gym)
+
+    @property
+    def run(self) -> Run | None:
+        """The run, as soon as it is recorded: from the first reset of its environment on."""
+        return self._run.run
+
+    def get_logdir(self) -> str:
+        """Return the folder that the script named."""
+        return self.log_dir
+
+    # --- what is written ----------------------------------------------------------------------------------
+
+    def add_scalar(
+        self,
+        tag: str,
+        scalar_value: Any,
+        global_step: Any = None,
+        *_: Any,
+        **__: Any,
+    ) -> None:
+        """Log a number."""
+        self._run.log(tag, as_number(tag, scalar_value), step_of(global_step))
+
+    def add_scalars(
+        self,
+        main_tag: str,
+        tag_scalar_dict: Mapping[str, Any],
+        global_step: Any = None,
+        *_: Any,
+        **__: Any,
+    ) -> None:
+        """Log several numbers, as `main_tag/name`."""
+        for name, value in tag_scalar_dict.items():
+            self.add_scalar(f"{main_tag}/{name}", value, global_step)
+
+    def add_text(
+        self,
+        tag: str,
+        text_string: str,
+        global_step: Any = None,
+        *_: Any,
+        **__: Any,
+    ) -> None:
+        """Log a text; a table of hyperparameters, as CleanRL writes it, also becomes the settings."""
+        if self._run.is_waiting and (found := _HYPERPARAMETERS.search(str(text_string))):
+            self._run.settings = _settings(text_string[found.end() :]) | self._run.settings
+        self._run.log(tag, str(text_string), step_of(global_step))
+
+    def add_histogram(
+        self,
+        tag: str,
+        values: Any,
+        global_step: Any = None,
+        *_: Any,
+        **__: Any,
+    ) -> None:
+        """Record a histogram of 64 bins: the arrays `tag/counts` and `tag/edges`."""
+        self._run.snapshot(tag, histogram_of(values), step_of(global_step))
+
+    def add_tensor(
+        self,
+        tag: str,
+        tensor: Any,
+        global_step: Any = None,
+        *_: Any,
+        **__: Any,
+    ) -> None:
+        """Record an array."""
+        self._run.snapshot(tag, tensor, step_of(global_step))
+
+    def add_image(
+        self,
+        tag: str,
+        img_tensor: Any,
+        global_step: Any = None,
+        dataformats: str = "CHW",
+        **_: Any,
+    ) -> None:
+        """Record a picture."""
+        self._run.picture(tag, picture_of(img_tensor, dataformats.upper()), step_of(global_step))
+
+    def add_images(
+        self,
+        tag: str,
+        img_tensor: Any,
+        global_step: Any = None,
+        dataformats: str = "NCHW",
+        **_: Any,
+    ) -> None:
+        """Record several pictures as one."""
+        self._run.picture(tag, picture_of(grid_of(img_tensor, dataformats.upper())), step_of(global_step))
+
+    def add_figure(
+        self,
+        tag: str,
+        figure: Any,
+        global_step: Any = None,
+        close: bool = True,
+        **_: Any,
+    ) -> None:
+        """Record a figure of Matplotlib, or a list of them, as pictures."""
+        for each in figure if isinstance(figure, list) else [figure]:
+            self._run.picture(tag, picture_of(each), step_of(global_step))
+            if close and (pyplot := sys.modules.get("matplotlib.pyplot")):
+                pyplot.close(each)
+
+    def add_video(
+        self,
+        tag: str,
+        vid_tensor: Any,
+        global_step: Any = None,
+        fps: float = 4,
+        dataformats: str = "NTCHW",
+        **_: Any,
+    ) -> None:
+        """Record a film."""
+        self._run.picture(tag, film_of(vid_tensor, dataformats.upper(), fps), step_of(global_step))
+
+    def add_hparams(
+        self,
+        hparam_dict: Mapping[str, Any],
+        metric_dict: Mapping[str, Any],
+        hparam_domain_discrete: Any = None,  # noqa: ARG002
+        run_name: str | None = None,  # noqa: ARG002
+        global_step: Any = None,
+    ) -> None:
+        """Take settings, and log metrics; settings that come after the recording began are logged too."""
+        if self._run.is_waiting:
+            self._run.settings |= dict(hparam_dict)
+        else:
+            self._run.log("hparams", str(dict(hparam_dict)), step_of(global_step))
+        for name, value in metric_dict.items():
+            self.add_scalar(name, value, global_step)
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        if name not in _NOT_RECORDED:
+            supported = ", ".join(method for method in vars(SummaryWriter) if method.startswith("add_"))
+            raise AttributeError(f"SummaryWriter has no {name!r}, but {supported}")
+
+        def not_recorded(*_: Any, **__: Any) -> None:
+            self._run.warn_once(f"SummaryWriter.{name} does nothing: a recording has no place for it.")
+
+        return not_recorded
+
+    # --- the end ------------------------------------------------------------------------------------------
+
+    def flush(self) -> None:
+        """Do nothing: what is written is in the file within a second."""
+
+    def close(self) -> None:
+        """End the run as finished, unless something else does."""
+        if self._is_own:
+            self._run.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: Any) -> Literal[False]:
+        if self._is_own:
+            self._run.close(*ending_of(raised[1]))
+        return False
+
+
+def run_name(log_dir: str) -> str | None:
+    """Return the name of a run that is logged into a folder, such as `CartPole-v1__ppo__1__1700000000`."""
+    parts = Path(log_dir).parts
+    inside = parts[parts.index("runs") + 1 :] if "runs" in parts[:-1] else parts[-1:]
+    name = re.sub(r"[^A-Za-z0-9_.+/-]", "-", "/".join(inside))[:100].lstrip(".-+/")
+    return name if re.fullmatch(RUN_NAME_PATTERN, name) else None
+
+
+def step_of(step: Any) -> int | None:
+    """Return a script's own step as a whole number; None if it gave none.
+
+    Raises:
+        ConfigError: it is no number, or negative.
+    """
+    if step is None or (step.__class__ is int and step >= 0):
+        return step
+    try:
+        whole = int(step)
+        if 0 <= whole < 2**62:
+            return whole
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ConfigError(f"global_step: found {step!r}, expected a whole number from 0") from error
+    raise ConfigError(f"global_step: found {step!r}, expected a whole number from 0")
+
+
+def as_number(name: str, value: Any) -> Any:
+    """Return a number, also one that stands in an array or tensor of one; text is refused.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    if value.__class__ is float:
+        return value
+    try:
+        return float(np.asarray(as_array(value)).astype(np.float64, casting="same_kind").item())
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ConfigError(
+            f"add_scalar: found {type(value).__name__} for {name!r}, expected a number"
+        ) from error
+
+
+def _settings(table: str) -> dict[str, Any]:
+    """Return the rows `|name|value|` of a Markdown table; values as Python writes them, else as text."""
+    settings: dict[str, Any] = {}
+    for line in table.splitlines():
+        if found := re.fullmatch(r"\|([^|]+)\|(.*)\|", line.strip()):
+            name, text = found.groups()
+            try:
+                settings[name] = ast.literal_eval(text)
+            except (ValueError, SyntaxError, MemoryError, RecursionError):
+                settings[name] = text
+    return settings
+
+
+# --- other writers ------------------------------------------------------------------------------------------
+
+
+_forwarded: SummaryWriter | None = None
+"""Takes what the script writes with another library's writer."""
+
+
+def forward() -> bool:
+    """Also log what the script writes with the writers of PyTorch and tensorboardX into the run that is open.
+
+    Returns whether such a writer is loaded.
+    """
+    global _forwarded
+    _forwarded, found = SummaryWriter(), False
+    for module in _WRITERS:
+        writer = getattr(sys.modules.get(module), "SummaryWriter", None)
+        if writer is None:
+            continue
+        found = True
+        for name in [name for name in vars(SummaryWriter) if name.startswith("add_")]:
+            method = getattr(writer, name, None)
+            if method is not None and not hasattr(method, "forwards"):
+                setattr(writer, name, _forwarding(name, method))
+    return found
+
+
+def _forwarding(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
+    @wraps(method)
+    def both(self: Any, *arguments: Any, **named: Any) -> Any:
+        if _forwarded is not None and not _forwarded._run.closed:
+            getattr(_forwarded, name)(*arguments, **named)
+        return method(self, *arguments, **named)
+
+    both.forwards = True  # type: ignore[attr-defined]
+    return both
+
+
+hook_environments()

@@ -1,0 +1,431 @@
+"""A module with the shape of `wandb`, which writes into a recording.
+
+    from runner.integrations import wandb
+
+    wandb.init(project="cartpole", config={"learning_rate": 2.5e-4, "seed": 1})
+    wandb.log({"loss": loss})
+    wandb.finish()
+
+The import is the whole change of a script. The environment that it resets first after `init` is recorded,
+every step of it, and what is logged goes into that recording. `runner.integrations.script` has the rules.
+Nothing is sent to Weights & Biases, and its package is not needed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
+from pathlib import Path
+from typing import Any, Final, Literal, Self
+
+import numpy as np
+
+from runner.errors import ConfigError, RunnerError
+from runner.integrations.hooks import hook_environments
+from runner.integrations.media import Histogram, Image, Table, Video
+from runner.integrations.script import ScriptRun
+from runner.integrations.tensorboard import as_number, forward, step_of
+from runner.loops.recorded import ending_of
+from runner.loops.values import warn_user
+from runner.util.jsonable import as_json, as_mapping
+from runner.util.values import RUN_NAME_PATTERN, flatten
+
+_SUPPORTED: Final = (
+    *("Histogram", "Image", "Settings", "Table", "Video", "config", "define_metric", "finish", "init", "log"),
+    *("login", "run", "save", "setup", "summary", "unwatch", "watch"),
+)
+_NO_EFFECT: Final = ("define_metric", "login", "log_code", "save", "setup", "unwatch", "watch")
+_IGNORED: Final = frozenset(
+    {
+        *("allow_val_change", "anonymous", "config_exclude_keys", "config_include_keys", "dir", "entity"),
+        *("force", "fork_from", "id", "magic", "resume", "resume_from", "save_code", "settings"),
+    }
+)
+"""Arguments of `init` that change nothing in a recording."""
+
+
+class Settings:
+    """Settings of wandb itself, which change nothing here."""
+
+    def __init__(self, *_: Any, **__: Any) -> None: ...
+
+
+# --- a run --------------------------------------------------------------------------------------------------
+
+
+class Config(MutableMapping[str, Any]):
+    """The settings of a run: `config["lr"]`, `config.lr`, `config.update({...})`."""
+
+    _run: Tracked
+
+    def __init__(self, tracked: Tracked) -> None:
+        object.__setattr__(self, "_run", tracked)
+
+    def update(self, *settings: Any, **more: Any) -> None:
+        """Take the settings of a mapping, dataclass or namespace."""
+        more.pop("allow_val_change", None)
+        for each in settings:
+            self._run.configure(_mapping(each))
+        self._run.configure(more)
+
+    def setdefaults(self, settings: Any) -> None:
+        """Take the settings that are not there yet."""
+        self._run.configure({key: value for key, value in _mapping(settings).items() if key not in self})
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the settings."""
+        return dict(self._run.script.settings)
+
+    def __getitem__(self, key: str) -> Any:
+        return self._run.script.settings[key]
+
+    def __setitem__(self, key: str, value: Any) -> None:
+        self._run.configure({key: value})
+
+    def __delitem__(self, key: str) -> None:
+        raise RunnerError(f"config: {key!r} cannot be removed")
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._run.script.settings)
+
+    def __len__(self) -> int:
+        return len(self._run.script.settings)
+
+    def __getattr__(self, key: str) -> Any:
+        try:
+            return self._run.script.settings[key]
+        except KeyError:
+            raise AttributeError(f"config has no {key!r}, but {', '.join(self) or 'nothing'}") from None
+
+    __setattr__ = __setitem__
+
+
+class Summary(dict[str, Any]):
+    """The last value logged under each name, and what the script puts there, which is logged at the end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.own: dict[str, Any] = {}
+
+    def __setitem__(self, key: str, value: Any) -> None:
+        super().__setitem__(key, value)
+        self.own[key] = value
+
+    def update(self, values: Any = (), **more: Any) -> None:  # type: ignore[override]
+        """Put several values there."""
+        for key, value in {**dict(values), **more}.items():
+            self[key] = value
+
+    def seen(self, key: str, value: Any) -> None:
+        """Note a value that was logged."""
+        super().__setitem__(key, value)
+
+
+class Tracked:
+    """A run, as `wandb.init` returns it; a context manager."""
+
+    url = sweep_id = entity = None
+    resumed = offline = False
+
+    def __init__(
+        self,
+        script: ScriptRun,
+        project: str,
+        group: str,
+        job_type: str,
+        tags: Sequence[str],
+        is_disabled: bool,
+    ) -> None:
+        self.script = script
+        self.project, self.group, self.job_type, self.tags = project, group, job_type, tuple(tags)
+        self.disabled = is_disabled
+        self.config, self.summary = Config(self), Summary()
+        self.expects_writer = False
+        """Whether the script's `SummaryWriter` is to write into the run."""
+        self.step = 0
+        """The number of calls of `log` that were committed."""
+
+    @property
+    def id(self) -> str:
+        """The id of the run."""
+        return self.script.run_id
+
+    @property
+    def name(self) -> str:
+        """The name of the run; may be set until the recording begins."""
+        return self.script.name or self.id
+
+    @name.setter
+    def name(self, name: str) -> None:
+        if not self.script.is_waiting:
+            raise RunnerError(f"name: run {self.id} is being recorded; rename it by `dualtaxi label`")
+        self.script.name = _name(name)
+
+    @property
+    def dir(self) -> str:
+        """A folder for files of the script; they do not become part of the recording."""
+        folder = Path("wandb") / f"run-{self.id}" / "files"
+        folder.mkdir(parents=True, exist_ok=True)
+        return str(folder.absolute())
+
+    def log(self, data: Mapping[str, Any], step: Any = None, commit: bool | None = None, **_: Any) -> None:
+        """Log numbers, texts, pictures, films, histograms and arrays by name; nested names are joined by `/`.
+
+        Args:
+            data: the values by name.
+            step: the script's own step; without it calls are counted, where no environment is recorded.
+            commit: False if the next call logs values of the same step.
+
+        Raises:
+            ConfigError: the data are no mapping.
+        """
+        if not isinstance(data, Mapping):
+            raise ConfigError(f"log: found {type(data).__name__}, expected a mapping of names to values")
+        if self.disabled:
+            return
+        at = step_of(step)
+        if at is None and not self.script.has_steps:
+            at = self.step
+        for name, value in data.items():
+            self._log(str(name), value, at)
+        if at is not None:
+            self.step = max(self.step, at)
+        if commit or (commit is None and step is None):
+            self.step += 1
+
+    def _log(self, name: str, value: Any, step: int | None) -> None:
+        if isinstance(value, Mapping):
+            for key, inner in value.items():
+                self._log(f"{name}/{key}", inner, step)
+            return
+        if (
+            isinstance(value, list | tuple)
+            and value
+            and all(isinstance(each, Image | Video) for each in value)
+        ):
+            for number, each in enumerate(value):
+                self._log(f"{name}/{number}", each, step)
+            return
+        if isinstance(value, Image | Video):
+            self.script.picture(name, value.picture, step)
+            if value.caption:
+                self.script.log(f"{name}/caption", str(value.caption), step)
+        elif isinstance(value, Histogram):
+            self.script.snapshot(name, value.arrays, step)
+        elif isinstance(value, Table):
+            self.script.log(name, value.text(), step)
+        elif isinstance(value, str):
+            self.script.log(name, value, step)
+            self.summary.seen(name, value)
+        elif value is None:
+            self.script.warn_once(f"log: None is not recorded, first found for {name!r}.")
+        elif np.ndim(value) and np.size(value) != 1:
+            self.script.snapshot(name, value, step)
+        else:
+            self._log_number(name, value, step)
+
+    def _log_number(self, name: str, value: Any, step: int | None) -> None:
+        try:
+            number = as_number(name, value)
+        except ConfigError:
+            text = str(as_json(value))
+            self.script.warn_once(
+                f"log: found {type(value).__name__} for {name!r}, which is recorded as text. This warning is "
+                "given once."
+            )
+            self.script.log(name, text, step)
+            return
+        self.script.log(name, number, step)
+        self.summary.seen(name, number)
+
+    def configure(self, settings: Mapping[str, Any]) -> None:
+        """Take settings; those that come after the recording began are logged as text."""
+        settings = {str(key): value for key, value in settings.items()}
+        as_text = [
+            key
+            for key, value in flatten(settings).items()
+            if not isinstance(value, str | float | os.PathLike) and isinstance(as_json(value), str)
+        ]
+        if as_text:
+            self.script.warn_once(f"config: {', '.join(as_text)} are recorded as text.")
+        self.script.settings |= settings
+        if not self.script.is_waiting and settings and not self.disabled:
+            self.script.warn_once(
+                "config: found settings after the recording began, which are logged as a text, `config`: set "
+                "them before the environment is reset."
+            )
+            self.script.log("config", json.dumps(as_json(settings)))
+
+    def finish(self, exit_code: int | None = None, quiet: bool | None = None) -> None:  # noqa: ARG002
+        """End the run: as failed if the exit code is not 0."""
+        self._end("failed" if exit_code else "finished", f"exit code {exit_code}" if exit_code else "")
+
+    def _end(self, status: str, error: str) -> None:
+        global run  # noqa: PLW0603 - wandb.run is part of the shape
+        if self.expects_writer and not self.script.has_writer:
+            self.script.warn_once(
+                "sync_tensorboard: found no SummaryWriter of PyTorch or tensorboardX when init was called, "
+                "expected it to be imported before."
+            )
+        if not (self.script.closed or self.disabled):
+            for name, value in self.summary.own.items():
+                self._log(f"summary/{name}", value, None)
+        self.script.close(status, error)
+        if run is self:
+            run = None
+
+    def __getattr__(self, name: str) -> Any:
+        if name in _NO_EFFECT:
+            return globals()[name]
+        raise AttributeError(
+            f"a run of runner.integrations.wandb has no {name!r}, but config, dir, finish, group, id, "
+            "job_type, log, name, project, step, summary, tags, url"
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: Any) -> Literal[False]:
+        self._end(*ending_of(raised[1]))
+        return False
+
+
+run: Tracked | None = None
+"""The run that is open."""
+
+
+def init(
+    project: str | None = None,
+    config: Any = None,
+    name: str | None = None,
+    group: str | None = None,
+    tags: Sequence[str] | None = None,
+    notes: str | None = None,
+    job_type: str | None = None,
+    mode: str | None = None,
+    reinit: bool | str | None = None,
+    sync_tensorboard: bool | None = None,
+    tensorboard: bool | None = None,
+    monitor_gym: bool | None = None,
+    recordings: str | os.PathLike[str] | None = None,
+    **ignored: Any,
+) -> Tracked:
+    """Begin a run.
+
+    Args:
+        project: the name of the run unless `name` is given, and its tag `project=...`.
+        config: the settings: a mapping, dataclass or namespace; its `seed` is the seed of the run.
+        name: the name of the run.
+        group: its tag `group=...`.
+        tags: its tags.
+        notes: its note.
+        job_type: its tag `job_type=...`.
+        mode: `disabled` records nothing; also if $WANDB_MODE is that.
+        reinit: whether to finish a run that is still open; without it that one is returned.
+        sync_tensorboard: also record what is written with the `SummaryWriter` of PyTorch or tensorboardX.
+        tensorboard: the same.
+        monitor_gym: False records values only, and not the environment.
+        recordings: the recordings folder, or the address of a server, as for `runner.record`.
+        **ignored: other arguments of wandb's, without effect.
+
+    Raises:
+        ConfigError: an argument is unknown or cannot be used.
+    """
+    global run  # noqa: PLW0603 - wandb.run is part of the shape
+    if unknown := sorted(set(ignored) - _IGNORED):
+        raise ConfigError(f"init: found the argument {unknown[0]!r}, which wandb.init does not have")
+    if run is not None and not run.script.closed:
+        if not reinit or reinit == "return_previous":
+            warn_user(
+                f"init: run {run.id} is still open, and is returned: call finish(), or use reinit=True."
+            )
+            run.config.update(config or {})
+            return run
+        run.finish()
+    labels = {"project": project, "group": group, "job_type": job_type}
+    own_tags = tuple(f"{key}={_tag(value)}" for key, value in labels.items() if value)
+    is_disabled = (mode or os.environ.get("WANDB_MODE")) == "disabled"
+    script = ScriptRun(
+        recordings,
+        _name(name or project),
+        tags=(*(tags or ()), *own_tags),
+        note=notes or "",
+        has_environment=monitor_gym is not False,
+        takes_writers=True,
+    )
+    if is_disabled:
+        script.discard()
+    run = Tracked(script, project or "", group or "", job_type or "", tags or (), is_disabled)
+    run.configure(_mapping(config))
+    if (sync_tensorboard or tensorboard) and not is_disabled:
+        script.has_writer, run.expects_writer = forward(), True
+    return run
+
+
+def log(data: Mapping[str, Any], step: Any = None, commit: bool | None = None, **more: Any) -> None:
+    """Log values into the open run."""
+    _open_run("log").log(data, step, commit, **more)
+
+
+def finish(exit_code: int | None = None, quiet: bool | None = None) -> None:
+    """End the open run, if there is one."""
+    if run is not None:
+        run.finish(exit_code, quiet)
+
+
+def _open_run(what: str) -> Tracked:
+    if run is None:
+        raise RunnerError(f"wandb.{what}: no run is open: call wandb.init() first")
+    return run
+
+
+def _mapping(settings: Any) -> Mapping[Any, Any]:
+    if settings is None:
+        return {}
+    mapping = as_mapping(settings)
+    if mapping is None:
+        raise ConfigError(
+            f"config: found {type(settings).__name__}, expected a mapping, dataclass or namespace"
+        )
+    return mapping
+
+
+def _name(name: str | None) -> str | None:
+    """Return a name as a run can have it."""
+    text = re.sub(r"[^A-Za-z0-9_.+/-]", "-", name or "")[:100].lstrip(".-+/")
+    return text if re.fullmatch(RUN_NAME_PATTERN, text) else None
+
+
+def _tag(text: str) -> str:
+    return re.sub(r"[^\w.=+/@-]", "-", text)
+
+
+_warned: set[str] = set()
+
+
+def _without_effect(name: str) -> Callable[..., None]:
+    def do_nothing(*_: Any, **__: Any) -> None:
+        if name not in _warned:
+            _warned.add(name)
+            warn_user(f"wandb.{name} does nothing: a recording needs no such call, or has no place for it.")
+
+    return do_nothing
+
+
+define_metric, log_code, login, save, setup, unwatch, watch = map(
+    _without_effect, ("define_metric", "log_code", "login", "save", "setup", "unwatch", "watch")
+)
+
+
+def __getattr__(name: str) -> Any:
+    if name in ("config", "summary"):
+        return getattr(_open_run(name), name)
+    raise AttributeError(
+        f"runner.integrations.wandb has no {name!r}, but {', '.join(_SUPPORTED)}; "
+        "for what else it has, import wandb itself"
+    )
+
+
+hook_environments()
