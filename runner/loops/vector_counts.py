@@ -13,18 +13,20 @@ Flags = NDArray[np.bool_]
 
 
 class EpisodeCounts(NamedTuple):
-    """Numbers, lengths and returns of episodes along the rows of a block; [rows, N] or [rows + 1, N]."""
+    """Numbers, lengths and returns of episodes along the rows of a block, [rows, N] if not stated."""
 
     over: Flags
     only_reset: Flags
     """Where no step was taken: the environment ignored its action and was reset."""
     ended_before: NDArray[np.int64]
-    """Episodes that ended in the block before each row, and before its end."""
+    """[rows + 1, N]: episodes that ended in the block before each row, and before its end."""
     t: NDArray[np.int64]
     length: NDArray[np.int64]
     """Steps of the episode up to and including each row."""
     returns: NDArray[np.float64]
-    """Sums of the episode's rewards up to and including each row."""
+    """The returns of the episodes that ended, in the order of `np.nonzero(over)`."""
+    carried: NDArray[np.float64]
+    """[N]: the sums of the rewards of the episodes in progress after the block."""
 
 
 def counts_of(
@@ -51,14 +53,13 @@ def counts_of(
     began = np.where(np.vstack([np.zeros(n, np.bool_), over]), taken, -length)
     np.maximum.accumulate(began, axis=0, out=began)
     t = np.where(only_reset, schema.RESET_ONLY, taken[:-1] - began[:-1])
-    # Rewards are added one after the other: other orders round otherwise.
-    sums = np.where(only_reset, 0.0, rewards)
-    carried = np.where(only_reset[0], 0.0, carried)
-    begin = 0
-    for end in [*np.flatnonzero(over[:-1].any(axis=1)).tolist(), rows - 1]:
-        part = sums[begin : end + 1]
-        part[0] += carried
-        np.add.accumulate(part, axis=0, out=part)
-        carried = np.where(over[end], 0.0, part[-1])
-        begin = end + 1
-    return EpisodeCounts(over, only_reset, ended_before, t, taken[1:] - began[:-1], sums)
+    # An episode's rewards are added one after the other, as `bincount` does: other orders round otherwise.
+    first = np.append(0, np.cumsum(ended_before[-1] + 1)[:-1])
+    segment = first + ended_before
+    sums = np.bincount(
+        np.append(first, segment[:-1]),
+        np.append(carried, np.where(only_reset, 0.0, rewards)),
+        minlength=int(segment[-1, -1]) + 1,
+    )
+    returns, left = sums[segment[:-1][over]], sums[segment[-1]]
+    return EpisodeCounts(over, only_reset, ended_before, t, taken[1:] - began[:-1], returns, left)

@@ -30,10 +30,10 @@ _MAX_STEPS: Final = 2048
 
 
 class _Reset(NamedTuple):
-    """A reset of environments whose episodes had ended, by the user or within a step (`SAME_STEP`)."""
+    """Resets of environments whose episodes had ended, by the user or within a step (`SAME_STEP`)."""
 
-    row: int
-    """The row of the block that comes after it."""
+    row: NDArray[np.intp]
+    """The row of the block that comes after each."""
     which: NDArray[np.intp]
     observation: NDArray[Any]
     seeds: Sequence[int | None]
@@ -88,7 +88,7 @@ class VectorRows:
         self._state = np.full(n, -self._state_start)
         """The states before the first row, where both spaces are discrete."""
         self._block_resets: list[_Reset] = []
-        self._finals: list[tuple[int, NDArray[np.intp], NDArray[Any]]] = []
+        self._finals: list[tuple[Any, NDArray[np.intp], NDArray[Any]]] = []
         """Rows whose observations are of the next episodes; environments, and the last ones of the ended."""
         self._autoreset_states: dict[int, States] = {}
         """Rows with resets in place of steps, and what those depended on."""
@@ -146,8 +146,7 @@ class VectorRows:
             return self._over
         over: Flags = self._terminated[self._filled - 1] | self._truncated[self._filled - 1]
         for reset in self._block_resets:
-            if reset.row == self._filled:
-                over[reset.which] = False
+            over[reset.which[reset.row == self._filled]] = False
         return over
 
     @over.setter
@@ -198,7 +197,7 @@ class VectorRows:
             self._finals.append((row, which, last[which]))
             after = self._observations[row, which]
             none = [None] * len(which)
-            self._block_resets.append(_Reset(row + 1, which, after, none, none))
+            self._block_resets.append(_Reset(np.full(len(which), row + 1), which, after, none, none))
         if states:
             self._autoreset_states[row] = states
         self._filled = row + 1
@@ -221,7 +220,8 @@ class VectorRows:
         filler(self._observation_leaves, now[np.newaxis], (self._n,))(0, observation)
         over = self.over
         if self._filled and over[chosen].all():
-            self._block_resets.append(_Reset(self._filled, chosen, now[chosen], own_seeds, own_states))
+            after = np.full(len(chosen), self._filled)
+            self._block_resets.append(_Reset(after, chosen, now[chosen], own_seeds, own_states))
             return
         self.commit()
         self._abandon(chosen)
@@ -257,7 +257,7 @@ class VectorRows:
         self._put_ends(
             first + row * n + which,
             counts.length[row, which],
-            counts.returns[row, which],
+            counts.returns,
             self._terminated[row, which],
             self._truncated[row, which],
         )
@@ -265,7 +265,7 @@ class VectorRows:
         ended = counts.over[-1]
         self._episode += counts.ended_before[-1]
         self._length = np.where(ended, 0, counts.length[-1])
-        self._return = np.where(ended, 0.0, counts.returns[-1])
+        self._return = counts.carried
         self._over = over_after
         self._filled = self._counted = self._ended_here = 0
         self._block_resets, self._finals, self._autoreset_states = [], [], {}
@@ -277,7 +277,8 @@ class VectorRows:
         if self._next_step:
             only_reset[0], only_reset[1:] = self._over, over[:-1]
             for reset in self._block_resets:
-                only_reset[reset.row : reset.row + 1, reset.which] = False
+                inside = reset.row < rows
+                only_reset[reset.row[inside], reset.which[inside]] = False
         return counts_of(over, only_reset, self._rewards[:rows], self._length, self._return)
 
     def _put_records(self, counts: EpisodeCounts, first: int) -> None:
@@ -324,10 +325,8 @@ class VectorRows:
         own = zip(only_rows.tolist(), only.tolist(), strict=True)
         own_states = [self._autoreset_states.get(row, {}).get(i) for row, i in own]
         observed = self._observations[only_rows, only]
-        resets = [*self._block_resets, _Reset(0, only, observed, [None] * len(only), own_states)]
-        rows = np.concatenate(
-            [*(np.full(len(reset.which), reset.row) for reset in self._block_resets), only_rows]
-        )
+        resets = [*self._block_resets, _Reset(only_rows, only, observed, [None] * len(only), own_states)]
+        rows = np.concatenate([reset.row for reset in resets])
         if not len(rows):
             return
         order = np.argsort(rows, kind="stable")
