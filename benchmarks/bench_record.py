@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import statistics
 import sys
 import tempfile
@@ -67,6 +68,7 @@ def measure(quick: bool) -> list[Figure]:
         for name, kind, count in (("Blackjack-v1", "short", steps // 20), ("Taxi-v4", "long", steps // 2)):
             figures += _against_minari(name, kind, Path(folder), count, repetitions)
         figures += [_vector(count, Path(folder), steps // 5, repetitions) for count in (1, 4, 16)]
+        figures += [_batches(count, Path(folder), steps * 40, repetitions) for count in (16, 1024)]
         figures += _extras(Path(folder), steps, repetitions)
         figures += _short(Path(folder), 100 if quick else 1_000, repetitions)
         figures += _logging(Path(folder), steps, repetitions)
@@ -214,6 +216,36 @@ def _drive_vector(envs: Any, steps: int) -> None:
     envs.reset(seed=0)
     for _ in range(steps):
         envs.step(actions)
+
+
+def _batches(count: int, folder: Path, steps: int, repetitions: int) -> Figure:
+    """Return how many steps of this many environments are recorded a second, from batches of 128 steps."""
+    draws = np.random.default_rng(0)
+    moves = draws.normal(scale=0.01, size=(129, count, 4)).astype(np.float32)
+    observations, actions = moves.cumsum(axis=0), draws.integers(0, 2, (128, count))
+    rewards, ends = np.ones((128, count), np.float32), draws.random((128, count)) < 1 / 200
+    batches = max(1, steps // rewards.size)
+    rates, spent, size = [], [], 0.0
+    for _ in range(repetitions):
+        begin, began = time.process_time(), time.perf_counter()
+        with runner.record_batches(
+            "CartPole", folder / "recordings", action_space=spaces.Discrete(2), autoreset_mode="NextStep"
+        ) as rec:
+            rec.reset(observations[0])
+            for _ in range(batches):
+                rec.batch(observations[1:], actions, rewards, ends)
+        rates.append(batches * rewards.size / (time.perf_counter() - began) / 1e6)
+        spent.append((time.process_time() - begin) / (batches * rewards.size) * 1e9)
+        size = rec.run.summary["bytes"] / (batches * rewards.size)
+        shutil.rmtree(rec.run.folder)
+    return figure(
+        f"batches of {count:,} environments",
+        rates,
+        "M steps/s",
+        (3, 10),
+        detail=f"CartPole's observations, to the end of the file; {statistics.median(spent):.0f} ns of "
+        f"processor time a step, all threads; {size:.0f} bytes a step",
+    )
 
 
 class Observed(gymnasium.Env[Any, Any]):

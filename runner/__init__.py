@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from runner.execution.rerecord import evaluate, rerecord
     from runner.execution.resume import resume
     from runner.execution.verify import verify
+    from runner.loops.batches import record_batches
     from runner.loops.branch import branch
     from runner.loops.env import record
     from runner.loops.parallel import record_parallel
@@ -51,6 +52,7 @@ __all__ = [
     "list_runs",
     "open_recording",
     "record",
+    "record_batches",
     "record_parallel",
     "record_vector",
     "rerecord",
@@ -72,6 +74,7 @@ _HOME = {
     "list_runs": "runner.runs.listing",
     "open_recording": "runner.recording.reader",
     "record": "runner.loops.env",
+    "record_batches": "runner.loops.batches",
     "record_parallel": "runner.loops.parallel",
     "record_vector": "runner.loops.vector",
     "rerecord": "runner.execution.rerecord",

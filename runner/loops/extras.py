@@ -143,6 +143,50 @@ class Extras:
         if n - 1 in self._partial:
             self._partial[n - 1].update(values)
 
+    def checked_batch(self, values: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, NDArray[Any]]:
+        """Return the values of T steps of N environments, by name, as `put_batch` takes them.
+
+        Args:
+            values: [T, N, ...] each.
+            shape: T and N.
+
+        Raises:
+            ConfigError: a name or a value cannot be recorded.
+        """
+        if not isinstance(values, Mapping):
+            raise ConfigError(f"extras: found {type(values).__name__}, expected arrays by name")
+        arrays = {name: _numbers(name, value) for name, value in values.items()}
+        for name, array in arrays.items():
+            if array.shape[:2] != shape:
+                raise ConfigError(
+                    f"extras: found shape {array.shape} for {name!r}, expected {(*shape, '...')}"
+                )
+        self._grow(len(self._steps), {name: array[0] for name, array in arrays.items()})
+        fast = self._fast
+        return {
+            name: _fitting(name, array, fast[name][0], shape[:1] + fast[name][1])
+            for name, array in arrays.items()
+        }
+
+    def put_batch(self, phase: str, rows: PhaseRows, values: Mapping[str, NDArray[Any]]) -> None:
+        """Hand the values of the T steps of all environments that were just taken to the recorder.
+
+        Args:
+            phase: `train` or `eval`.
+            rows: its steps.
+            values: as `checked_batch` returned them.
+        """
+        self._write(len(self._steps))
+        self._phase = phase
+        count = len(next(iter(values.values()))) * self._n
+        first = self._taken[phase] + rows.filled - count
+        columns = {
+            name: values[name].reshape(count, *own.shape) if name in values else np.zeros(count, own)
+            for name, own in self._dtypes.items()
+        }
+        given = {name: np.full(count, name in values) for name in self._dtypes}
+        self._send(np.arange(first, first + count), columns, given)
+
     def _cut(self, rows: int) -> None:
         """Remove what was put down of a row after these."""
         for column in self._columns.values():
@@ -211,22 +255,34 @@ class Extras:
         """Hand the first n rows to the recorder."""
         if n <= 0:
             return
+        columns = {
+            name: np.frombuffer(b"".join(column[:n]), self._dtypes[name])
+            for name, column in self._columns.items()
+        }
+        steps = np.add.outer(np.array(self._steps[:n]), np.arange(self._n)).ravel()
+        self._send(steps, columns, self._given(n))
+        del self._steps[:n]
+        for column in self._columns.values():
+            del column[:n]
+        self._partial = {row - n: names for row, names in self._partial.items() if row >= n}
+
+    def _send(
+        self,
+        steps: NDArray[np.int64],
+        columns: Mapping[str, NDArray[Any]],
+        given: Mapping[str, NDArray[np.bool_]],
+    ) -> None:
+        """Hand the values with these steps, and whether each was given, to the recorder."""
         topic, recorder = _TOPICS[self._phase], self._recorder
         # The steps of the other phase came before all of these.
         first = sum(recorder.steps.values()) - recorder.steps[self._phase] + 1
         if not self._is_described:
             layout = ExtraLayout(0, np.dtype(list(self._dtypes.items())))
             payload = encode(schema.EXTRA_COLUMNS, {"json": layout.json})
-            recorder.append(schema.EXTRA_COLUMNS_TOPIC, payload, first + self._steps[0])
+            recorder.append(schema.EXTRA_COLUMNS_TOPIC, payload, first + int(steps[0]))
             recorder.flush_messages()
             recorder.resize(dict.fromkeys(_TOPICS.values(), layout.sizes))
             self._is_described = True
-        given = self._given(n)
-        columns = {
-            name: np.frombuffer(b"".join(column[:n]), self._dtypes[name])
-            for name, column in self._columns.items()
-        }
-        steps = np.add.outer(np.array(self._steps[:n]), np.arange(self._n)).ravel()
         done = 0
         while done < len(steps):
             block = recorder.block(topic)[: len(steps) - done]
@@ -238,10 +294,6 @@ class Extras:
             recorder.take(topic, (steps[part] + first).astype(np.uint64))
             done += len(block)
         self._final[self._phase] = int(steps[-1])
-        del self._steps[:n]
-        for column in self._columns.values():
-            del column[:n]
-        self._partial = {row - n: names for row, names in self._partial.items() if row >= n}
 
     def _given(self, n: int) -> dict[str, NDArray[np.bool_]]:
         """Return whether each environment's step has a value, by name, in n rows."""

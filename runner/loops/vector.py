@@ -228,9 +228,9 @@ def record_vector(
             f"found {type(envs).__name__}, expected a vector environment, such as gymnasium.make_vec gives"
         )
     check_phase(phase)
-    mode = _autoreset_mode(envs, autoreset_mode)
-    with _one_of(envs) as first:
-        described = _described_vector(envs, first)
+    mode = autoreset_mode_of(envs, autoreset_mode)
+    with first_of(envs) as first:
+        described = described_vector(envs, first)
         require_fixed(described)
         maker = vector_maker_of(envs, first, mode, checked_make(make))
         watch = VectorWatch(envs, first, mode)
@@ -261,14 +261,16 @@ def record_vector(
     return RecordedVector(envs, loop, mode, watch, phase)
 
 
-def _autoreset_mode(envs: VectorEnv[Any, Any, Any], chosen: AutoresetMode | str | None) -> AutoresetMode:
+def autoreset_mode_of(
+    envs: VectorEnv[Any, Any, Any] | None, chosen: AutoresetMode | str | None
+) -> AutoresetMode:
     """Return how environments reset themselves: as chosen, else as their metadata states.
 
     Raises:
         ConfigError: there is no such mode.
         EnvironmentNotUsable: none is chosen and none is stated.
     """
-    if chosen is not None:
+    if chosen is not None or envs is None:
         try:
             return AutoresetMode(chosen)
         except ValueError as error:
@@ -284,7 +286,7 @@ def _autoreset_mode(envs: VectorEnv[Any, Any, Any], chosen: AutoresetMode | str 
     return stated
 
 
-def _described_vector(envs: VectorEnv[Any, Any, Any], first: Any) -> Described:
+def described_vector(envs: VectorEnv[Any, Any, Any], first: Any) -> Described:
     """Return the description of a vector environment; `first` is its first environment.
 
     Older ones have no `single_` spaces: their spaces are those of one environment.
@@ -297,7 +299,7 @@ def _described_vector(envs: VectorEnv[Any, Any, Any], first: Any) -> Described:
 
 
 @contextlib.contextmanager
-def _one_of(envs: VectorEnv[Any, Any, Any]) -> Iterator[Any]:
+def first_of(envs: VectorEnv[Any, Any, Any]) -> Iterator[Any]:
     """Yield the first environment of a vector, or the vector if it has none of its own.
 
     Those of an AsyncVectorEnv are in other processes, which end if a registration cannot be sent; so one is

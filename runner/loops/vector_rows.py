@@ -29,7 +29,7 @@ _MAX_STEPS: Final = 2048
 """The most steps of the vector environment in a block; fewer if the recorder's blocks hold fewer records."""
 
 
-class _Reset(NamedTuple):
+class ResetsBetween(NamedTuple):
     """Resets of environments whose episodes had ended, by the user or within a step (`SAME_STEP`)."""
 
     row: NDArray[np.intp]
@@ -82,12 +82,14 @@ class VectorRows:
         self._return = np.zeros(n)
         self._ended = self._reset_count = 0
         self._observation_dtype = recorder.blank(self._resets, 1).dtype["observation"]
+        self._current = np.zeros(n, self._observation_dtype)
+        """The observations before the first row of the block."""
         self._room = self._filled = 0
         """Rows of the block that are in use, of `_room`."""
         self._over = np.zeros(n, np.bool_)
         self._state = np.full(n, -self._state_start)
         """The states before the first row, where both spaces are discrete."""
-        self._block_resets: list[_Reset] = []
+        self._block_resets: list[ResetsBetween] = []
         self._finals: list[tuple[Any, NDArray[np.intp], NDArray[Any]]] = []
         """Rows whose observations are of the next episodes; environments, and the last ones of the ended."""
         self._autoreset_states: dict[int, States] = {}
@@ -197,12 +199,22 @@ class VectorRows:
             self._finals.append((row, which, last[which]))
             after = self._observations[row, which]
             none = [None] * len(which)
-            self._block_resets.append(_Reset(np.full(len(which), row + 1), which, after, none, none))
+            self._block_resets.append(ResetsBetween(np.full(len(which), row + 1), which, after, none, none))
         if states:
             self._autoreset_states[row] = states
         self._filled = row + 1
         if self._filled == self._room:
             self.commit()
+
+    def _now(self) -> NDArray[Any]:
+        """Return the observations [N] after the last step or reset of each environment."""
+        if not self._filled:
+            return self._current
+        now: NDArray[Any] = self._observations[self._filled - 1].copy()
+        for reset in self._block_resets:
+            here = reset.row == self._filled
+            now[reset.which[here]] = reset.observation[here]
+        return now
 
     def reset(self, observation: Any, seeds: Sequence[int | None], which: Flags, states: States) -> None:
         """Record a reset of some environments; it ends episodes in progress in them.
@@ -221,11 +233,12 @@ class VectorRows:
         over = self.over
         if self._filled and over[chosen].all():
             after = np.full(len(chosen), self._filled)
-            self._block_resets.append(_Reset(after, chosen, now[chosen], own_seeds, own_states))
+            self._block_resets.append(ResetsBetween(after, chosen, now[chosen], own_seeds, own_states))
             return
         self.commit()
         self._abandon(chosen)
         self._over = self._over & ~which
+        self._current[chosen] = now[chosen]
         if self._discrete:
             self._state[chosen] = now[chosen].astype(np.int64) - self._state_start
         steps = np.full(len(chosen), self._recorder.steps[self._phase])
@@ -251,6 +264,7 @@ class VectorRows:
         if not rows:
             return
         first, over_after = self._recorder.steps[self._phase], self.over
+        self._current = self._now()
         self._put_records(counts := self._count(), first)
         self._recorder.steps[self._phase] += rows * n
         row, which = np.nonzero(counts.over)
@@ -325,7 +339,10 @@ class VectorRows:
         own = zip(only_rows.tolist(), only.tolist(), strict=True)
         own_states = [self._autoreset_states.get(row, {}).get(i) for row, i in own]
         observed = self._observations[only_rows, only]
-        resets = [*self._block_resets, _Reset(only_rows, only, observed, [None] * len(only), own_states)]
+        resets = [
+            *self._block_resets,
+            ResetsBetween(only_rows, only, observed, [None] * len(only), own_states),
+        ]
         rows = np.concatenate([reset.row for reset in resets])
         if not len(rows):
             return

@@ -147,6 +147,33 @@ def _column_of(leaf: Leaf, column: NDArray[Any]) -> NDArray[Any]:
     return column
 
 
+def fitted(leaves: Sequence[Leaf], value: Any, batch: tuple[int, ...]) -> list[NDArray[Any]]:
+    """Return a batch of values of a space as an array for each leaf, [*batch, ...].
+
+    Raises:
+        RecordingError: it is not of its space, or not of this shape.
+    """
+    arrays = []
+    for leaf in leaves:
+        try:
+            arrays.append(leaf.fit(leaf.part.of(value), batch))
+        except (TypeError, ValueError, LookupError, OverflowError) as error:
+            raise leaf.refused(error) from error
+    return arrays
+
+
+def put_fitted(leaves: Sequence[Leaf], arrays: Sequence[NDArray[Any]], at: Any, column: NDArray[Any]) -> None:
+    """Put the part of `fitted` arrays that an index chooses into a column of values of the space."""
+    for leaf, array in zip(leaves, arrays, strict=True):
+        _column_of(leaf, column)[...] = array[at]
+
+
+def put_unknown(leaves: Sequence[Leaf], column: NDArray[Any]) -> None:
+    """Fill a column of values of the space with NaN, and with 0 where they are whole numbers."""
+    for leaf in leaves:
+        _column_of(leaf, column)[...] = np.nan if leaf.base.kind == "f" else 0
+
+
 def leaves_by_agent(space: Any, what: str, on_rounded: OnRounded = lambda _: None) -> dict[str, list[Leaf]]:
     """Return the leaves of each agent's space in the `Dict` of all of them."""
     leaves = leaves_of(space, what, "the agents' spaces", on_rounded)
@@ -207,8 +234,8 @@ def put_chosen(leaves: Sequence[Leaf], values: Any, into: NDArray[Any], which: N
         put(i, element_of(values, i))
 
 
-def element_of(values: Any, i: int) -> Any:
-    """Return one of many values that are nested as their space."""
+def element_of(values: Any, i: int | slice) -> Any:
+    """Return one of many values, or some, that are nested as their space."""
     if isinstance(values, Mapping):
         return {key: element_of(part, i) for key, part in values.items()}
     if isinstance(values, tuple):

@@ -32,6 +32,7 @@ def test_the_public_names():
         "list_runs",
         "open_recording",
         "record",
+        "record_batches",
         "record_parallel",
         "record_vector",
         "rerecord",
