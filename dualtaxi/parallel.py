@@ -70,6 +70,10 @@ class DualTaxiParallelEnv(ParallelEnv):  # type: ignore[misc]
         """Return the space of an agent's actions."""
         return self._action_spaces[agent]
 
+    def get_action_meanings(self) -> list[str]:
+        """Return the names of an agent's actions, by their numbers."""
+        return list(ACTIONS)
+
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, int], dict[str, dict[str, Any]]]:

@@ -14,7 +14,7 @@ from runner.environments.mdp import events_of
 from runner.environments.naming import actions_in_words, states_in_words
 from runner.export.contents import ENDINGS, ending_of
 from runner.export.pictures import describer
-from runner.export.values import plain_value, value_in_words
+from runner.export.values import action_in_words, plain_value, value_in_words
 from runner.replay.steps import check_steps, reset_of, transitions_of
 from runner.util.humanize import number
 from runner.util.jsonable import as_json
@@ -61,7 +61,7 @@ class Episode:
     def steps(self) -> Iterator[dict[str, Any]]:
         """Yield each step as JSON: with names where the environment's table has them."""
         recording, agents = self._recording, self._recording.agents
-        describe = _named(recording) if recording.tabular else _valued(recording)
+        describe = _named(recording) if recording.tabular else _valued(recording, self._phase)
         for row in transitions_of(recording, self._phase, self._number):
             yield {
                 "t": int(row["t"]),
@@ -169,16 +169,25 @@ def _named(recording: Recording) -> Callable[[Any], dict[str, Any]]:
     return describe
 
 
-def _valued(recording: Recording) -> Callable[[Any], dict[str, Any]]:
-    """Return a function that gives the action of a step and the observation after it."""
-    if recording.kind == "step":
-        return lambda row: {name: int(row[name]) for name in ("state", "action", "next_state")}
+def _valued(recording: Recording, phase: str) -> Callable[[Any], dict[str, Any]]:
+    """Return a function that gives the action of a step, by name where it has one, and the observation."""
+    agents = recording.agents if len(recording.agents) > 1 else ("",)
+    words = {
+        agent: action_in_words(recording, phase, agent)
+        for agent in agents
+        if recording.action_names(phase, agent)
+    }
 
     def describe(row: Any) -> dict[str, Any]:
-        found = {name: as_json(plain_value(row[name])) for name in ("action", "next_observation")}
-        if len(recording.agents) > 1:
-            found["acted"] = [a for i, a in enumerate(recording.agents) if int(row["acted"]) >> i & 1]
-        return found
+        if recording.kind == "step":
+            found: dict[str, Any] = {name: int(row[name]) for name in ("state", "action", "next_state")}
+        else:
+            found = {name: as_json(plain_value(row[name])) for name in ("action", "next_observation")}
+        if agents != ("",):
+            found["acted"] = [agent for i, agent in enumerate(agents) if int(row["acted"]) >> i & 1]
+            own = {agent: words[agent](row["action"][agent]) for agent in found["acted"] if agent in words}
+            return found | ({"action_in_words": own} if own else {})
+        return found | ({"action_in_words": words[""](row["action"])} if words else {})
 
     return describe
 

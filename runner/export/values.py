@@ -83,12 +83,22 @@ def value_in_words(value: Any, limit: int = FEW) -> str:
     return f"{array.item():.3g}" if array.dtype.kind == "f" else f"{array.item()}"
 
 
-def action_in_words(recording: Recording, phase: str) -> Callable[[Any], str]:
-    """Return how to put an action of a step's record in words: `left`, or its value where it has no name."""
-    start = recording.spaces["action"].get("start")
+def action_in_words(recording: Recording, phase: str, agent: str = "") -> Callable[[Any], str]:
+    """Return how to put an action of a step's record in words: `left`, or its value where it has no name.
+
+    Args:
+        recording: of a loop.
+        phase: `train` or `eval`.
+        agent: whose actions they are; of a game without one, actions are mappings by agent.
+    """
+    if len(recording.agents) > 1 and not agent:
+        by_agent = {each: action_in_words(recording, phase, each) for each in recording.agents}
+        return lambda actions: ", ".join(f"{each} {by_agent[each](own)}" for each, own in actions.items())
+    space = recording.spaces["action"]
+    start = (space["spaces"][agent] if agent else space).get("start")
     least = start if isinstance(start, int) else 0
     recorded_from = 0 if recording.kind == "step" else least
-    names = [spoken(name) for name in recording.action_names(phase)]
+    names = [spoken(name) for name in recording.action_names(phase, agent)]
 
     def in_words(action: Any) -> str:
         if not names and recording.kind != "step":

@@ -18,6 +18,8 @@ from runner.recording.maker import MAX_NAMES
 from runner.util.values import is_text
 
 _MAX_TEXT: Final = 200
+Names = Sequence[str] | Mapping[str, Sequence[str]]
+"""Names of discrete actions, the least action's first; of a game by agent."""
 _KNOWN: Final = {
     "AcrobotEnv": ("torque -1", "no torque", "torque 1"),
     "BlackjackEnv": ("stick", "hit"),
@@ -25,16 +27,18 @@ _KNOWN: Final = {
     "CartPoleEnv": ("left", "right"),
     "CartPoleVectorEnv": ("left", "right"),
     "LunarLander": ("no engine", "left engine", "main engine", "right engine"),
+    "SimpleEnv": ("no action", "left", "right", "down", "up"),
     "MountainCarEnv": ("left", "no push", "right"),
 }
-"""The actions of Gymnasium's own environments, by class, as its documentation names them."""
+"""The actions of well-known environments, by class, as their documentation names them."""
+_KNOWN_IN: Final = ("gymnasium.envs.", "mpe2.")
 
 
 def action_names(env: Any, space: Space) -> tuple[str, ...]:
     """Return the names of an environment's discrete actions, the least action's first; empty if unknown.
 
     Args:
-        env: a Gymnasium environment, or a vector environment without its wrappers.
+        env: a Gymnasium environment, a vector environment without its wrappers, or a game.
         space: of the actions as the user takes them: names are only returned if there is one for each.
     """
     layer, base = env, getattr(env, "unwrapped", env)
@@ -42,7 +46,7 @@ def action_names(env: Any, space: Space) -> tuple[str, ...]:
         if isinstance(layer, ActionWrapper) and not isinstance(layer, StickyAction):  # has other actions
             return ()
         layer = getattr(layer, "env", base)
-    kinds = (kind for kind in type(base).__mro__ if kind.__module__.startswith("gymnasium.envs."))
+    kinds = (kind for kind in type(base).__mro__ if kind.__module__.startswith(_KNOWN_IN))
     names: Any = next((_KNOWN[kind.__name__] for kind in kinds if kind.__name__ in _KNOWN), ())
     meanings, named = getattr(base, "get_action_meanings", None), getattr(base, "actions", None)
     if callable(meanings):  # as ALE has
@@ -56,22 +60,35 @@ def action_names(env: Any, space: Space) -> tuple[str, ...]:
     return names if is_complete and all(map(is_text, names)) else ()
 
 
-def parsed_action(space: Space, given: Any, recorded: Any, names: Sequence[str], is_game: bool) -> Any:
+def action_in_words(space: Space, action: Any, names: Names) -> str:
+    """Return the name of an action, or the names of those of several agents; empty if there is none."""
+    if isinstance(names, Mapping):
+        assert isinstance(space, spaces.Dict)
+        own = {
+            agent: action_in_words(space[agent], value, names[str(agent)]) for agent, value in action.items()
+        }
+        return ", ".join(f"{agent} {name}" for agent, name in own.items() if name)
+    return (
+        spoken(names[int(action) - int(space.start)]) if isinstance(space, spaces.Discrete) and names else ""
+    )
+
+
+def parsed_action(space: Space, given: Any, recorded: Any, names: Names) -> Any:
     """Return an action in the dtypes of the recorded one.
 
     Args:
         space: of the environment's actions; of a game a `Dict` by agent.
-        given: text, or a value; of a game `AGENT=VALUE`, or a mapping by agent. None for the recorded action.
+        given: text, or a value; of a game `AGENT=VALUE`, or a mapping by agent: the others act as
+            recorded. None for the recorded action.
         recorded: the recorded action at the same step; of a game those of the agents that acted.
-        names: of discrete actions, if known.
-        is_game: whether it is a game; agents that are not given act as recorded.
+        names: of discrete actions, if known; of a game by agent.
 
     Raises:
         ConfigError: it is not in the space.
     """
     if given is None:
         return recorded
-    if not is_game:
+    if not isinstance(names, Mapping):
         return _parsed(space, given, recorded, names, "action")
     assert isinstance(space, spaces.Dict)
     if isinstance(given, str):
@@ -85,7 +102,7 @@ def parsed_action(space: Space, given: Any, recorded: Any, names: Sequence[str],
         )
     own = {acting[str(agent)]: value for agent, value in given.items()}
     return recorded | {
-        agent: _parsed(space[agent], value, recorded[agent], names, f"action of {agent}")
+        agent: _parsed(space[agent], value, recorded[agent], names[str(agent)], f"action of {agent}")
         for agent, value in own.items()
     }
 

@@ -23,7 +23,7 @@ from typing import Any, Final
 from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.analysis.step_reference import StepRef
 from runner.errors import CannotRedo, ConfigError, RunnerError
-from runner.loops.actions import action_names, parsed_action
+from runner.loops.actions import Names, action_in_words, action_names, parsed_action
 from runner.loops.env import record
 from runner.loops.parallel import record_parallel
 from runner.loops.policies import Policy, from_policy, policy_named
@@ -215,8 +215,10 @@ class _Player:
         self._is_game, self._actions = maker.kind == "pettingzoo", actions
         self._space = copy.deepcopy(stepper.action_space)
         self._space.seed(task.seed)
-        names = recording.action_names(self.phase) or action_names(env, self._space)
-        self._action = parsed_action(self._space, task.action, next(actions), names, self._is_game)
+        names: Names = recording.action_names(self.phase) or action_names(env, self._space)
+        if self._is_game:
+            names = {agent: recording.action_names(self.phase, agent) for agent in recording.agents}
+        self._action = parsed_action(self._space, task.action, next(actions), names)
         self.origin = BranchOrigin(
             recording.run_id,
             self.phase,
@@ -226,6 +228,7 @@ class _Player:
             _text(self._action),
             task.policy,
             task.seed,
+            action_in_words(self._space, self._action, names),
         )
         wrap: Callable[..., Any] = record_parallel if self._is_game else record
         self.rec = stepper.env = wrap(

@@ -189,7 +189,13 @@ def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
     layers = list(_layers(env))
     base, outer = layers[-1], layers[0]
     module = type(base).__module__
-    maker = EnvironmentMaker("pettingzoo", make=make, wrappers=tuple(map(_class_name, layers[:-1])))
+    named = {str(agent): action_names(base, env.action_space(agent)) for agent in env.possible_agents}
+    maker = EnvironmentMaker(
+        "pettingzoo",
+        make=make,
+        wrappers=tuple(map(_class_name, layers[:-1])),
+        agent_action_names={agent: names for agent, names in named.items() if names},
+    )
     top, assumed = _top(module), []
     try:
         has_function = callable(getattr(sys.modules.get(module), "parallel_env", None))

@@ -14,6 +14,7 @@ from runner.loops.loop import Loop, R
 from runner.loops.messages import Messages
 from runner.loops.options import Options
 from runner.loops.rows import Rows
+from runner.loops.values import frozen_options
 from runner.runs.run import Run
 
 S = TypeVar("S", bound=Rows)
@@ -234,7 +235,7 @@ class RecordedAlone(Recorded[S]):
 
     def _recorded_reset(self, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, Any]:
         """Reset the environment, and record it: the seed, the options, the observation."""
-        before = dict(options) if options else None  # the environment may change them
+        before = frozen_options(options or {})
         state = self._watch.before(self._steps_so_far()) if seed is None else None
         result: tuple[Any, Any] = self.env.reset(**given(seed=seed, options=options))
         try:

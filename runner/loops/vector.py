@@ -21,7 +21,7 @@ from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, vector_maker_of
 from runner.loops.options import options_of
 from runner.loops.recorded import Recorded, given, require_pictures
-from runner.loops.values import check_phase
+from runner.loops.values import check_phase, frozen_options
 from runner.loops.vector_rows import VectorRows
 from runner.runs.run import Run
 
@@ -129,8 +129,8 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Reset all environments, or those of `options["reset_mask"]`, and record it."""
-        n, others = self.env.num_envs, dict(options) if options else {}
-        mask = others.pop("reset_mask", None)
+        n, mask = self.env.num_envs, (options or {}).get("reset_mask")
+        others = frozen_options({key: own for key, own in (options or {}).items() if key != "reset_mask"})
         which = np.ones(n, np.bool_) if mask is None else np.array(mask, np.bool_)
         seeds = [seed + i for i in range(n)] if isinstance(seed, int) else list(seed or ())
         states = self._watch.before_reset(which, seeds)

@@ -236,8 +236,12 @@ class RunDescription(ABC):
                 break
         return self._maker(f"{MAKER_RECORD}/{phase}") or self.maker
 
-    def action_names(self, phase: str) -> tuple[str, ...]:
+    def action_names(self, phase: str, agent: str = "") -> tuple[str, ...]:
         """Return the names of the discrete actions of a phase, the least action's first; empty if unknown.
+
+        Args:
+            phase: `train` or `eval`.
+            agent: of a game of several agents, which may have different actions.
 
         Raises:
             RecordingError: they are damaged.
@@ -245,8 +249,12 @@ class RunDescription(ABC):
         if self.tabular:
             return () if action_names(self.mdp) is None else tuple(map(str, actions_in_words(self.mdp)))
         maker = self.maker_of(phase)
-        names = () if maker is None else maker.action_names
+        if maker is None:
+            return ()
+        names = maker.agent_action_names.get(agent, ()) if agent else maker.action_names
         space = self.spaces["action"] if names else {}
+        if names and agent:
+            space = space["spaces"][agent] if agent in space.get("spaces", ()) else {"type": "?"}
         if names and (space["type"], space.get("n")) != ("Discrete", len(names)):
             raise RecordingError(
                 f"{self.path}: its {MAKER_RECORD} is damaged: found {len(names)} action_names, expected one "

@@ -88,6 +88,8 @@ class EnvironmentMaker:
     machine: str = ""
     action_names: tuple[str, ...] = ()
     """The names of the actions of a `Discrete` space, the least action's first; empty if unknown."""
+    agent_action_names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Of a game, the same by agent; agents without names are left out."""
 
     def is_like(self, other: EnvironmentMaker) -> bool:
         """Return whether another maker makes the environment, or each of a vector, in the same way."""
@@ -124,6 +126,7 @@ def parse_maker(values: Mapping[str, Any], where: str) -> EnvironmentMaker:
         platform=check.text("platform", MAX_TEXT),
         machine=check.text("machine", MAX_TEXT),
         action_names=check.labels("action_names"),
+        agent_action_names=check.labels_by_name("agent_action_names"),
     )
 
 
@@ -187,6 +190,13 @@ class _Check:
         labels = self.names(key) if key in self.values else ()
         self.require(key, all(map(is_text, labels)))
         return labels
+
+    def labels_by_name(self, key: str) -> dict[str, tuple[str, ...]]:
+        """Return such texts of an object by key; none if the object is missing, as in earlier recordings."""
+        found = self.values.get(key, {})
+        self.require(key, isinstance(found, Mapping) and len(found) <= MAX_NAMES)
+        own = _Check(found, self._where)
+        return {name: own.labels(name) for name in found}
 
     def versions(self, key: str) -> dict[str, str]:
         value = self.values.get(key)

@@ -33,10 +33,13 @@ class BranchOrigin:
     """What acts after it."""
     seed: int
     """The seed of a random policy."""
+    action_name: str = ""
+    """The name of the action, of several agents their names; empty if it has none."""
 
     def __str__(self) -> str:
-        """Describe the branch: `at 120:5, action 1, then random`."""
-        return f"at {self.at}, action {self.action}, then {self.policy}"
+        """Describe the branch: `at 120:5, action 1 (right), then random`."""
+        named = f" ({self.action_name})" if self.action_name else ""
+        return f"at {self.at}, action {self.action}{named}, then {self.policy}"
 
 
 def origin_in(config: Mapping[str, Any]) -> BranchOrigin | None:
@@ -50,7 +53,10 @@ def parse_origin(found: Mapping[str, Any]) -> BranchOrigin | None:
     """Return the origin with these fields, among others; None if one is missing or of another type."""
     values: dict[str, Any] = {name: found.get(name) for name in BranchOrigin.__dataclass_fields__}
     are_numbers = all(is_whole(values[name], 0, _MAX_NUMBER) for name in ("episode", "t", "seed"))
-    are_texts = all(isinstance(values[name], str) for name in ("run", "at", "action", "policy"))
+    values["action_name"] = found.get("action_name", "")
+    are_texts = all(
+        isinstance(values[name], str) for name in ("run", "at", "action", "policy", "action_name")
+    )
     return (
         BranchOrigin(**values) if are_numbers and are_texts and values["phase"] in ("train", "eval") else None
     )

@@ -21,6 +21,11 @@ def size(count: float) -> str:
     return f"{_two_digits(count / 1000)} TB"
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number of things as text: `1 episode`, `2,000 episodes`."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
 def amount(count: float) -> str:
     """Return a large number as text: `9,500`, `12 thousand`, `3.4 million`."""
     for divisor, word in ((1e9, "billion"), (1e6, "million"), (1e3, "thousand")):

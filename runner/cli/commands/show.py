@@ -15,7 +15,7 @@ from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import console, draw, facts, print_json, say, title
 from runner.cli.progress import stage_line
 from runner.cli.runs import command_for, find, restored
-from runner.util.humanize import UNKNOWN, age, duration, number, size
+from runner.util.humanize import UNKNOWN, age, counted, duration, number, size
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -96,7 +96,10 @@ def _parts(details: RunDetails, branches: Mapping[str, BranchOrigin]) -> list[Re
             for each in details.tables
         }
         parts += [title("Tables"), facts(fill)]
-    config = {key: _yaml(value) for key, value in details.config.items()}
+    given = dict(details.config)
+    if (frames := given.get("frames")) and isinstance(frames, Mapping) and not frames.get("every"):
+        del given["frames"]
+    config = {key: _yaml(value) for key, value in given.items() if value not in ([], {})}
     parts += [title("Configuration"), facts(config)]
     if details.provenance:
         parts += [title("Provenance"), facts(details.provenance)]
@@ -111,7 +114,7 @@ def _head(details: RunDetails) -> dict[str, str]:
     took = "" if summary.seconds is None else f", took {duration(summary.seconds)}"
     steps = ""
     if not (details.train_steps is None or details.episodes is None or details.eval_steps is None):
-        steps = f"{details.train_steps:,} of training in {details.episodes:,} episodes, "
+        steps = f"{details.train_steps:,} of training in {counted(details.episodes, 'episode')}, "
         steps += f"{details.eval_steps:,} of evaluation"
     head = {
         "run": f"{run.run_id}  {run.title}",

@@ -16,7 +16,7 @@ from runner.cli.progress import bytes_line, count_line
 from runner.cli.runs import command_for, find_recording, job_progress, require_over
 from runner.errors import Diverged, ExitCode
 from runner.runs.locking import locked
-from runner.util.humanize import UNKNOWN, size
+from runner.util.humanize import UNKNOWN, counted, size
 
 if TYPE_CHECKING:
     from runner.execution.redo import Redone
@@ -104,9 +104,9 @@ def verify_command(
 
 def _redone(redone: Redone) -> dict[str, str]:
     """Return what came of doing a loop again, as rows."""
-    compared = f"{redone.episodes:,} episodes, {redone.steps:,} steps"
-    if redone.of_episodes is not None:
-        compared = f"{redone.episodes:,} of {redone.of_episodes:,} episodes, {redone.steps:,} steps"
+    steps, of = counted(redone.steps, "step"), redone.of_episodes
+    episodes = counted(redone.episodes if of is None else of, "episode")
+    compared = f"{episodes if of is None else f'{redone.episodes:,} of {episodes}'}, {steps}"
     exactness = f"within {redone.tolerance:g}" if redone.tolerance else "every byte"
     rows = {"verdict": f"reproduced: {compared}, {exactness}"}
     if redone.verdict == "differs":

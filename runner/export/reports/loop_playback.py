@@ -28,7 +28,7 @@ from runner.export.reports.player_data import (
     short_rows,
     words,
 )
-from runner.export.values import action_in_words, is_image, value_in_words
+from runner.export.values import action_in_words, is_image
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import leaves_of
@@ -188,9 +188,12 @@ class _Reader:
         if len(agents) == 1:
             in_words = action_in_words(self._recording, self._phase)
             return {"": [_short_text(in_words(record["action"])) for record in records]}
+        words_of = {agent: action_in_words(self._recording, self._phase, agent) for agent in agents}
         return {
             agent: [
-                _short_text(value_in_words(record["action"][agent])) if int(record["acted"]) >> i & 1 else "–"
+                _short_text(words_of[agent](record["action"][agent]))
+                if int(record["acted"]) >> i & 1
+                else "–"
                 for record in records
             ]
             for i, agent in enumerate(agents)

@@ -315,9 +315,11 @@ class LoopExporter:
                 style = rr.SeriesPoints(names=lines, colors=colours, marker_sizes=[1.5])
             self._sender("").send_static(entity, style)
             tab, title = _OVERVIEW, quantity.removeprefix("extra/")
-            actions = self._recording.action_names(phase)
+            agent = self._recording.agents[member.number] if self._is_game else ""
+            actions = self._recording.action_names(phase, agent)
             if quantity == "action" and 0 < len(actions) <= FEW:
-                least = self._recording.spaces["action"]["start"]
+                space = self._recording.spaces["action"]
+                least = (space["spaces"][agent] if agent else space)["start"]
                 title = f"action: {', '.join(f'{i} {name}' for i, name in enumerate(actions, least))}"
             if member.name and len(names) > 1:
                 tab, title = title.capitalize(), _spaced(member.name, title)

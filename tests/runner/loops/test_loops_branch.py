@@ -153,7 +153,8 @@ def test_the_difference_of_parent_and_branch_is_the_branch(runs, tmp_path):
             place = found.divergence.episode, found.divergence.t, found.divergence.field
             assert place == (1, t, "action")
             assert found.cause.kind == "branch"
-            assert found.cause.text == f"{which}, at 1:{t}, action {action}, then recorded"
+            name = ("left", "down", "right", "up")[action]
+            assert found.cause.text == f"{which}, at 1:{t}, action {action} ({name}), then recorded"
             lead = summary(found)
             assert lead.startswith("The content differs. No setting that determines the content differs.")
             assert found.cause.text in lead
@@ -177,7 +178,7 @@ def test_the_command_and_what_show_lists(runs, tmp_path):
     assert re.search(r"parent +\w+ .*terminated\nbranch +\w+ .*terminated", text)
     assert f"dualtaxi diff {run.run_id}" in text
     assert printed["run_id"] in json.loads(command("show", run.run_id, "--json"))["branches"]
-    assert "at 0:3, action 0, then constant" in command("show", run.run_id)
+    assert "at 0:3, action 0 (left), then constant" in command("show", run.run_id)
     assert f"of run {run.run_id} at 0:3, action 1" in command("show", printed["run_id"])
 
 
@@ -233,7 +234,10 @@ def test_a_game_of_several_agents(tmp_path):
                 rec.step({agent: (i + 1) % 5 for i, agent in enumerate(rec.agents)})
     same = runner.branch(rec.run, at="1:4", recordings=tmp_path)
     assert rows(same.run, 0).tobytes() == rows(rec.run, 1).tobytes()
-    branch = runner.branch(rec.run, at="1:4", action="agent_1=0", policy="constant", recordings=tmp_path)
+    branch = runner.branch(
+        rec.run, at="1:4", action="agent_1=no action", policy="constant", recordings=tmp_path
+    )
+    assert "agent_1 no action" in str(branch.origin)
     own = rows(branch.run, 0)
     assert own[:4].tobytes() == rows(rec.run, 1)[:4].tobytes()
     assert [tuple(each) for each in own["action"][4:].tolist()] == [(1, 0, 3)] * 6

@@ -17,7 +17,10 @@ from gymnasium import wrappers
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
+from runner.cli.episode import Episode
 from runner.errors import ConfigError, RecordingError
+from runner.export.episodes import named_episode
+from runner.export.pictures import describer
 from runner.recording.maker import EnvironmentMaker, VectorMaker, parse_maker
 from runner.recording.metadata import json_object
 from runner.recording.reader import open_recording
@@ -230,6 +233,21 @@ def test_the_environments_of_a_vector_have_names_of_actions(tmp_path):
     assert maker_of(runner.record_vector(swapped, tmp_path)).action_names == ()
 
 
+def test_the_agents_of_a_game_have_names_of_actions(tmp_path):
+    simple_spread_v3 = pytest.importorskip("mpe2.simple_spread_v3")
+    with runner.record_parallel(simple_spread_v3.parallel_env(max_cycles=3), tmp_path, name="spread") as rec:
+        rec.reset(seed=0)
+        while rec.agents:
+            rec.step(dict(zip(rec.agents, (0, 2, 4), strict=True)))
+    with open_recording(rec.run.recording) as recording:
+        assert recording.action_names("train", "agent_1") == ("no action", "left", "right", "down", "up")
+        assert recording.action_names("train") == ()
+        described, _ = describer(recording, "train")(next(recording.transitions("train")))
+        (first, *_) = Episode(recording, named_episode(recording, "train", 0), "").steps()
+    assert described == "agent_0 no action, agent_1 right, agent_2 up"
+    assert first["action_in_words"] == {"agent_0": "no action", "agent_1": "right", "agent_2": "up"}
+
+
 # --- what comes in ------------------------------------------------------------------------------------
 
 GOOD = EnvironmentMaker(
@@ -239,6 +257,7 @@ GOOD = EnvironmentMaker(
     vector=VectorMaker(2, "sync", "Disabled"),
     packages={"a": "1"},
     action_names=("left", "right"),
+    agent_action_names={"a": ("left", "right")},
 )
 
 
@@ -261,6 +280,7 @@ def test_a_recording_made_before_actions_had_names_is_read():
         *(("wrappers", "abc"), ("wrappers", ["x"] * 200), ("wrappers", [3]), ("assumed", {})),
         *(("vector", 3), ("vector", {"number": 0}), ("packages", {"a": 1}), ("machine", "x" * 300)),
         *(("action_names", "left"), ("action_names", ["x"] * 101), ("action_names", ["x" * 201])),
+        *(("agent_action_names", [["x"]]), ("agent_action_names", {"a": "left"})),
         *(("action_names", [""]), ("action_names", ["\x1b[2J"]), ("action_names", [3])),
     ],
 )

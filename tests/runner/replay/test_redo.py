@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import time
 from functools import partial
@@ -140,6 +141,20 @@ def test_options_of_resets_are_given_again(tmp_path):
             for _ in range(10):
                 env.step(0)
     assert redone(env.run.recording, trust=True) == (30, None)
+
+
+def test_options_that_the_environment_changes_are_recorded_as_they_were(tmp_path):
+    class Taking(loops.Counter):
+        def reset(self, *, seed=None, options=None):
+            (options or {"start": {"add": 0}})["start"].pop("add")
+            return super().reset(seed=seed)
+
+    with runner.record(Taking(), tmp_path) as env:
+        env.reset(seed=1, options={"start": {"add": 500}})
+        env.step(0)
+    with open_recording(env.run.recording) as recording:
+        (info,) = recording.decoded(recording.topic("/train/info"))
+    assert json.loads(info["json"])["reset"] == {"options": {"start": {"add": 500}}}
 
 
 @pytest.mark.parametrize("is_shared", [True, False])
