@@ -15,6 +15,7 @@ from runner.analysis.evaluations import (
 )
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.clock import Clock, read_clock
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import Summary
 from runner.runs.checkpoints import Checkpoint, read_checkpoints
@@ -76,6 +77,8 @@ class RunDetails:
 
     checkpoints: tuple[Checkpoint, ...] = ()
     """What a loop kept of its agent."""
+    clock: Clock | None = None
+    """The time that was recorded; None in recordings of earlier versions."""
 
     def facts(self) -> dict[str, Any]:
         """Return everything but the series, as JSON can hold it."""
@@ -93,6 +96,8 @@ class RunDetails:
             "topic_digests": dict(summary.topic_digests) if "topic_digests" in summary else None,
             **{key: getattr(self, key) for key in ("episodes", "train_steps", "eval_steps")},
             "seconds": summary.seconds,
+            "recorded_seconds": None if self.clock is None else self.clock.duration,
+            "steps_a_second": None if self.clock is None else self.clock.steps_a_second,
             "config": dict(self.config),
             "provenance": dict(self.provenance),
             "success_events": list(self.success_events),
@@ -128,6 +133,7 @@ def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> Ru
                     config if config == recording.config else recording.config,  # the former in better order
                     **done,
                     bytes=recording.size,
+                    clock=read_clock(recording),
                     provenance=recording.provenance,
                     success_events=tuple(recording.environment["success_events"]),
                     tables=_tables(recording),

@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
+
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.clock import Clock
@@ -227,7 +229,7 @@ class ConsoleLine:
     seconds: float
     """When it began, in seconds of the run, as in its clock."""
     position: int
-    """The number of steps executed when it was recorded, about a second later."""
+    """The number of steps executed until then; without a clock, until it was recorded."""
     stream: str
     """`stdout`, `stderr`, or empty for a note of the recorder."""
     text: str
@@ -251,8 +253,10 @@ def read_console(recording: TopicReader, clock: Clock | None) -> list[ConsoleLin
                 f"{recording.path}: {schema.CONSOLE_TOPIC.name}: found stream {number} after {seconds} s in "
                 f"message {count}, expected at most {MAX_LINES:,} of the streams 0 to {len(STREAMS) - 1}."
             )
-        earlier = 0.0 if clock is None else clock.earlier.get(started, 0.0)
         position = fields["log_time"] // schema.STEP_NANOSECONDS
-        line = ConsoleLine(earlier + seconds, position, STREAMS[number], fields["text"])
+        if clock is not None:
+            seconds += clock.earlier.get(started, 0.0)
+            position = int(np.interp(seconds, clock.seconds, clock.positions))
+        line = ConsoleLine(seconds, position, STREAMS[number], fields["text"])
         lines[started, number, fields["line"]] = line
     return sorted(lines.values(), key=lambda line: line.seconds)

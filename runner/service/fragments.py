@@ -25,6 +25,7 @@ from runner.errors import RecordingError, RunnerError
 from runner.export.encoded import picture_note
 from runner.export.episodes import last_episode, last_whole_evaluation, typical_trial
 from runner.export.plots.curves import footnote, panel_plots
+from runner.export.plots.machine import machine_facts, machine_plots
 from runner.export.reports.diff import ShownDivergence, difference_view
 from runner.export.reports.episode import trial
 from runner.export.reports.maps import maps_of, stages_of
@@ -32,6 +33,9 @@ from runner.export.reports.playback import playback_of
 from runner.export.reports.rendering import Link, partials
 from runner.export.rerun.location import locate
 from runner.export.rerun.selection import Request
+from runner.recording.clock import read_clock
+from runner.recording.console import read_console
+from runner.recording.host import read_host
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.addresses import link, places_in
@@ -41,6 +45,8 @@ from runner.sweep.page import sweep_legend
 from runner.sweep.results import Results, effects_sections, ranking_sections, results_of
 from runner.sweep.state import read_sweep
 
+MAX_OUTPUT_LINES: Final = 1000
+"""Lines of output that a page shows."""
 _STEPS_BEFORE: Final = 1
 """Steps before the first one of a part, so that it includes the step that led there."""
 
@@ -96,6 +102,38 @@ def _typical_start(recording: Recording) -> int:
         return int(trial(recording, *typical_trial(recording)).states[0])
     except RecordingError:
         return int(recording.mdp.start.argmax())
+
+
+def system(path: Path) -> bytes:
+    """Return how a run went on its machine: facts, and charts over time, as HTML."""
+    with open_recording(path) as recording:
+        clock = read_clock(recording)
+        host = read_host(recording, clock)
+    shown = partials()
+    if clock is None:
+        return str(shown.paragraphs(["Its recording has no clock: an earlier version made it."])).encode()
+    facts = machine_facts(clock, host)
+    text = "Use of the machine was not recorded." if host is None else ""
+    html = shown.pairs("Time and machine", facts)
+    return str(html + shown.charts("machine", "Over time", text, machine_plots(clock, host))).encode()
+
+
+def console(path: Path, sought: str, stream: str) -> bytes:
+    """Return the output of a run as JSON: `total` lines, those `found`, and the last of them, `lines`.
+
+    Args:
+        path: the recording.
+        sought: text that lines must have, in any case.
+        stream: `stdout`, `stderr`, or empty for both.
+    """
+    with open_recording(path) as recording:
+        clock = read_clock(recording)
+        every = read_console(recording, clock)
+    found = [
+        line for line in every if sought.casefold() in line.text.casefold() and stream in ("", line.stream)
+    ]
+    lines = [(line.seconds, line.position, line.stream, line.text) for line in found[-MAX_OUTPUT_LINES:]]
+    return json.dumps({"lines": lines, "found": len(found), "total": len(every)}).encode()
 
 
 def difference(a: Run, b: Run) -> bytes:

@@ -116,6 +116,9 @@ def _head(details: RunDetails) -> dict[str, str]:
     if not (details.train_steps is None or details.episodes is None or details.eval_steps is None):
         steps = f"{details.train_steps:,} of training in {counted(details.episodes, 'episode')}, "
         steps += f"{details.eval_steps:,} of evaluation"
+    clock, time = details.clock, ""
+    if clock is not None and clock.steps_a_second is not None:
+        time = f"{duration(clock.duration)} recorded, {clock.steps_a_second:,.0f} steps a second"
     head = {
         "run": f"{run.run_id}  {run.title}",
         "status": f"{run.status}, begun {ago} ago{took}",
@@ -123,6 +126,7 @@ def _head(details: RunDetails) -> dict[str, str]:
         "error": summary.error or "",
         "branch": "" if origin is None else f"of run {origin.run} {origin}",
         "steps": steps,
+        "time": time,
         "digest": summary.content_digest or f"{UNKNOWN} (written when a run ends properly)",
         "file": f"{run.recording}  {size(details.bytes)}" if details.bytes else "no recording",
     }

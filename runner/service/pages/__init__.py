@@ -4,11 +4,23 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from runner.service.pages import compare, episodes, jobs, replay, rerun, run, runs, static, submit, sweeps
+from runner.service.pages import (
+    compare,
+    episodes,
+    jobs,
+    machine,
+    replay,
+    rerun,
+    run,
+    runs,
+    static,
+    submit,
+    sweeps,
+)
 from runner.service.pages.rendering import add_error_handlers, refused
 
 __all__ = ["add_error_handlers", "refused", "router"]
 
 router = APIRouter(include_in_schema=False)
-for _module in (runs, rerun, run, replay, episodes, compare, submit, jobs, sweeps, static):
+for _module in (runs, rerun, run, replay, episodes, compare, machine, submit, jobs, sweeps, static):
     router.include_router(_module.router)

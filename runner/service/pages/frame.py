@@ -19,6 +19,8 @@ TABS: Final = (
     ("evaluations", "Evaluations"),
     ("learned", "What was learned"),
     ("config", "Configuration"),
+    ("system", "System"),
+    ("console", "Console"),
     ("rerun", "Rerun"),
 )
 

@@ -34,6 +34,8 @@ PAGES = (
     "/runs/first/evaluations",
     "/runs/first/learned",
     "/runs/first/config",
+    "/runs/first/system",
+    "/runs/first/console",
     "/compare?run=first&run=second",
     "/compare/divergence?run=first&run=second",
     "/compare/replay?run=first&run=second",

@@ -6,15 +6,18 @@ import asyncio
 import contextlib
 import json
 import re
+import sys
 
 import pytest
 from submitted import ICY
 
+import runner
 from runner.environments.naming import deeds_in_words, states_in_words
 from runner.recording import reader
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 from tests.runner.export.outline import Outline
+from tests.runner.loops.making import make, play
 from tests.waiting import until
 
 ACCEPT_HTML = {"Accept": "text/html"}
@@ -130,6 +133,8 @@ PAGES = (
     "/runs/first/evaluations",
     "/runs/first/learned",
     "/runs/first/config",
+    "/runs/first/system",
+    "/runs/first/console",
     "/runs/first/rerun?at=3:2",
     "/runs/first/rerun?at=3",
     "/runs/first/rerun?at=eval:10",
@@ -208,6 +213,35 @@ def test_the_parts_of_an_episode_are_the_recorded_steps(client, recordings):
         (state,) = part["texts"]
         shown = [state["values"][i] for i in state["at"]][:-1]
         assert shown == words[steps["state"][first : first + 101]].tolist()
+
+
+def test_output_is_shown_escaped_and_searched(client, recordings, capsys):
+    with runner.record(make("CartPole-v1"), recordings, name="printing") as env:
+        for _ in play(env, 20):
+            pass
+        print("<script>alert(1)</script> \x1b[31mred\x1b[0m")
+        print("a warning", file=sys.stderr)
+        shown = page_of(client, "/runs/printing/console")
+        assert "data-live" in shown
+    shown = page_of(client, "/runs/printing/console")
+    assert "&lt;script&gt;alert(1)&lt;/script&gt; red" in shown
+    assert "a warning" in shown
+    assert "data-live" not in shown
+    assert "script&gt;" not in page_of(client, "/runs/printing/console?stream=stderr")
+    found = page_of(client, "/runs/printing/console?q=WARN")
+    assert "script&gt;" not in found
+    assert "1 line found, of 2" in found
+    assert "No line was found" in page_of(client, "/runs/printing/console?q=nothing")
+    assert client.get("/runs/printing/console/part?status=running").status_code == 204
+    assert client.get("/runs/printing/console?stream=else", headers=ACCEPT_HTML).status_code == 422
+
+
+def test_the_time_and_the_machine_are_shown(client, recordings):
+    page = page_of(client, "/runs/first/system")
+    assert "Steps a second, mean" in page
+    assert page.count("<figure") == 1, "it was too short for a sample of the machine"
+    assert client.get("/runs/first/system/part?status=running").status_code == 204
+    assert "<figure" in client.get("/runs/first/system/part?status=finished").text
 
 
 def test_labels_are_changed_by_a_form(client):

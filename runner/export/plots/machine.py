@@ -1,0 +1,108 @@
+"""Charts of how a training went on its machine: steps a second, processor, memory, GPUs, disk, network."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.export.plots.chart import Chart, Scale, labelled, series_colour
+from runner.export.plots.curves import HEIGHT, WIDTH, Plot, draw_legend
+from runner.recording.clock import SAMPLE_SECONDS, Clock
+from runner.recording.host import HostMetrics
+from runner.util import humanize
+
+Values = NDArray[np.float64]
+_INTERVALS: Final = 200
+"""The most intervals of the time in which steps are counted."""
+_GB, _MB = 1e9, 1e6
+
+
+class _Panel(NamedTuple):
+    title: str
+    unit: str
+    lines: dict[str, Values]
+    top: float = 0.0
+    """The least upper end of the axis."""
+
+
+def machine_facts(clock: Clock, host: HostMetrics | None) -> dict[str, str]:
+    """Return the facts of a run's time and of its machine, by name."""
+    sessions, rate = len(clock.earlier), clock.steps_a_second
+    facts = {
+        "Time": humanize.duration(clock.duration) + (f", in {sessions} sessions" if sessions > 1 else ""),
+        "Steps a second, mean": humanize.UNKNOWN if rate is None else f"{rate:,.0f}",
+    }
+    if host is not None:
+        of = host.values
+        largest = {
+            "Memory of the process, largest": of["memory_bytes"],
+            "Memory of the machine": of["host_memory_total"],
+            "GPU memory, largest": of["gpu_memory_bytes"],
+            "Disk, free at the end": of["disk_free_bytes"][-1:],
+        }
+        for name, values in largest.items():
+            if (known := values[np.isfinite(values)]).size:
+                facts[name] = humanize.size(float(known.max()))
+    return facts
+
+
+def machine_plots(clock: Clock, host: HostMetrics | None) -> list[Plot]:
+    """Return the charts of a run over its time; those of its machine only if that was recorded."""
+    edges = np.linspace(0, clock.duration, 1 + min(_INTERVALS, max(1, int(clock.duration / SAMPLE_SECONDS))))
+    done = np.interp(edges, clock.seconds, clock.positions)
+    plots = []
+    if clock.duration > 0:
+        rate = {"": np.diff(done) / np.diff(edges)}
+        plots.append(_plot(_Panel("Steps a second", "steps a second", rate), edges[1:], clock.duration))
+    panels = [] if host is None else _host_panels(host)
+    return plots + [_plot(panel, host.seconds, clock.duration) for panel in panels if host is not None]
+
+
+def _host_panels(host: HostMetrics) -> list[_Panel]:
+    of = host.values
+    panels = [
+        _Panel("Processor, this process", "percent of one core", {"": of["cpu_percent"]}),
+        _Panel("Processor, all of the machine", "percent", {"": of["host_cpu_percent"]}, 100.0),
+        _Panel(
+            "Memory",
+            "GB",
+            {"this process": of["memory_bytes"] / _GB, "all of the machine": of["host_memory_bytes"] / _GB},
+        ),
+    ]
+    gpus = [f"GPU {k}" for k in range(host.gpus)]
+    if gpus:
+        use, memory = of["gpu_percent"].T, of["gpu_memory_bytes"].T / _GB
+        panels += [
+            _Panel("GPU", "percent", dict(zip(gpus, use, strict=True)), 100.0),
+            _Panel("GPU memory", "GB", dict(zip(gpus, memory, strict=True))),
+        ]
+    for title, lines in (
+        ("Disk", {"read": "disk_read_bytes", "written": "disk_written_bytes"}),
+        ("Network", {"received": "network_received_bytes", "sent": "network_sent_bytes"}),
+    ):
+        rates = {name: host.rate(field) / _MB for name, field in lines.items()}
+        panels.append(_Panel(f"{title}, all of the machine", "MB a second", rates))
+    return [panel for panel in panels if any(np.isfinite(values).any() for values in panel.lines.values())]
+
+
+def _plot(panel: _Panel, seconds: Values, duration: float) -> Plot:
+    unit, divisor = next(
+        each
+        for each in (("hours", 3600.0), ("minutes", 60.0), ("seconds", 1.0))
+        if duration >= 2 * each[1] or each[1] == 1
+    )
+    usable = {name: np.where(np.isfinite(values), values, np.nan) for name, values in panel.lines.items()}
+    highest = max(float(np.nanmax(values, initial=0.0)) for values in usable.values())
+    y = Scale(0.0, max(panel.top, 1.06 * highest) or 1.0, HEIGHT - 34, 32.0)
+    chart = Chart(Scale(0.0, duration / divisor or 1.0, 50.0, WIDTH - 8), y, WIDTH, HEIGHT, panel.title)
+    chart.x_ticks(labelled(chart.x.ticks))
+    chart.y_ticks(labelled(y.ticks, short=highest >= 10_000))
+    chart.frame(panel.title, 25.0 if len(usable) == 1 else 14.0, unit, [panel.unit])
+    for number, values in enumerate(usable.values()):
+        known = ~np.isnan(values)
+        chart.line(seconds[known] / divisor, values[known], series_colour(number), number)
+    if len(usable) > 1:
+        draw_legend(chart, list(usable), [series_colour(i) for i in range(len(usable))])
+    return Plot(panel.title, chart.svg(), wide=False)
