@@ -135,7 +135,7 @@ def _fixed_steps(
         ended: list[tuple[int, NDArray[np.void]]] = []
         for environment, parts in open_parts.items():
             rows = block[(environment - int(block["step"][0])) % n :: n]
-            rows = rows[rows["t"] != schema.RESET_ONLY] if n > 1 else rows
+            rows = rows[rows["t"] != schema.RESET_ONLY]
             for part in np.split(rows, np.flatnonzero(np.diff(rows["episode"])) + 1):
                 ended += ((environment, steps) for steps in _extend(recording, parts, part))
         yield from sorted(ended, key=lambda found: int(found[1]["step"][-1]))

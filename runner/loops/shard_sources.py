@@ -150,7 +150,7 @@ class Source:
             return
         for block in self.recording.blocks(self._topic(phase, "step"), first, stop):
             rows = block[(first - int(block["step"][0])) % self.n :: self.n]
-            rows = rows[rows["t"] != schema.RESET_ONLY] if self.n > 1 else rows
+            rows = rows[rows["t"] != schema.RESET_ONLY]
             if len(rows):
                 yield rows, rows["step"].astype(np.int64)
 

@@ -233,7 +233,7 @@ def own_steps(
     if not len(rows):
         return rows, [(0, reset) for reset in own]
     at = [(reset.step - piece.first) // environments for reset in own]
-    if environments > 1 and not is_all:
+    if not is_all:
         taken = rows["t"] != schema.RESET_ONLY
         if not taken.all():
             before = np.concatenate([[0], np.cumsum(taken)])

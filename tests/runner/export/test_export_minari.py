@@ -102,24 +102,25 @@ def test_an_episode_that_was_reset_before_its_end_is_marked_truncated_and_report
     assert "The last training episode never ended" in output
 
 
+@pytest.mark.parametrize("n", [1, 3])
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.name)
-def test_parallel_environments_give_whole_episodes_each(mode, tmp_path, monkeypatch):
+def test_parallel_environments_give_whole_episodes_each(mode, n, tmp_path, monkeypatch):
     """Each equals the episode of a single environment with the same seed and actions."""
-    envs = SyncVectorEnv([lambda: gymnasium.make("CartPole-v1")] * 3, autoreset_mode=mode)
+    envs = SyncVectorEnv([lambda: gymnasium.make("CartPole-v1")] * n, autoreset_mode=mode)
     with runner.record_vector(envs, tmp_path, name="loop", chunk_steps=256) as rec:
         rec.reset(seed=7)
-        over = np.zeros(3, np.bool_)
+        over = np.zeros(n, np.bool_)
         for _ in range(400):
             if mode == AutoresetMode.DISABLED and over.any():
                 rec.reset(options={"reset_mask": over})
-            _, _, terminated, truncated, _ = rec.step(np.ones(3, np.int64))
+            _, _, terminated, truncated, _ = rec.step(np.ones(n, np.int64))
             over = terminated | truncated
     dataset, _ = exported(rec.run, tmp_path, monkeypatch)
     assert dataset.recover_environment().spec.id == "CartPole-v1"
     found = list(dataset.iterate_episodes())
     assert len(found) == rec.run.summary["messages"]["/train/episode"]
     alone = gymnasium.make("CartPole-v1")
-    for k in range(3):
+    for k in range(n):
         mine = [alone.reset(seed=7 + k)[0]]
         over = False
         while not over:

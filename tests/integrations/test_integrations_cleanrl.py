@@ -1,0 +1,99 @@
+"""CleanRL's own scripts, recorded by a change of one import."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import runner
+from runner.execution.redo import verify_by_redoing
+from runner.recording.schema import SCALAR_TOPIC
+
+SCRIPTS = Path(__file__).parent / "cleanrl"
+WRITER = ("from torch.utils.tensorboard import", "from runner.integrations.tensorboard import")
+WANDB = ("import wandb\n", "from runner.integrations import wandb\n")
+BUFFER = ("from cleanrl_utils.buffers import", "from stable_baselines3.common.buffers import")
+"""CleanRL's copy of the replay buffer; it is not part of the change."""
+
+
+def execute(name, changes, *arguments):
+    """Run a script in the current folder, with some of its lines changed; return what it printed."""
+    source = (SCRIPTS / f"{name}.py").read_text()
+    for before, after in changes:
+        assert source.count(before) == 1
+        source = source.replace(before, after)
+    Path(f"{name}.py").write_text(source)
+    paths = [str(SCRIPTS), str(Path(runner.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+    done = subprocess.run(
+        [sys.executable, f"{name}.py", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def recorded(name, changes, *arguments):
+    """Run a script; return the run that it recorded."""
+    execute(name, changes, *arguments)
+    (run,) = runner.list_runs()
+    return run
+
+
+def series(run, name):
+    """Return (steps, the script's own steps) of the values that were logged under a name."""
+    steps, own, last = [], [], None
+    with runner.open_recording(run.recording) as recording:
+        for scalar in recording.decoded(SCALAR_TOPIC):
+            if scalar["name"] == "global_step":
+                last = scalar["value"]
+            elif scalar["name"] == name:
+                steps.append(scalar["step"])
+                own.append(last)
+    return steps, own
+
+
+@pytest.mark.parametrize(
+    ("changes", "track"),
+    [([WRITER], "False"), ([WANDB], "True"), ([WRITER, WANDB], "True")],
+    ids=["writer", "wandb", "both"],
+)
+def test_ppo_is_recorded_whole(changes, track, recordings):
+    run = recorded("ppo", changes, "--total-timesteps", "1024", "--track", track)
+    assert run.status == "finished"
+    assert run.name.startswith("CartPole-v1__ppo__1__")
+    assert run.seed == 1
+    settings = run.facts["config"]["config"]
+    assert (settings["learning_rate"], settings["num_envs"], settings["target_kl"]) == (2.5e-4, 4, None)
+    assert run.summary["train_steps"] == 1024
+    assert series(run, "losses/value_loss") == ([512, 1024], [512.0, 1024.0])
+    verdict = verify_by_redoing(run.recording)
+    assert (verdict.verdict, verdict.reason) == ("reproduced", "")
+
+
+def test_recording_does_not_change_what_ppo_learns(recordings):
+    last = "    envs.close()\n"
+    report = (last, f"    print(v_loss.item(), agent.critic[0].weight.sum().item())\n{last}")
+    plain = execute("ppo", [report], "--total-timesteps", "1024")
+    assert runner.list_runs() == []
+    assert (
+        execute("ppo", [report, WRITER], "--total-timesteps", "1024").splitlines()[-1]
+        == plain.splitlines()[-1]
+    )
+    assert len(runner.list_runs()) == 1
+
+
+def test_dqn_is_recorded_whole(recordings):
+    arguments = ["--total-timesteps", "1000", "--learning-starts", "400"]
+    run = recorded("dqn", [WRITER, BUFFER], *arguments)
+    assert run.summary["train_steps"] == 1000
+    steps, own = series(run, "losses/td_loss")
+    assert own == [500.0, 600.0, 700.0, 800.0, 900.0]
+    assert steps == [step + 1 for step in own]
+    assert verify_by_redoing(run.recording).verdict == "reproduced"
