@@ -16,6 +16,7 @@ from runner.replay.differences import Difference, differing_value, first_differi
 from runner.replay.recorded import RecordedReset
 from runner.replay.redone import RedoneStart, RedoneSteps, Values
 from runner.replay.stepping import Results
+from runner.replay.steps import ended_episode
 
 
 class Part(NamedTuple):
@@ -197,7 +198,7 @@ class Comparison:
     ) -> Difference:
         number: int | None = episode
         if self._recording.environments > 1:
-            number = _ended_episode(self._recording, phase, environment, step)
+            number = ended_episode(self._recording, phase, environment, step)
         return Difference(phase, number, t, step, environment, field, recorded, got)
 
 
@@ -209,12 +210,3 @@ def _recorded_values(rows: NDArray[np.void], results: Results) -> Values:
         return Values(got.observations, got.rewards, rows["terminated"], rows["truncated"])
     observations = rows["next_state" if "next_state" in names else "next_observation"]
     return Values(observations, rows["rewards"], rows["terminated"], rows["truncated"])
-
-
-def _ended_episode(recording: Recording, phase: str, environment: int, step: int) -> int | None:
-    """Return the number of the episode that a step of an environment belongs to; None if it never ended."""
-    for block in recording.blocks(recording.topic(f"/{phase}/episode")):
-        own = (block["last_step"] >= step) & (block["last_step"] % recording.environments == environment)
-        if own.any():
-            return int(block["episode"][np.argmax(own)])
-    return None

@@ -8,7 +8,7 @@ print(difference.divergence, difference.cause)
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, TypedDict
 
@@ -242,8 +242,21 @@ def as_json(difference: RunDiff) -> dict[str, Any]:
 
 
 def can_compare_steps(a: Recording, b: Recording) -> bool:
-    """Return whether two jobs have recorded steps of the same number of states and actions."""
-    return _same_sizes(a, b) and all(recording.count(schema.TRAIN_STEP) for recording in (a, b))
+    """Return whether two runs have recorded training steps of the same states and actions, or spaces."""
+    are_alike = _same_sizes(a, b) if a.has_tables and b.has_tables else have_same_spaces(a, b)
+    return are_alike and all(recording.count(recording.topic("/train/step")) for recording in (a, b))
+
+
+def divergences(a: Recording, b: Recording) -> Iterator[Divergence]:
+    """Yield the first steps of training and of evaluation at which two runs diverge, if they do.
+
+    Of training there is also one where a run has no more steps; it has no step of that run then.
+    """
+    if a.has_tables and b.has_tables:
+        found = [training_divergence(a, b), next(evaluation_divergences(a, b), None)]
+    else:
+        found = [loop_divergence(a, b, phase) for phase in schema.PHASES]
+    yield from filter(None, found)
 
 
 def _same_sizes(a: Recording, b: Recording) -> bool:

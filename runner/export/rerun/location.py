@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from runner.analysis.diff import can_compare_steps
-from runner.analysis.diff.divergence import evaluation_divergences, training_divergence
+from runner.analysis.diff import can_compare_steps, divergences
 from runner.analysis.diff.sections import where_in_words
 from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.analysis.step_reference import StepRef
@@ -17,6 +16,7 @@ from runner.export.contents import require_steps
 from runner.export.rerun.selection import Request, episodes_of, evaluations_with_steps, select
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
+from runner.replay.steps import ended_episode
 from runner.runs.run import Run
 
 
@@ -55,12 +55,13 @@ def locate(run: Run, request: Request, step: StepRef | None) -> Location:
                 )
         else:
             evaluations = evaluations_of(recording)
-            if recording.is_job:
+            if recording.has_reports:
                 evaluations = evaluations_with_steps(recording, episodes_of(recording, "train"), episodes)
             where = str(recording.path)
             number = evaluation_after(evaluations, step.after, where).trial(step.episode, where)
-            # The steps of a loop's evaluations are always exported.
-            more = Request(evaluations=(step.after,)) if recording.is_job else Request(trials=(number,))
+            # Where no evaluations are reported, the steps of all of them are exported.
+            is_chosen = recording.has_reports
+            more = Request(evaluations=(step.after,)) if is_chosen else Request(trials=(number,))
         if recording.environments > 1:
             steps = recording.episode_span(phase, number)
         else:
@@ -89,20 +90,21 @@ def locate_divergence(runs: Sequence[Run]) -> tuple[StepRef | None, str]:
     diverge, or if they cannot be compared.
     """
     with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
-        if not (a.is_job and b.is_job):
-            return None, "`dualtaxi diff` shows where two loops diverge."
         if not can_compare_steps(a, b):
             return (
                 None,
                 "Where they diverge is unknown: states or actions differ, or steps were not recorded.",
             )
-        divergence = training_divergence(a, b)
-        if divergence is None or None in (divergence.a_step, divergence.b_step):
-            suffix = ", as far as the shorter goes" if divergence is not None else ""
-            divergence = next(evaluation_divergences(a, b), None)
-            if divergence is None:
-                return None, f"They never diverge: every step is the same{suffix}."
-    return divergence.reference, f"They diverge {where_in_words(divergence)}."
+        found = list(divergences(a, b))
+        both = [each for each in found if None not in (each.a_step, each.b_step)]
+        if not both:
+            suffix = ", as far as the shorter goes" if found else ""
+            return None, f"They never diverge: every step is the same{suffix}."
+        words = f"They diverge {where_in_words(both[0])}."
+        if a.environments == 1:
+            return both[0].reference, words
+        number = ended_episode(a, both[0].phase, both[0].step % a.environments, both[0].step)
+    return None if number is None or both[0].after is not None else StepRef(number, both[0].t), words
 
 
 def _default_time(recording: Recording, request: Request) -> int:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import socket
 import sys
 
+import gymnasium
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import runner
 from runner.analysis.diff import diff
 from runner.analysis.step_reference import StepRef
 from runner.cli import cli
@@ -195,6 +197,34 @@ class TestTwoRuns:
             step, message = locate_divergence([run, other])
             assert step is None
             assert "is unknown" in message
+
+    def test_loops_diverge_at_the_first_step_that_differs(self, tmp_path):
+        runs = []
+        for last in (0, 1):
+            with runner.record(gymnasium.make("CartPole-v1"), tmp_path) as env:
+                for episode in range(3):
+                    env.reset(seed=episode)
+                    for action in (0, 1, last if episode == 2 else 0):
+                        env.step(action)
+            runs.append(env.run)
+        step, message = locate_divergence(runs)
+        assert step == StepRef(2, 2)
+        assert "training episode 2, at t = 2" in message
+        assert locate(runs[0], Request(), step).time == 9
+        assert locate_divergence([runs[0], runs[0]])[0] is None
+
+    def test_vectors_diverge_in_an_episode_that_ended(self, tmp_path):
+        runs = []
+        for last in (0, 1):
+            envs = gymnasium.make_vec("CartPole-v1", 2, vectorization_mode="sync")
+            with runner.record_vector(envs, tmp_path) as env:
+                env.reset(seed=3)
+                for t in range(60):
+                    env.step(np.array([0, last if t == 4 else 1]))
+            runs.append(env.run)
+        step, _ = locate_divergence(runs)
+        assert step is not None
+        assert locate(runs[0], Request(), step).time == 10
 
     def test_a_longer_run_is_the_same_as_far_as_the_shorter_goes(self, pictured):
         shorter = pictured("rivals", evaluation=None, episodes=20)
