@@ -28,6 +28,7 @@ from runner.errors import RecordingError
 from runner.recording.extras import filled
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
+from runner.replay.steps import steps_of
 from runner.runs.run import Run
 from runner.util.extras import require
 from runner.util.values import flatten
@@ -188,7 +189,7 @@ def step_columns(
         blocks = [block.copy() for block in recording.blocks(topic, start, stop)]
         records = np.concatenate(blocks) if blocks else np.empty(0, recording.dtypes[topic])
     else:
-        records = recording.episode_steps(phase, episode)
+        records = steps_of(recording, phase, episode)
     names = records.dtype.names or ()
     columns = _spread(_plain_columns(records, [name for name in _BEFORE if name in names]))
     columns |= _by_name(records["rewards"], [f"reward.{agent}" for agent in recording.agents])

@@ -38,17 +38,18 @@ def shortcomings(recording: Recording) -> list[str]:
     return sentences + [f"Some messages of {topic} were lost in a repair." for topic in recording.lost]
 
 
-def require_steps(recording: Recording, purpose: str) -> None:
+def require_steps(recording: Recording, purpose: str, may_redo: bool = False) -> None:
     """Refuse a recording without steps.
 
     Args:
         recording: the recording.
         purpose: what the steps are needed for, such as `play`.
+        may_redo: whether recorded actions are enough, as their steps are done again.
 
     Raises:
         RecordingError: it has none.
     """
-    if not recording.has_steps:
+    if not (recording.has_steps or (may_redo and recording.has_actions)):
         raise RecordingError(f"{recording.path}: found no steps to {purpose}: {why_no_steps(recording)}.")
 
 

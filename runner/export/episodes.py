@@ -59,7 +59,7 @@ def chosen_episode(recording: Recording, episode: int | None, trial: tuple[int, 
     Raises:
         RecordingError: there is no such evaluation or trial, or no steps.
     """
-    require_steps(recording, "show")
+    require_steps(recording, "show", may_redo=True)
     if episode is not None:
         return place_of(recording, (episode,))
     return place_of(recording, trial or default_trial(recording) or (last_episode(recording),))
@@ -73,10 +73,10 @@ def ranked_episodes(recording: Recording) -> tuple[str, NDArray[np.int64]]:
     Raises:
         RecordingError: no episode ended, or there are no steps.
     """
-    require_steps(recording, "show")
+    require_steps(recording, "show", may_redo=True)
     phase = "eval" if recording.count(schema.EVAL_EPISODE) else "train"
     records = recording.episodes(phase)
-    records = records[records["last_step"] < recording.count(recording.topic(f"/{phase}/step"))]
+    records = records[records["last_step"] < recording.step_count(phase)]
     if not len(records):
         raise RecordingError(f"{recording.path}: found no episode that ended; --episode 0 shows the first.")
     return phase, _by_rank(records)
@@ -121,7 +121,7 @@ def typical_trial(recording: Recording) -> tuple[int, int]:
     Raises:
         RecordingError: there is no evaluation, or no steps.
     """
-    require_steps(recording, "show")
+    require_steps(recording, "show", may_redo=True)
     after = last_whole_evaluation(recording)
     if after is None:
         raise RecordingError(f"{recording.path}: has no whole evaluation; choose a training episode.")
@@ -151,7 +151,7 @@ def last_whole_evaluation(recording: Recording) -> int | None:
     A recording that was cut off may have an evaluation's metrics without its trials. The evaluations of a
     loop are the trials that were recorded.
     """
-    episodes, steps = recording.count(schema.EVAL_EPISODE), recording.count(schema.EVAL_STEP)
+    episodes, steps = recording.count(schema.EVAL_EPISODE), recording.step_count("eval")
     for one in reversed(evaluations_of(recording)):
         if (
             one.stop <= episodes

@@ -87,7 +87,7 @@ class Pictures:
 
     def __init__(self, recording: Recording, phase: str, episode: int, trust: bool) -> None:
         require_packages()
-        require_steps(recording, "show")
+        require_steps(recording, "show", may_redo=True)
         self._recording, self._phase, self._episode = recording, phase, episode
         self.learners = recording.agents
         self.steps = len(recording.episode_span(phase, episode))

@@ -85,16 +85,13 @@ class Recording(TopicReader):
 
     def done(self) -> dict[str, int]:
         """Return the number of training episodes and steps of each phase: as written, else counted."""
-        topics = {
-            "episodes": schema.TRAIN_EPISODE,
-            "train_steps": schema.TRAIN_STEP,
-            "eval_steps": schema.EVAL_STEP,
+        counts = {
+            "episodes": partial(self.count, schema.TRAIN_EPISODE),
+            "train_steps": partial(self.step_count, "train"),
+            "eval_steps": partial(self.step_count, "eval"),
         }
-        recorded = {key: getattr(self.result, key) for key in topics}
-        return {
-            key: self.count(topic) if recorded[key] is None else recorded[key]
-            for key, topic in topics.items()
-        }
+        recorded = {key: getattr(self.result, key) for key in counts}
+        return {key: count() if recorded[key] is None else recorded[key] for key, count in counts.items()}
 
     @property
     def has_steps(self) -> bool:
@@ -108,11 +105,16 @@ class Recording(TopicReader):
 
     def has_actions_of(self, phase: str) -> bool:
         """Return whether any action of a phase was recorded."""
-        return self.has_messages(f"/{phase}/step") or self.has_messages(f"/{phase}/actions")
+        return self.has_messages(f"/{phase}/step") or self.has_actions_alone(phase)
+
+    def has_actions_alone(self, phase: str) -> bool:
+        """Return whether actions of a phase were recorded without their steps."""
+        name = f"/{phase}/actions"
+        return name in self._topics_by_name and self.has_messages(name)
 
     def step_count(self, phase: str) -> int:
         """Return how many steps of a phase were recorded, whole or their actions alone."""
-        if self.is_job or not self.has_messages(f"/{phase}/actions"):
+        if not self.has_actions_alone(phase):
             return self.count(self.topic(f"/{phase}/step"))
         topic = self.topic(f"/{phase}/actions")
         last = len(self._chunks(topic)) - 1
@@ -163,7 +165,7 @@ class Recording(TopicReader):
                 (int(block["step"][-1]) for block in self.blocks(resets, count - 1, count)), default=-1
             )
             steps: Iterator[Any] = self.blocks(topic, max(last, 0))
-            if self.has_messages(f"/{phase}/actions"):
+            if self.has_actions_alone(phase):
                 steps = (block[block["step"] >= last] for block in self.actions(phase))
         else:
             last = max((int(each["step"]) for each in self.decoded(resets)), default=-1)

@@ -157,7 +157,7 @@ def _time_of(recording: Recording, phase: str, number: int, step: int) -> int:
 def _step_time(recording: Recording, phase: str, step: int) -> int:
     """Return the `log_time` of a step of a phase."""
     topic = recording.topic(f"/{phase}/step")
-    if recording.has_messages(f"/{phase}/actions"):
+    if recording.has_actions_alone(phase):
         found = (block[block["step"] == step] for block in recording.actions(phase))
         times = (int(block["log_time"][0]) for block in found if len(block))
     elif topic in recording.dtypes:

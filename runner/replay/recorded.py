@@ -270,7 +270,7 @@ def _blocks(
     """Yield the steps of a phase in blocks, each without steps of the other phase in between."""
     topic = recording.topic(f"/{phase}/step")
     stop = _FOREVER if stop_time is None else stop_time + 1
-    if recording.has_messages(f"/{phase}/actions"):
+    if recording.has_actions_alone(phase):
         found = _action_blocks(recording, phase, start_time, stop)
     elif topic in recording.dtypes:
         found = recording.blocks_between(topic, start_time + 1, stop)
@@ -326,7 +326,7 @@ def _variable_blocks(recording: Recording, topic: schema.Topic, times: range) ->
 def _row_dtype(recording: Recording, phase: str) -> np.dtype[np.void]:
     """Return the dtype of the steps in pieces."""
     topic = recording.topic(f"/{phase}/step")
-    if recording.has_messages(f"/{phase}/actions"):
+    if recording.has_actions_alone(phase):
         return kept_dtype(recording.dtypes[topic])
     if topic in recording.dtypes:
         return recording.dtypes[topic]

@@ -14,6 +14,7 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.messages import frame_place
 from runner.recording.reader import Recording
+from runner.replay.whole_steps import whole_steps
 
 _END_OF_TIME: Final = 2**62
 """Later than any message, in nanoseconds."""
@@ -59,6 +60,9 @@ def episode_blocks(recording: Recording, phase: str, episode: int) -> Iterator[N
         RecordingError: the recording has no such episode, or steps of it were lost.
     """
     topic, numbers = recording.topic(f"/{phase}/step"), recording.episode_span(phase, episode)
+    if recording.has_actions_alone(phase):
+        yield whole_steps(recording, phase, episode)
+        return
     found = 0
     for block in recording.blocks(topic, numbers.start, numbers.stop):
         steps = block[(numbers.start - int(block["step"][0])) % numbers.step :: numbers.step]
@@ -69,6 +73,18 @@ def episode_blocks(recording: Recording, phase: str, episode: int) -> Iterator[N
             f"{recording.path}: {len(numbers) - found:,} of the {len(numbers):,} steps of "
             f"{schema.PHASE_NAMES[phase]} episode {episode} were lost."
         )
+
+
+def steps_of(recording: Recording, phase: str, episode: int) -> NDArray[np.void]:
+    """Return an episode's steps as one array, where they have one size.
+
+    Raises:
+        RecordingError: the recording has no such episode, or its steps are too large for an array.
+        CannotRedo: only its actions were recorded, and its environment cannot be had.
+    """
+    if recording.has_actions_alone(phase):
+        return whole_steps(recording, phase, episode)
+    return recording.episode_steps(phase, episode)
 
 
 def reset_of(recording: Recording, phase: str, episode: int) -> Any | None:

@@ -105,7 +105,7 @@ def command(
     from runner.export.pictures import Source, pictures, source_of
     from runner.export.places import require_new, write_new
 
-    with opened_run(run_name, recordings, needs_steps=True) as (run, recording):
+    with opened_run(run_name, recordings) as (run, recording):
         path = output or EXPORTS / f"{run.file_stem}.mp4"
         format_of(path)
         require_new(path, force)

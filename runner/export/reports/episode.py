@@ -18,7 +18,7 @@ from runner.export.contents import ENDINGS, ending_of, require_steps
 from runner.export.episodes import EpisodePlace, place_of
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.replay.steps import check_steps
+from runner.replay.steps import check_steps, steps_of
 from runner.replay.tables import TableReplay, tables_at
 
 MAX_STEPS: Final = 1000
@@ -82,9 +82,9 @@ def episode_at(recording: Recording, place: EpisodePlace, limit: int = MAX_STEPS
     Raises:
         RecordingError: there is no such episode or step, or no steps.
     """
-    require_steps(recording, "show")
+    require_steps(recording, "show", may_redo=True)
     phase, number, title = place.phase, place.number, place.title
-    steps = recording.episode_steps(phase, number)
+    steps = steps_of(recording, phase, number)
     shown = steps[first : first + limit]
     if not len(shown):
         raise RecordingError(

@@ -33,6 +33,7 @@ from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import leaves_of
 from runner.replay.steps import reset_of
+from runner.replay.whole_steps import whole_steps
 
 MAX_SERIES: Final = 32
 _LEAST_SERIES: Final = 20
@@ -94,7 +95,7 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
         )
     observed, notes = _shown_parts(recording, "observation", MAX_SERIES)
     reader = _Reader(recording, place.phase, observed)
-    before, steps = reader.part(span, first, limit)
+    before, steps = reader.part(place.number, span, first, limit)
     time = frame_times(steps.log_time // schema.STEP_NANOSECONDS)
     ended = ending_of(recording, place.phase, place.number)
     total = None
@@ -133,11 +134,11 @@ class _Reader:
     ) -> None:
         self._recording, self._phase, self._observed = recording, phase, observed
 
-    def part(self, span: range, first: int, limit: int) -> tuple[NDArray[np.float64], _Steps]:
+    def part(self, episode: int, span: range, first: int, limit: int) -> tuple[NDArray[np.float64], _Steps]:
         """Return the sum of each agent's rewards before a part of an episode, and the steps of the part."""
         part = span[first : first + limit]
         before, found = np.zeros(len(self._recording.agents)), []
-        for records in self._records(range(span.start, part[-1] + 1, span.step)):
+        for records in self._records(episode, range(span.start, part[-1] + 1, span.step)):
             numbers = np.array([record["step"] for record in records])
             rewards = np.array([record["rewards"] for record in records], np.float64)
             earlier = int(np.searchsorted(numbers, part.start))
@@ -152,7 +153,7 @@ class _Reader:
         """Return the observation before a step of an episode, as columns of one value; empty if unknown."""
         if first:
             number = span[first - 1]
-            records = next(self._records(range(number, number + 1, span.step)), None)
+            records = next(self._records(place.number, range(number, number + 1, span.step)), None)
             return [] if records is None or not len(records) else self._observations(records)
         reset = reset_of(self._recording, place.phase, place.number)
         if reset is None:
@@ -161,9 +162,13 @@ class _Reader:
         values = [value] if self._recording.kind == "variable" else np.array([value])
         return [part.column(values) for part in self._observed]
 
-    def _records(self, numbers: range) -> Iterator[Any]:
-        """Yield the steps of these numbers, some at a time."""
+    def _records(self, episode: int, numbers: range) -> Iterator[Any]:
+        """Yield the steps of an episode with these numbers, some at a time."""
         recording, phase = self._recording, self._phase
+        if recording.has_actions_alone(phase):
+            steps = whole_steps(recording, phase, episode)
+            yield steps[(steps["step"] >= numbers.start) & (steps["step"] < numbers.stop)]
+            return
         if recording.kind != "variable":
             for block in recording.blocks(recording.topic(f"/{phase}/step"), numbers.start, numbers.stop):
                 yield block[(numbers.start - int(block["step"][0])) % numbers.step :: numbers.step]

@@ -53,7 +53,7 @@ def playback_of(
     Raises:
         RecordingError: there is no such episode or step, or no steps were recorded.
     """
-    require_steps(recording, "show")
+    require_steps(recording, "show", may_redo=True)
     place = place_of(recording, which)
     with np.errstate(over="ignore", invalid="ignore"):  # rewards may be infinite
         if recording.tabular:

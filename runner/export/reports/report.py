@@ -198,7 +198,7 @@ def _run(
 def _notes(recording: Recording) -> list[str]:
     """Return what is missing from the recording, a sentence each."""
     notes = shortcomings(recording)
-    if not recording.has_steps:
+    if not recording.has_actions:
         notes.append(
             f"No episode of run {recording.run_id} can be replayed, as there are no steps: "
             f"{why_no_steps(recording)}."
@@ -209,9 +209,8 @@ def _notes(recording: Recording) -> list[str]:
 def _facts(recording: Recording) -> dict[str, str]:
     """Return what identifies a run, and how much of it was recorded."""
     config = recording.config
-    episodes, steps, trial_steps = map(
-        recording.count, (schema.TRAIN_EPISODE, schema.TRAIN_STEP, schema.EVAL_STEP)
-    )
+    episodes = recording.count(schema.TRAIN_EPISODE)
+    steps, trial_steps = map(recording.step_count, ("train", "eval"))
     if recording.can_train_again:
         facts = {
             "Environment": config["env"]["id"],
@@ -242,7 +241,7 @@ def _episodes(recording: Recording, chosen: Sequence[Choice]) -> dict[tuple[int,
     They are the chosen ones; the typical, the best and the worst one of the last evaluation, or else of the
     last tenth of training; and of a tabular environment the first and the last one of training.
     """
-    if not recording.has_steps:
+    if not recording.has_actions:
         return {}
     episodes: dict[tuple[int, ...], list[str]] = {}
     for phase, number, trial in chosen:

@@ -10,15 +10,21 @@ import textwrap
 import gymnasium
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from gymnasium.vector import SyncVectorEnv
 from making import Rooms
+from starlette.testclient import TestClient
 
 import runner
+from runner.cli import cli
 from runner.errors import CannotRedo, ConfigError, Diverged, RunnerError
 from runner.execution.redo import verify_by_redoing
 from runner.execution.rerecord import rerecord
 from runner.execution.verify import verify
+from runner.export.reports.report import render_report
 from runner.recording.reader import open_recording
+from runner.service.app import create_app
+from runner.service.settings import Settings
 from tests.waiting import until
 
 
@@ -126,6 +132,27 @@ def test_one_episode_comes_again_alone(tmp_path):
         (steps,) = runner.replay.environment.redo(recording, "train", [9])
         assert steps.difference is None
         assert len(steps.recorded.rewards) == recording.episodes("train", 9, 10)["length"][0]
+
+
+def test_replays_make_its_steps_again(tmp_path):
+    for steps in ("all", "actions"):
+        single("Taxi-v4", steps=500)(tmp_path, name=steps, steps=steps)
+
+    def said(*words):
+        done = CliRunner().invoke(cli, [*words, "--recordings", str(tmp_path)])
+        assert done.exit_code == 0, done.output
+        return done.stdout
+
+    shown = [said("play", name, "--episode", "2", "--json") for name in ("all", "actions")]
+    assert shown[0] == shown[1]
+    said("export", "film", "actions", "--best", "-o", str(tmp_path / "x.gif"))
+    text, _ = render_report([runner.list_runs(tmp_path)[0].recording])
+    assert "No episode of run" not in text
+    settings = Settings(recordings=(tmp_path,), tokens=tmp_path / "tokens.json")
+    with TestClient(create_app(settings), base_url="http://localhost") as client:
+        addresses = [f"/api/v1/runs/{name}/replay/train/2" for name in ("all", "actions")]
+        first, again = (client.get(address).json()["episode"] for address in addresses)
+    assert first == again
 
 
 class Other(gymnasium.Wrapper):

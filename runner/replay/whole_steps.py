@@ -1,0 +1,76 @@
+"""Whole steps of an episode of which only the actions were recorded: done again, and proved by digests."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import CannotRedo, RecordingError
+from runner.recording.blocks import blank_records
+from runner.recording.metadata import sizes_of
+from runner.recording.reader import MAX_EPISODE_BYTES, Recording, open_recording
+from runner.replay.environment import redo, redo_in_child
+from runner.replay.redone import RedoneSteps
+
+
+def whole_steps(recording: Recording, phase: str, episode: int) -> NDArray[np.void]:
+    """Return the steps of an episode as `Recording.episode_steps` does, from its recorded actions.
+
+    The environment is made again in a child process with limits, from what is installed. The last episodes
+    are kept for the next call.
+
+    Raises:
+        RecordingError: there is no such episode, or it is too large for an array.
+        CannotRedo: the environment cannot be made, or is another one.
+    """
+    span, topic = recording.episode_span(phase, episode), recording.topic(f"/{phase}/step")
+    if len(span) * recording.dtypes[topic].itemsize > MAX_EPISODE_BYTES:
+        raise RecordingError(
+            f"{recording.path}: {phase} episode {episode} has {len(span):,} steps, too many to do again for "
+            f"an array; `dualtaxi rerecord {recording.run_id}` records them."
+        )
+    return _whole_steps(recording.path, recording.size, phase, episode)
+
+
+def _done_again(path: Path, phase: str, episode: int) -> Iterator[RedoneSteps]:
+    """Yield the steps of an episode, done again in a process with limits: this one, if it has them."""
+    if not multiprocessing.current_process().daemon:
+        yield from redo_in_child(path, phase, [episode])
+        return
+    with open_recording(path) as recording:
+        yield from redo(recording, phase, [episode])
+
+
+@lru_cache(4)
+def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> NDArray[np.void]:
+    with open_recording(path) as recording:
+        span, topic = recording.episode_span(phase, episode), recording.topic(f"/{phase}/step")
+        records = blank_records(topic, sizes_of(recording.run, str(path))[topic], len(span))
+        for block in recording.actions(phase):
+            own = block[(block["step"] >= span.start) & (block["step"] < span.stop)]
+            own = own[(own["step"] - span.start) % span.step == 0]
+            if len(own):
+                at = (own["step"] - span.start) // span.step
+                for name in own.dtype.names or ():
+                    if name != "digest":
+                        records[name][at] = own[name]
+        is_state, start = recording.kind == "step", 0
+        if is_state:
+            start = int(recording.spaces["observation"]["start"])
+    after = "next_state" if is_state else "next_observation"
+    for steps in _done_again(path, phase, episode):
+        if steps.difference is not None:
+            raise CannotRedo(f"The environment is not the recorded one: {steps.difference}.")
+        at = (steps.step - span.start) // span.step
+        records[after][at], records["rewards"][at] = steps.got.observations, steps.got.rewards
+        for first in steps.starts if is_state else ():
+            records["state"][0] = int(np.asarray(first.got).reshape(())) - start
+    if is_state:
+        records["state"][1:] = records["next_state"][:-1]
+    records.setflags(write=False)
+    return records
