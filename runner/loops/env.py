@@ -137,7 +137,8 @@ def record(
             has the status failed and says so. A value of `log` and the like that cannot be recorded is left
             out. Mistakes in these arguments are always raised.
         packing: `compression`, `level`, `index`, `chunk_steps` and `code`, as in the section `recording` of a
-            file; `code=False` records neither the script nor the state of its git repository.
+            file; `code=False` records neither the script nor the state of its git repository. `steps` is
+            what is recorded of a step: `all`, `actions`, from which the rest comes again, or `none`.
 
     Raises:
         EnvironmentNotUsable: a space cannot be recorded.
