@@ -62,7 +62,9 @@ def groups_of(series: Sequence[RunSeries]) -> list[Group]:
     return _labelled(runs_of, [runs[0].name for runs in runs_of])
 
 
-def grouped(series: Sequence[RunSeries], by: str | None = None) -> tuple[list[Group], list[str]]:
+def grouped(
+    series: Sequence[RunSeries], by: str | None = None, across_tasks: bool = False
+) -> tuple[list[Group], list[str]]:
     """Return runs in groups for a comparison, and notes on them, a sentence each.
 
     A group has the runs whose configurations differ in nothing but the seed, whatever their names and however
@@ -73,12 +75,14 @@ def grouped(series: Sequence[RunSeries], by: str | None = None) -> tuple[list[Gr
     Args:
         series: the runs.
         by: path of a configuration's value, such as `quirks.epsilon_exploits`.
+        across_tasks: whether runs in different environments are one group, if nothing else differs.
 
     Raises:
         RunnerError: no run has a value of that path.
     """
     found: dict[str, list[RunSeries]] = {}
-    key = _content if by is None else _value_at(by, series)
+    content = _content_without_task if across_tasks else _content
+    key = content if by is None else _value_at(by, series)
     for run in series:
         found.setdefault(key(run), []).append(run)
     if by is None:
@@ -88,7 +92,7 @@ def grouped(series: Sequence[RunSeries], by: str | None = None) -> tuple[list[Gr
         groups = [_group(f"{by} = {value}", runs) for value, runs in found.items()]
     notes = duplicates(groups)
     for group in groups:
-        if (count := len({_content(run) for run in group.runs})) > 1:
+        if (count := len({content(run) for run in group.runs})) > 1:
             notes.append(f"{group.label} has runs of {count} configurations")
     return groups, notes
 
@@ -171,6 +175,21 @@ def flat_config(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def _content(run: RunSeries) -> str:
     return json.dumps({k: v for k, v in run.config.items() if k not in _NOT_CONTENT}, sort_keys=True)
+
+
+def _content_without_task(run: RunSeries) -> str:
+    """Return the configuration without the environment, and without values that repeat its id."""
+    names = {run.environment, run.config.get("env", {}).get("id", run.environment)}
+
+    def stripped(value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            return value
+        return {
+            key: stripped(own) for key, own in value.items() if not (isinstance(own, str) and own in names)
+        }
+
+    config = {k: stripped(v) for k, v in run.config.items() if k not in (*_NOT_CONTENT, "env")}
+    return json.dumps(config, sort_keys=True)
 
 
 def _group(label: str, runs: Sequence[RunSeries]) -> Group:

@@ -60,6 +60,8 @@ class RunSeries:
     readings leave out."""
     axis: Axis = EPISODES
     """The axis of the positions."""
+    environment: str = ""
+    """The environment's id, with its keyword arguments: `FrozenLake-v1 map_name=8x8`."""
 
     @property
     def finished(self) -> bool:
@@ -204,7 +206,14 @@ def read_series(recording: Recording, axis: Axis = EPISODES) -> RunSeries:
         content_digest=recording.result.content_digest or "",
         not_finite=dict(not_finite),
         axis=axis,
+        environment=_environment(recording),
     )
+
+
+def _environment(recording: Recording) -> str:
+    kwargs = recording.config.get("env", {}).get("kwargs", {})
+    name = str(recording.environment["env_id"]).rpartition(":")[2]
+    return " ".join([name, *(f"{key}={value}" for key, value in kwargs.items())])
 
 
 def evaluation_readings(record: EvaluationRecord) -> Readings:

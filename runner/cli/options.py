@@ -291,6 +291,11 @@ axis_option: Final = click.option(
     metavar="episodes|steps|updates|time",
     help="Read metrics over training episodes, training steps, updates as a loop logged them, or wall time.",
 )
+normalise_option: Final = click.option(
+    "--normalise",
+    metavar="FILE|minmax",
+    help="Compare over environments, by a table of random and expert scores, or the worst and best values.",
+)
 all_option: Final = click.option(
     "--all", "everything", is_flag=True, help="Include everything, not only a selection."
 )

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from runner.errors import RunnerError
 from runner.export.contents import flat_text
-from runner.export.scalars import created, episodes, measures
+from runner.export.scalars import created, episodes, measures, times
 from runner.recording.reader import Recording
 from runner.util.extras import require
 
@@ -151,11 +151,11 @@ def _log_metrics(client: Any, run_id: str, recording: Recording, names: dict[str
     """Log all metrics, of a loop also length and return of its episodes; return their number, and the end."""
     from mlflow.entities import Metric
 
-    end = began = created(recording)
+    end, at = created(recording), times(recording)
     phases = () if recording.has_reports else ("train", "eval")
     moments = chain(measures(recording), *(episodes(recording, phase) for phase in phases))
     metrics = (
-        Metric(_name(name, names), value, round((began + moment.seconds) * 1000), moment.step)
+        Metric(_name(name, names), value, round(at(moment.position) * 1000), moment.step)
         for moment in moments
         for name, value in moment.by_phase.items()
     )

@@ -13,13 +13,16 @@ every number is one that was recorded, unchanged.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Final
 
+import numpy as np
+
 from runner.analysis.series import training_step
 from runner.errors import RecordingError
+from runner.recording.clock import read_clock
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording
 from runner.recording.schema import PHASES, SCALAR_TOPIC, STEP_NANOSECONDS
@@ -51,11 +54,6 @@ class Measures:
     """Training episodes finished; for values that a loop logged in evaluation, episodes of evaluation."""
     values: Mapping[str, float]
     """By name, without the phase."""
-
-    @property
-    def seconds(self) -> float:
-        """The logical time in seconds."""
-        return self.position * STEP_NANOSECONDS / 1e9
 
     @property
     def by_phase(self) -> dict[str, float]:
@@ -109,6 +107,31 @@ def episodes(recording: Recording, phase: str) -> Iterator[Measures]:
             step = last_step + 1 if phase == "train" else position - last_step - 1
             values = zip(names, [float(length), *returns], strict=True)
             yield Measures(phase, position, step, episode, _finite(values))
+
+
+def wall_clock(recording: Recording) -> Callable[[int], float] | None:
+    """Return a function that returns the seconds that had passed at a position; None without a clock.
+
+    Raises:
+        RecordingError: the clock is damaged.
+    """
+    clock = read_clock(recording)
+    if clock is None:
+        return None
+    return lambda position: float(np.interp(position, clock.positions, clock.seconds))
+
+
+def times(recording: Recording) -> Callable[[int], float]:
+    """Return a function that returns the time of a position in seconds since 1970.
+
+    Where no clock was recorded, logical time is added to the time at which the run was created.
+
+    Raises:
+        RecordingError: the clock is damaged, or the recording holds no time of creation.
+    """
+    began = created(recording)
+    passed = wall_clock(recording) or (lambda position: position * STEP_NANOSECONDS / 1e9)
+    return lambda position: began + passed(position)
 
 
 def created(recording: Recording) -> float:

@@ -20,7 +20,7 @@ import pyarrow.parquet
 from runner.archive import layout
 from runner.archive.batches import Batches
 from runner.export.contents import Ranges, whole_ranges
-from runner.export.scalars import measures
+from runner.export.scalars import measures, wall_clock
 from runner.recording.reader import Recording
 
 _TABLES: Final = {
@@ -37,7 +37,8 @@ PATTERNS: Final = tuple(
 _METRICS: Final = pa.schema(
     [
         *(("run_id", pa.string()), ("phase", pa.string()), ("position", pa.int64()), ("step", pa.int64())),
-        *(("episode", pa.int64()), ("metric", pa.string()), ("value", pa.float64())),
+        *(("episode", pa.int64()), ("seconds", pa.float64())),
+        *(("metric", pa.string()), ("value", pa.float64())),
     ]
 )
 _ROWS: Final = 8192
@@ -104,9 +105,13 @@ def _episode_count(recording: Recording, phase: str) -> int:
 
 
 def _metrics(recording: Recording) -> Iterator[pa.RecordBatch]:
-    """Yield a row for each value of a metric."""
+    """Yield a row for each value of a metric; its seconds of wall time are empty without a clock."""
+    clock = wall_clock(recording)
     rows = (
-        (recording.run_id, moment.phase, moment.position, moment.step, moment.episode, name, value)
+        (
+            *(recording.run_id, moment.phase, moment.position, moment.step, moment.episode),
+            *(None if clock is None else clock(moment.position), name, value),
+        )
         for moment in measures(recording)
         for name, value in moment.values.items()
     )

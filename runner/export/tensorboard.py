@@ -1,6 +1,7 @@
 """A run as TensorBoard's event file: its metrics, and length and return of each training episode.
 
-The file is the same whenever it is written: an event's wall time is when the run began, plus logical time.
+The file is the same whenever it is written: an event's wall time is that of the recorded clock; without one,
+when the run began, plus logical time.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
-from runner.export.scalars import created, episodes, measures
+from runner.export.scalars import created, episodes, measures, times
 from runner.recording.reader import Recording
 from runner.util.extras import require
 
@@ -39,13 +40,13 @@ def write_events(recording: Recording, folder: Path) -> int:
     from tensorboardX.proto.summary_pb2 import Summary
     from tensorboardX.record_writer import RecordWriter
 
-    began, count = created(recording), 0
+    began, at, count = created(recording), times(recording), 0
     writer = RecordWriter(str(folder / f"events.out.tfevents.{int(began)}.{recording.run_id}"))
     try:
         writer.write(Event(wall_time=began, file_version="brain.Event:2").SerializeToString())
         for moment in chain(measures(recording), episodes(recording, "train")):
             numbers = [Summary.Value(tag=name, simple_value=x) for name, x in moment.by_phase.items()]
-            event = Event(wall_time=began + moment.seconds, step=moment.step, summary=Summary(value=numbers))
+            event = Event(wall_time=at(moment.position), step=moment.step, summary=Summary(value=numbers))
             writer.write(event.SerializeToString())
             count += len(numbers)
     finally:

@@ -17,19 +17,21 @@ import numpy as np
 
 from runner.analysis.axes import EPISODES
 from runner.analysis.compare import statistics
-from runner.analysis.compare.moments import Moment, higher_is_better, value_of
+from runner.analysis.compare.moments import (
+    Measured,
+    Moment,
+    Seed,
+    higher_is_better,
+    measured,
+    seed_of,
+    seed_order,
+)
 from runner.analysis.compare.statistics import Estimate, Values
 from runner.analysis.groups import Group
-from runner.analysis.series import RunSeries, points_of, title_of
+from runner.analysis.series import points_of, title_of
 from runner.errors import RunnerError
-from runner.util.humanize import listed
 
 THRESHOLDS: Final = 101
-Seed = int | str
-"""A seed; of a run that has none, its id."""
-
-Measured = dict[Seed, tuple[list[str], float]]
-"""Seed to the ids of its runs and their value."""
 
 
 @dataclass(frozen=True)
@@ -186,7 +188,7 @@ def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: 
     for a, b in itertools.combinations(digests, 2):
         if digests[a] == digests[b]:
             yield f"{a} and {b} are identical: their runs have the same content, seed by seed"
-    seeds = {group.label: len({_seed(run) for run in group.runs}) for group in groups}
+    seeds = {group.label: len({seed_of(run) for run in group.runs}) for group in groups}
     few = [group for group in groups if seeds[group.label] < statistics.FEW_SEEDS]
     if few:
         listed_groups = ", ".join(f"{group.label} ({seeds[group.label]})" for group in few)
@@ -200,7 +202,7 @@ def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: 
 
 def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> MetricResult:
     notes: list[str] = []
-    found = {group.label: _values(group, metric, line, moment, groups, notes) for group in groups}
+    found = {group.label: measured(group, metric, line, moment, groups, notes) for group in groups}
     present = {label: values for label, values in found.items() if values}
     title, unit = title_of(metric)
     better = higher_is_better(metric, groups)
@@ -223,40 +225,6 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
         thresholds=thresholds.tolist(),
         notes=notes,
     )
-
-
-def _seed(run: RunSeries) -> Seed:
-    """Return a run's seed; its id if it has none: such runs are not repetitions of each other."""
-    return run.run_id if run.seed is None else run.seed
-
-
-def _order(seed: Seed) -> tuple[bool, Seed]:
-    """Return the sort key of a seed: numbers come first."""
-    return isinstance(seed, str), seed
-
-
-def _values(
-    group: Group, metric: str, line: str, moment: Moment, groups: Sequence[Group], notes: list[str]
-) -> Measured:
-    """Return the values of a group; `notes` gets the runs that are left out."""
-    found: dict[Seed, list[tuple[str, float]]] = {}
-    without: dict[str, list[str]] = {}
-    for run in group.runs:
-        value, reason = value_of(run, metric, line, moment, groups)
-        if value is None:
-            without.setdefault(reason, []).append(run.run_id)
-        else:
-            found.setdefault(_seed(run), []).append((run.run_id, value))
-    notes += [f"{group.label}, left out: {listed(runs)} ({reason})" for reason, runs in without.items()]
-    count = sum(map(len, found.values()))
-    if count > len(found):
-        notes.append(
-            f"{group.label}: {count} runs of {len(found)} seeds, each seed with the mean of its runs"
-        )
-    return {
-        seed: ([run_id for run_id, _ in runs], float(np.mean([value for _, value in runs])))
-        for seed, runs in sorted(found.items(), key=lambda entry: _order(entry[0]))
-    }
 
 
 def _uneven_ends(groups: Sequence[Group], metric: str, line: str) -> list[str]:
@@ -308,7 +276,7 @@ def _group(label: str, values: Measured, thresholds: Values, sign: float) -> Gro
 
 
 def _pair(a: str, ours: Measured, b: str, theirs: Measured, sign: float) -> PairResult:
-    seeds = sorted(ours.keys() & theirs.keys(), key=_order)
+    seeds = sorted(ours.keys() & theirs.keys(), key=seed_order)
     left, right = (np.array([values[seed][1] for seed in seeds]) for values in (ours, theirs))
     difference = left - right
     none = Estimate(np.nan, np.nan, np.nan)
@@ -316,8 +284,8 @@ def _pair(a: str, ours: Measured, b: str, theirs: Measured, sign: float) -> Pair
         a=a,
         b=b,
         seeds=seeds,
-        left_out_a=sorted(ours.keys() - theirs.keys(), key=_order),
-        left_out_b=sorted(theirs.keys() - ours.keys(), key=_order),
+        left_out_a=sorted(ours.keys() - theirs.keys(), key=seed_order),
+        left_out_b=sorted(theirs.keys() - ours.keys(), key=seed_order),
         median=statistics.median(difference) if seeds else np.nan,
         iqm=statistics.interquartile_mean(difference),
         simultaneous=none,

@@ -16,8 +16,15 @@ from runner.analysis.groups import Group
 from runner.analysis.series import RunSeries, first_crossing, mean_height, points_of
 from runner.errors import RunnerError
 from runner.recording.metrics import METRIC_OF
+from runner.util.humanize import listed
 
 Kind = Literal["last", "best", "area", "position", "crossing"]
+Seed = int | str
+"""A seed; of a run that has none, its id."""
+
+Measured = dict[Seed, tuple[list[str], float]]
+"""Seed to the ids of its runs and their value."""
+
 _OF_WHOLE_RUNS: Final[tuple[Kind, ...]] = ("last", "best", "area")
 
 
@@ -91,6 +98,40 @@ def moment_of(
         if not axis.whole and 0 <= (number := float(moment)) < math.inf:
             return Moment("position", number=number, axis=axis), chosen
     raise RunnerError(f"moment: found {moment!r}, expected last, best, area, or a number of {axis.label}.")
+
+
+def seed_of(run: RunSeries) -> Seed:
+    """Return a run's seed; its id if it has none: such runs are not repetitions of each other."""
+    return run.run_id if run.seed is None else run.seed
+
+
+def seed_order(seed: Seed) -> tuple[bool, Seed]:
+    """Return the sort key of a seed: numbers come first."""
+    return isinstance(seed, str), seed
+
+
+def measured(
+    group: Group, metric: str, line: str, moment: Moment, groups: Sequence[Group], notes: list[str]
+) -> Measured:
+    """Return the value of each seed of a group; `notes` gets the runs that are left out."""
+    found: dict[Seed, list[tuple[str, float]]] = {}
+    without: dict[str, list[str]] = {}
+    for run in group.runs:
+        value, reason = value_of(run, metric, line, moment, groups)
+        if value is None:
+            without.setdefault(reason, []).append(run.run_id)
+        else:
+            found.setdefault(seed_of(run), []).append((run.run_id, value))
+    notes += [f"{group.label}, left out: {listed(runs)} ({reason})" for reason, runs in without.items()]
+    count = sum(map(len, found.values()))
+    if count > len(found):
+        notes.append(
+            f"{group.label}: {count} runs of {len(found)} seeds, each seed with the mean of its runs"
+        )
+    return {
+        seed: ([run_id for run_id, _ in runs], float(np.mean([value for _, value in runs])))
+        for seed, runs in sorted(found.items(), key=lambda entry: seed_order(entry[0]))
+    }
 
 
 def value_of(

@@ -32,6 +32,7 @@ FEWEST_TOGETHER: Final = 6
 """With fewer, the middle half is at most three values, too few for simultaneous intervals of any use."""
 NEVER: Final = 1e100
 _BAND_RESAMPLES: Final = 2_000
+_TAILS: Final = (0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2)
 _SEED: Final = 2021
 _BATCH: Final = 4_000_000
 
@@ -63,8 +64,8 @@ def interquartile_mean(values: Values) -> Estimate:
     """Return the mean of the middle half of the values, and its interval; nan for fewer than four."""
     if len(values) < FEWEST_FOR_IQM:
         return Estimate(np.nan, np.nan, np.nan)
-    low, high = _interval(values, _iqm)
-    return Estimate(bounded(float(_iqm(values, -1))), bounded(float(low)), bounded(float(high)))
+    low, high = _interval(values, iqm)
+    return Estimate(bounded(float(iqm(values, -1))), bounded(float(low)), bounded(float(high)))
 
 
 def iqm_band(values: Values) -> tuple[Values, Values, Values]:
@@ -89,10 +90,39 @@ def iqm_band(values: Values) -> tuple[Values, Values, Values]:
         drawn = np.random.default_rng(_SEED).integers(n, size=(_BAND_RESAMPLES, n))
         kept = np.sort(drawn, axis=1)[:, cut : n - cut]
         weights = np.array([np.bincount(row, minlength=n) for row in kept]) / (n - 2 * cut)
-        tails = (0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2)
-        low, high = np.quantile(weights @ ordered, tails, axis=0)
+        low, high = np.quantile(weights @ ordered, _TAILS, axis=0)
         result[:, chosen] = ordered[cut : n - cut].mean(axis=0), low, high
     return result[0], result[1], result[2]
+
+
+def stratified(
+    strata: Sequence[Values], statistic: Callable[[Sequence[Values]], Values], cells: int = 0
+) -> tuple[Values, Values, Values]:
+    """Return a statistic of several samples and its percentile bootstrap interval: (value, low, high).
+
+    Each sample is resampled by itself; the interval is nan if no sample has two values.
+
+    Args:
+        strata: the samples, float64 [n, columns], with equal columns; the result has one value for each.
+        statistic: takes one column of all samples, [n, resamples] each, and returns [resamples].
+        cells: numbers that the statistic holds for each resample, if more than there are values.
+    """
+    columns = strata[0].shape[1]
+    value = np.array([float(statistic([own[:, k : k + 1] for own in strata])[0]) for k in range(columns)])
+    if all(len(own) < 2 for own in strata):
+        return value, np.full(columns, np.nan), np.full(columns, np.nan)
+    resamples = RESAMPLES if columns == 1 else _BAND_RESAMPLES
+    batch = max(1, _BATCH // max(cells, sum(map(len, strata))))
+    rng = np.random.default_rng(_SEED)
+    drawn: list[list[Values]] = [[] for _ in range(columns)]
+    for start in range(0, resamples, batch):
+        size = min(batch, resamples - start)
+        places = [rng.integers(len(own), size=(len(own), size)) for own in strata]
+        for k in range(columns):
+            samples = [own[:, k][place] for own, place in zip(strata, places, strict=True)]
+            drawn[k].append(statistic(samples))
+    ends = np.quantile([np.concatenate(own) for own in drawn], _TAILS, axis=1)
+    return value, ends[0], ends[1]
 
 
 def improvement(a: Values, b: Values) -> Estimate:
@@ -130,7 +160,7 @@ def simultaneous(samples: Sequence[Sequence[float]]) -> list[Estimate]:
     estimates = []
     for sample in samples:
         values = np.array(sample, np.float64)
-        value = bounded(float(_iqm(values, -1))) if len(values) >= FEWEST_FOR_IQM else np.nan
+        value = bounded(float(iqm(values, -1))) if len(values) >= FEWEST_FOR_IQM else np.nan
         error = np.nan
         if len(values) >= FEWEST_TOGETHER and bool((abs(values) < NEVER).all()):
             freedom = len(values) - 2 * (len(values) // 4) - 1
@@ -163,7 +193,8 @@ def bounded(value: float) -> float:
     return float(np.copysign(np.inf, value)) if abs(value) > NEVER / 1e6 else value
 
 
-def _iqm(values: Values, axis: int) -> Values:
+def iqm(values: Values, axis: int) -> Values:
+    """Return the interquartile mean along an axis."""
     trimmed: Values = require_scipy().trim_mean(values, 0.25, axis=axis)
     return trimmed
 

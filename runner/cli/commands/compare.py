@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
@@ -18,6 +18,7 @@ from runner.cli.options import (
     html_option,
     json_option,
     markdown_option,
+    normalise_option,
     recordings_option,
     runs_argument,
     target_option,
@@ -30,7 +31,14 @@ from runner.export.places import write_text_new
 from runner.util.humanize import size
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from runner.analysis.axes import Axis
+    from runner.analysis.compare import Comparison
+    from runner.analysis.compare.moments import Moment
+    from runner.analysis.compare.tasks import TaskComparison
+    from runner.analysis.sections import Section
+    from runner.analysis.series import RunSeries
 
 
 @click.command("compare", cls=Command)
@@ -55,6 +63,7 @@ if TYPE_CHECKING:
     "--at-step", type=INDEX, metavar="N", help="Compare after N training steps: --axis steps --moment N."
 )
 @target_option(multiple=False)
+@normalise_option
 @json_option
 @markdown_option
 @html_option
@@ -68,6 +77,7 @@ def compare_command(
     axis: Axis,
     at_step: int | None,
     target: tuple[str, float] | None,
+    normalise: str | None,
     as_json: bool,
     as_markdown: bool,
     html: Path | None,
@@ -81,6 +91,11 @@ def compare_command(
     interquartile mean (IQM) with a 95 % bootstrap interval; for each pair of groups the differences, and the
     probability that a run of A is better than one of B; and the share of runs that reach a level.
 
+    With --normalise, algorithms are compared over several environments by normalised scores: IQM, median,
+    mean and optimality gap, the probability of improvement, performance profiles and sample-efficiency
+    curves, with intervals by a bootstrap that resamples the seeds of each environment. A group then has the
+    runs that differ in nothing but environment and seed, or have the same value of --by, such as name.
+
     Exit code 0 when groups were compared, 2 when there is nothing to compare.
 
     Examples:
@@ -88,14 +103,12 @@ def compare_command(
       dualtaxi compare first second third --metric mean_length --moment 10000
       dualtaxi compare ppo dqn --at-step 100000
       dualtaxi compare sweep --by discount --target success_percent=80
+      dualtaxi compare ppo dqn --normalise scores.csv --metric mean_return
       dualtaxi compare cooperative competitive --html comparison.html
     """
     from runner.analysis.axes import EPISODES, STEPS
-    from runner.analysis.compare import compare
     from runner.analysis.compare.moments import moment_of
-    from runner.analysis.compare.sections import sections
     from runner.analysis.compare.statistics import require_scipy
-    from runner.analysis.groups import grouped, metrics_of, require_two
     from runner.analysis.series import read_series
     from runner.recording.reader import open_recording
 
@@ -114,26 +127,76 @@ def compare_command(
         for run in runs:
             with open_recording(run.recording) as recording:
                 series.append(read_series(recording, axis))
-        groups, notes = grouped(series, by)
-        require_two(groups, by)
         stage("computing intervals")
-        comparison = compare(groups, metrics_of(groups, chosen), read_at, notes)
+        made = (
+            _compare_groups(series, by, chosen, read_at, html is not None)
+            if normalise is None
+            else _compare_tasks(series, by, chosen, read_at, normalise, html is not None)
+        )
         if html is not None:
-            from runner.export.reports.compare import render_comparison
-
-            stage("drawing the page")
-            write_text_new(html, force, render_comparison(comparison, groups))
+            write_text_new(html, force, made.page)
     if html is not None:
-        for note in comparison.notes:
+        for note in made.result.notes:
             say(f"Note: {note}.")
-        count = sum(len(group.runs) for group in groups)
-        named = "1 metric" if len(comparison.metrics) == 1 else f"{len(comparison.metrics)} metrics"
-        page = f"{html}: {named} of {count} runs in {len(groups)} groups"
-        (say if as_json else click.echo)(page)
+        (say if as_json else click.echo)(f"{html}: {made.contents}")
     if as_json:
-        print_json(dataclasses.asdict(comparison))
+        print_json(dataclasses.asdict(made.result))
     elif html is None:
-        print_sections(sections(comparison), as_markdown)
+        print_sections(made.sections, as_markdown)
+
+
+class _Made(NamedTuple):
+    """A comparison, as it is printed or written."""
+
+    result: Comparison | TaskComparison
+    sections: list[Section]
+    contents: str
+    page: str = ""
+
+
+def _compare_groups(
+    series: list[RunSeries], by: str | None, chosen: Sequence[str], moment: Moment, with_page: bool
+) -> _Made:
+    from runner.analysis.compare import compare
+    from runner.analysis.compare.sections import sections
+    from runner.analysis.groups import grouped, metrics_of, require_two
+
+    groups, notes = grouped(series, by)
+    require_two(groups, by)
+    comparison = compare(groups, metrics_of(groups, chosen), moment, notes)
+    page = ""
+    if with_page:
+        from runner.export.reports.compare import render_comparison
+
+        page = render_comparison(comparison, groups)
+    count = sum(len(group.runs) for group in groups)
+    named = "1 metric" if len(comparison.metrics) == 1 else f"{len(comparison.metrics)} metrics"
+    return _Made(comparison, sections(comparison), f"{named} of {count} runs in {len(groups)} groups", page)
+
+
+def _compare_tasks(
+    series: list[RunSeries],
+    by: str | None,
+    chosen: Sequence[str],
+    moment: Moment,
+    normalise: str,
+    with_page: bool,
+) -> _Made:
+    from runner.analysis.compare.score_table import scores_of
+    from runner.analysis.compare.task_sections import task_sections
+    from runner.analysis.compare.tasks import compare_tasks, metric_of_tasks
+    from runner.analysis.groups import grouped
+
+    table = scores_of(normalise)
+    groups, notes = grouped(series, by, across_tasks=True)
+    comparison = compare_tasks(groups, metric_of_tasks(groups, chosen), moment, table, notes)
+    page = ""
+    if with_page:
+        from runner.export.reports.tasks import render_tasks
+
+        page = render_tasks(comparison)
+    contents = f"{len(groups)} groups in {len(comparison.tasks)} environments"
+    return _Made(comparison, task_sections(comparison), contents, page)
 
 
 @click.command("diff", cls=Command)

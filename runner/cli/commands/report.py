@@ -13,6 +13,7 @@ from runner.cli.options import (
     INDEX,
     TRIAL,
     axis_option,
+    normalise_option,
     runs_argument,
     writing_options,
 )
@@ -26,17 +27,20 @@ from runner.util.humanize import size
 
 if TYPE_CHECKING:
     from runner.analysis.axes import Axis
+    from runner.analysis.series import RunSeries
 
 
 @click.command("plot", cls=Command)
 @runs_argument
 @axis_option
 @click.option("--lines", is_flag=True, help="Draw each run as a thin line too.")
+@normalise_option
 @writing_options(EXPORTS / "plot.png", "FILE.png|svg|pdf")
 def plot_command(
     run_names: tuple[str, ...],
     axis: Axis,
     lines: bool,
+    normalise: str | None,
     output: Path,
     force: bool,
     recordings: Path | None,
@@ -48,6 +52,9 @@ def plot_command(
     interval as a band; below four runs, their mean and range. A run that was recorded twice counts once, with
     a message. A name shared by several runs stands for all of them.
 
+    With --normalise the figure has normalised scores over environments instead, as in `dualtaxi compare`:
+    aggregates, performance profiles and sample-efficiency curves of the returns.
+
     Of a sweep, given by its name, the objective is drawn against each parameter and in parallel coordinates,
     and over episodes for the best and the median trial.
 
@@ -55,6 +62,7 @@ def plot_command(
       dualtaxi plot @latest
       dualtaxi plot cooperative competitive -o comparison.pdf
       dualtaxi plot ppo dqn --axis steps
+      dualtaxi plot ppo dqn --axis steps --normalise minmax
       dualtaxi plot hyperparameters -o hyperparameters.png
     """
     from runner.analysis.groups import duplicates, groups_of
@@ -69,8 +77,8 @@ def plot_command(
     folder = recordings_folder(recordings)
     if is_sweep(run_names, folder):
         _refuse_axis(axis)
-        if lines:
-            raise click.UsageError("--lines: found a sweep, expected runs.")
+        if lines or normalise is not None:
+            raise click.UsageError("--lines, --normalise: found a sweep, expected runs.")
         _plot_sweep(run_names[0], folder, output, force, as_json)
         return
     series = []
@@ -82,6 +90,9 @@ def plot_command(
                 for shortcoming in shortcomings(recording):
                     say(shortcoming)
             progress(len(series))
+    if normalise is not None:
+        _plot_tasks(series, normalise, output, force, as_json)
+        return
     groups = groups_of(series)
     for note in duplicates(groups):
         say(f"{note[0].upper()}{note[1:]}.")
@@ -93,6 +104,26 @@ def plot_command(
     count = sum(len(group.runs) for group in groups)
     text = f"{output}: {len(panels)} metrics of {_runs(count)}"
     print_written(text, as_json, output, metrics=len(panels), runs=count)
+
+
+def _plot_tasks(series: list[RunSeries], normalise: str, output: Path, force: bool, as_json: bool) -> None:
+    from runner.analysis.compare.moments import Moment
+    from runner.analysis.compare.score_table import scores_of
+    from runner.analysis.compare.tasks import compare_tasks, metric_of_tasks
+    from runner.analysis.groups import grouped
+    from runner.export.plots.image import save
+    from runner.export.plots.tasks import tasks_sheet
+
+    table = scores_of(normalise)
+    groups, notes = grouped(series, across_tasks=True)
+    with stage_line("computing intervals") as stage:
+        found = compare_tasks(groups, metric_of_tasks(groups, ()), Moment("last"), table, notes)
+        stage("drawing")
+        write_new(output, force, lambda path: save(tasks_sheet(found), path))
+    for note in found.notes:
+        say(f"Note: {note}.")
+    text = f"{output}: {len(found.algorithms)} groups in {len(found.tasks)} environments"
+    print_written(text, as_json, output, groups=len(found.algorithms), environments=len(found.tasks))
 
 
 def _refuse_axis(axis: Axis) -> None:

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.compare import GroupResult, MetricResult
+from runner.analysis.compare.tasks import AlgorithmResult
 from runner.analysis.diff import TableDiff
 from runner.drawing import palette
 from runner.environments.naming import spoken
@@ -56,19 +57,43 @@ def intervals_svg(metric: MetricResult, labels: list[str]) -> str:
 
 def profile_svg(metric: MetricResult, labels: list[str]) -> str:
     """Return the share of each group's runs that are at least as good as a level, over the levels."""
-    levels = np.array(metric.thresholds)
-    is_lower_better = metric.higher_is_better is False
-    x, y = Scale.around(levels, 50.0, WIDTH - 10), Scale(0, 103, 146.0, 16.0)
-    chart = Chart(x, y, WIDTH, HEIGHT, f"{metric.title}: performance profile")
+    title, lower = f"{metric.title}: performance profile", metric.higher_is_better is False
+    return profile_chart("", title, metric.unit, metric.thresholds, metric.groups, labels, lower).svg()
+
+
+def profile_chart(
+    heading: str,
+    title: str,
+    unit: str,
+    thresholds: Sequence[float],
+    groups: Sequence[GroupResult] | Sequence[AlgorithmResult],
+    labels: Sequence[str],
+    is_lower_better: bool = False,
+) -> Chart:
+    """Return performance profiles with their bands.
+
+    Args:
+        heading: above the chart; may be empty.
+        title: the description for screen readers.
+        unit: of the levels.
+        thresholds: the levels.
+        groups: whose profiles are drawn.
+        labels: the labels of all groups, in the order of their colours.
+        is_lower_better: whether a run reaches a level by being lower.
+    """
+    levels = np.array(thresholds)
+    x, y = Scale.around(levels, 50.0, WIDTH - 10), Scale(0, 103, 146.0, 16.0 if not heading else 32.0)
+    chart = Chart(x, y, WIDTH, HEIGHT, title)
     chart.x_ticks(labelled(x.ticks))
     chart.y_ticks(labelled(range(0, 101, 20)))
     sign = "at most" if is_lower_better else "at least"
-    chart.frame("", 14.0, f"{metric.unit}, {sign}", ["percent of runs"])
-    for group in metric.groups:
+    chart.frame(heading, 25.0 if heading else 14.0, f"{unit}, {sign}", ["percent of runs"])
+    for group in groups:
         number = labels.index(group.label)
         colour, share = series_colour(number), 100 * np.array(group.profile)
         low, high = 100 * np.array(group.profile_low), 100 * np.array(group.profile_high)
-        chart.band(levels, low, high, colour, opacity=0.2)
+        if not np.isnan(low).any():
+            chart.band(levels, low, high, colour, opacity=0.2)
         steps, heights = np.repeat(levels, 2), np.repeat(share, 2)
         if is_lower_better:  # a share holds from its level on, else up to it
             chart.line(steps[1:], heights[:-1], colour)
@@ -76,7 +101,7 @@ def profile_svg(metric: MetricResult, labels: list[str]) -> str:
             chart.line(steps[:-1], heights[1:], colour)
         every = slice(None, None, max(len(levels) // 8, 1))
         chart.markers(levels[every], share[every], colour, series_marker(number), 1.7)
-    return chart.svg()
+    return chart
 
 
 def tables_svg(tables: Sequence[TableDiff]) -> str:

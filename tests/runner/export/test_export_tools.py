@@ -19,6 +19,7 @@ import runner
 from runner.cli import cli
 from runner.export.scalars import measures
 from runner.recording import schema
+from runner.recording.clock import read_clock
 from runner.recording.reader import open_recording
 from tests.runner.recording.making import LAKE, TAXIS, make_run
 
@@ -192,10 +193,10 @@ def test_tensorboard_reads_the_measures(export, taxis):
     events = accumulator.EventAccumulator("a/logs", size_guidance={"scalars": 0, "tensors": 0}).Reload()
     expected: dict[str, list[tuple[float, int, float]]] = {}
     with open_recording(taxis.recording) as recording:
-        began = taxis.created.timestamp()
+        began, clock = taxis.created.timestamp(), read_clock(recording)
         for found in measures(recording):
             for name, value in found.values.items():
-                at = began + found.position / 10
+                at = began + float(np.interp(found.position, clock.positions, clock.seconds))
                 expected.setdefault(f"{found.phase}/{name}", []).append((at, found.step, np.float32(value)))
         episodes = recording.episodes("train")
     for tag, points in expected.items():
@@ -255,8 +256,9 @@ def test_mlflow_has_the_run_once(export, taxis):
     assert found["start"] == round(taxis.created.timestamp() * 1000)
     expected: dict[str, list[tuple[int, int, float]]] = {}
     with open_recording(taxis.recording) as recording:
+        began, clock = taxis.created.timestamp(), read_clock(recording)
         for moment in measures(recording):
-            at = round((taxis.created.timestamp() + moment.position / 10) * 1000)
+            at = round((began + float(np.interp(moment.position, clock.positions, clock.seconds))) * 1000)
             for name, value in moment.values.items():
                 expected.setdefault(f"{moment.phase}/{name}", []).append((at, moment.step, value))
     assert {name: sorted(points) for name, points in found["history"].items()} == {

@@ -1,0 +1,105 @@
+"""Tables of scores that normalise the values of environments: those of a random policy and an expert."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from runner.analysis.compare.statistics import Values
+from runner.errors import RunnerError
+
+MIN_MAX: Final = "minmax"
+"""Stands for a normalisation by the worst and the best value of each environment."""
+_MAX_TABLE: Final = 1 << 20
+_SCORES: Final = ("random", "expert")
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The values that are the scores 0 and 1 in an environment."""
+
+    zero: float
+    one: float
+
+    def score(self, values: Values) -> Values:
+        """Return the normalised scores of values."""
+        return (values - self.zero) / (self.one - self.zero)
+
+
+def scores_of(option: str) -> dict[str, Bounds] | None:
+    """Return the table that an option stands for: a file, or None for `minmax`.
+
+    Raises:
+        RunnerError: the file cannot be read, or is no such table.
+    """
+    return None if option == MIN_MAX else read_table(Path(option))
+
+
+def read_table(path: Path) -> dict[str, Bounds]:
+    """Return the scores of a random policy and of an expert by environment, from CSV, YAML or JSON.
+
+    CSV has the columns task, random and expert; YAML and JSON map an environment to `random` and `expert`.
+
+    Raises:
+        RunnerError: the file cannot be read, or is no such table.
+    """
+    try:
+        if path.stat().st_size > _MAX_TABLE:
+            raise RunnerError(f"{path}: found more than {_MAX_TABLE:,} bytes, expected a table of scores.")
+        text = path.read_text("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8"
+        raise RunnerError(f"{path}: cannot be read ({reason}).") from error
+    return parse_table(text, path.name)
+
+
+def parse_table(text: str, name: str) -> dict[str, Bounds]:
+    """Return the table of a text, see `read_table`; its format follows the ending of the name.
+
+    Raises:
+        RunnerError: it is no such table.
+    """
+    ending = Path(name).suffix.lower()
+    if ending not in (".csv", ".yaml", ".yml", ".json"):
+        raise RunnerError(f"{name}: found the ending {ending!r}, expected .csv, .yaml or .json.")
+    rows: list[tuple[str, Any]]
+    if ending == ".csv":
+        reader = csv.DictReader(text.splitlines())
+        if sorted(reader.fieldnames or ()) != sorted(("task", *_SCORES)):
+            columns = ", ".join(reader.fieldnames or ()) or "none"
+            raise RunnerError(f"{name}: found the columns {columns}, expected task, {', '.join(_SCORES)}.")
+        rows = [(str(row.pop("task")), row) for row in reader]
+    else:
+        rows = [(str(task), own) for task, own in _mapping(text, name).items()]
+    table: dict[str, Bounds] = {}
+    for task, own in rows:
+        try:
+            zero, one = (float(own[score]) for score in _SCORES)
+        except (KeyError, TypeError, ValueError):
+            zero = one = math.nan
+        if not math.isfinite(one - zero) or len(own) != len(_SCORES):
+            raise RunnerError(f"{name}: {task}: found {own}, expected finite numbers, random and expert.")
+        if zero == one or task in table:
+            problem = f"{zero:g} as random and as expert" if zero == one else "a second row"
+            raise RunnerError(f"{name}: {task}: found {problem}, expected one row with two different scores.")
+        table[task] = Bounds(zero, one)
+    if not table:
+        raise RunnerError(f"{name}: found no row, expected one for each environment.")
+    return table
+
+
+def _mapping(text: str, name: str) -> Mapping[Any, Any]:
+    import yaml
+
+    try:
+        found = json.loads(text) if name.endswith(".json") else yaml.safe_load(text)
+    except (ValueError, RecursionError, yaml.YAMLError) as error:
+        raise RunnerError(f"{name}: cannot be parsed ({' '.join(str(error).split())}).") from error
+    if not isinstance(found, Mapping):
+        raise RunnerError(f"{name}: expected a mapping of environments to `random` and `expert`.")
+    return found

@@ -1,0 +1,306 @@
+"""Algorithms compared over several environments by normalised scores, as Agarwal et al. (2021) advise.
+
+Each run's value is normalised by its environment: 0 is the score of a random policy and 1 that of an expert,
+from a table; or 0 the worst and 1 the best value of any run there. Statistics are over all runs of all
+environments; intervals are percentile intervals of a bootstrap that resamples the seeds of each environment.
+The definitions are those of the library rliable, which a test compares them with.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from runner.analysis.compare import statistics
+from runner.analysis.compare.moments import Moment, Seed, higher_is_better, measured, seed_of
+from runner.analysis.compare.score_table import MIN_MAX, Bounds
+from runner.analysis.compare.statistics import Estimate, Values
+from runner.analysis.groups import Group, metrics_of
+from runner.analysis.series import RunSeries, points_of, title_of
+from runner.errors import RunnerError
+from runner.util.humanize import listed
+
+POINTS: Final = 101
+"""Levels of a profile, and positions of a curve."""
+
+
+@dataclass(frozen=True)
+class AlgorithmResult:
+    """The scores of one algorithm over all environments."""
+
+    label: str
+    seeds: dict[str, int]
+    """Environment to its number of seeds."""
+    scores: dict[str, list[float]]
+    """Environment to the score of each seed."""
+    iqm: Estimate
+    median: Estimate
+    """Median over the environments of their mean scores."""
+    mean: Estimate
+    optimality_gap: Estimate
+    """By how much scores fall short of 1, on average; above 1 nothing is gained."""
+    profile: list[float]
+    """Share of all runs whose score is at least each threshold."""
+    profile_low: list[float]
+    profile_high: list[float]
+    curve: list[float]
+    """IQM of the scores at each position."""
+    curve_low: list[float]
+    curve_high: list[float]
+
+
+@dataclass(frozen=True)
+class ImprovementResult:
+    """The probability that a run of A scores higher than one of B in an environment drawn at random."""
+
+    a: str
+    b: str
+    probability: Estimate
+
+
+@dataclass(frozen=True)
+class TaskComparison:
+    """The result of comparing algorithms over environments."""
+
+    metric: str
+    title: str
+    moment: str
+    normalised_by: str
+    tasks: dict[str, Bounds]
+    algorithms: list[AlgorithmResult]
+    improvements: list[ImprovementResult]
+    thresholds: list[float]
+    axis: str
+    """Label of the axis of the curves."""
+    positions: list[float]
+    notes: list[str]
+
+
+def metric_of_tasks(groups: Sequence[Group], chosen: Sequence[str]) -> tuple[str, str]:
+    """Return the metric and line that environments are compared by: the one chosen, or the return.
+
+    Raises:
+        RunnerError: several are chosen, or the metric has several lines, or no run has it.
+    """
+    pairs = metrics_of(groups, chosen)
+    if not chosen:
+        pairs = [pair for pair in pairs if pair[0].endswith("mean_return")] or pairs[:1]
+    if len(pairs) > 1:
+        names = [".".join(filter(None, pair)) for pair in pairs]
+        raise RunnerError(
+            f"--metric: found {listed(names)}, expected one, as environments are compared by it."
+        )
+    return pairs[0]
+
+
+def compare_tasks(
+    groups: Sequence[Group],
+    metric: tuple[str, str],
+    moment: Moment,
+    table: Mapping[str, Bounds] | None,
+    notes: Sequence[str] = (),
+) -> TaskComparison:
+    """Return the comparison of algorithms over the environments that all of them have.
+
+    Args:
+        groups: the runs of each algorithm, as `grouped` returns them for several tasks.
+        metric: (metric, line).
+        moment: at which it is read; a crossing cannot be normalised.
+        table: the scores 0 and 1 of each environment; None for the worst and the best value there.
+        notes: sentences to add to the comparison's own.
+
+    Raises:
+        MissingExtra: SciPy is not installed.
+        RunnerError: there is no common environment, or the table lacks one.
+    """
+    statistics.require_scipy()
+    if moment.level is not None:
+        raise RunnerError("--normalise: found --target as well, expected a moment: a level has no score.")
+    own_notes: list[str] = []
+    found = {group.label: dict(_values(group, metric, moment, groups, own_notes)) for group in groups}
+    tasks = _common_tasks(found, own_notes)
+    better = higher_is_better(metric[0], groups)
+    if better is None and table is None:
+        own_notes.append(f"higher is taken as better, as nobody can say it of {metric[0]}")
+    bounds = _bounds(tasks, found, table, lower_is_better=better is False)
+    scores = {label: {task: bounds[task].score(own[task]) for task in tasks} for label, own in found.items()}
+    every = np.concatenate([values for own in scores.values() for values in own.values()])
+    thresholds = np.linspace(float(every.min()), float(every.max()), POINTS)
+    if moment.kind != "position":  # which takes runs that are not finished too
+        groups = [replace(each, runs=tuple(run for run in each.runs if run.finished)) for each in groups]
+    positions = _positions(groups, metric, tasks)
+    results = [
+        _result(group.label, scores[group.label], thresholds, _curves(group, metric, bounds, positions))
+        for group in groups
+    ]
+    own_notes += _seed_notes(results)
+    return TaskComparison(
+        metric=".".join(filter(None, metric)),
+        title=title_of(metric[0])[0],
+        moment=moment.described,
+        normalised_by="the worst and the best value in each environment"
+        if table is None
+        else "a table: 0 is the random, 1 the expert score",
+        tasks=bounds,
+        algorithms=results,
+        improvements=[
+            ImprovementResult(a, b, _improvement(scores[a], scores[b]))
+            for a, b in itertools.combinations(scores, 2)
+        ],
+        thresholds=thresholds.tolist(),
+        axis=groups[0].axis.label,
+        positions=positions.tolist(),
+        notes=[*notes, *own_notes],
+    )
+
+
+def _values(
+    group: Group, metric: tuple[str, str], moment: Moment, groups: Sequence[Group], notes: list[str]
+) -> Iterator[tuple[str, Values]]:
+    """Yield each environment of a group with the values of its seeds, in the order of the seeds."""
+    for task in dict.fromkeys(run.environment for run in group.runs):
+        own = replace(
+            group,
+            label=f"{group.label} in {task}",
+            runs=tuple(run for run in group.runs if run.environment == task),
+        )
+        if values := measured(own, *metric, moment, groups, notes):
+            yield task, np.array([value for _, value in values.values()])
+
+
+def _common_tasks(found: Mapping[str, Mapping[str, Values]], notes: list[str]) -> list[str]:
+    every = list(dict.fromkeys(task for own in found.values() for task in own))
+    tasks = [task for task in every if all(task in own for own in found.values())]
+    if not tasks:
+        listing = "; ".join(f"{label}: {listed(list(own)) or 'none'}" for label, own in found.items())
+        raise RunnerError(
+            f"--normalise: found no environment that all have a value in ({listing}), expected one at least; "
+            "--by PATH groups the runs otherwise, such as by name."
+        )
+    if left_out := [task for task in every if task not in tasks]:
+        notes.append(f"left out, as not every group has a value there: {listed(left_out)}")
+    return tasks
+
+
+def _bounds(
+    tasks: Sequence[str],
+    found: Mapping[str, Mapping[str, Values]],
+    table: Mapping[str, Bounds] | None,
+    lower_is_better: bool,
+) -> dict[str, Bounds]:
+    """Return the values of the scores 0 and 1: of the table, or the worst and the best there."""
+    if table is not None:
+        if lacking := [task for task in tasks if task not in table]:
+            raise RunnerError(
+                f"--normalise: the table has no row for {listed(lacking)}; it has {listed(list(table))}."
+            )
+        return {task: table[task] for task in tasks}
+    bounds = {}
+    for task in tasks:
+        values = np.concatenate([own[task] for own in found.values()])
+        low, high = float(values.min()), float(values.max())
+        if low == high:
+            raise RunnerError(
+                f"--normalise {MIN_MAX}: {task}: found the value {low:g} in every run, expected different "
+                "ones; a table of scores can normalise them."
+            )
+        bounds[task] = Bounds(high, low) if lower_is_better else Bounds(low, high)
+    return bounds
+
+
+def _seed_notes(results: Sequence[AlgorithmResult]) -> Iterator[str]:
+    for result in results:
+        counts = set(result.seeds.values())
+        if counts == {1}:
+            yield f"{result.label} has one seed in each environment: it has no interval"
+        elif 1 in counts:
+            yield f"{result.label} has one seed in some environments: its intervals are too narrow"
+        if len(counts) > 1:
+            yield f"{result.label} has other numbers of seeds in other environments: more seeds weigh more"
+
+
+# --- statistics -----------------------------------------------------------------------------------------
+
+
+def _result(
+    label: str, scores: Mapping[str, Values], thresholds: Values, curves: Sequence[Values]
+) -> AlgorithmResult:
+    """Return the statistics of an algorithm; `curves` has [seeds, positions] for each environment."""
+    own = [values[:, np.newaxis] for values in scores.values()]
+    reached = [(values >= thresholds).astype(np.float64) for values in own]
+    profile = [
+        part.tolist() for part in statistics.stratified(reached, lambda drawn: _pooled(drawn).mean(axis=0))
+    ]
+    curve = [part.tolist() for part in statistics.stratified(curves, _iqm)]
+    return AlgorithmResult(
+        label=label,
+        seeds={task: len(values) for task, values in scores.items()},
+        scores={task: values.tolist() for task, values in scores.items()},
+        iqm=_estimate(own, _iqm),
+        median=_estimate(own, lambda drawn: np.median([task.mean(axis=0) for task in drawn], axis=0)),
+        mean=_estimate(own, lambda drawn: np.mean([task.mean(axis=0) for task in drawn], axis=0)),
+        optimality_gap=_estimate(own, lambda drawn: 1 - np.minimum(_pooled(drawn), 1).mean(axis=0)),
+        profile=profile[0],
+        profile_low=profile[1],
+        profile_high=profile[2],
+        curve=curve[0],
+        curve_low=curve[1],
+        curve_high=curve[2],
+    )
+
+
+def _pooled(drawn: Sequence[Values]) -> Values:
+    return np.concatenate(drawn)
+
+
+def _iqm(drawn: Sequence[Values]) -> Values:
+    return statistics.iqm(_pooled(drawn), 0)
+
+
+def _estimate(
+    strata: Sequence[Values], statistic: Callable[[Sequence[Values]], Values], cells: int = 0
+) -> Estimate:
+    value, low, high = statistics.stratified(strata, statistic, cells)
+    return Estimate(float(value[0]), float(low[0]), float(high[0]))
+
+
+def _improvement(a: Mapping[str, Values], b: Mapping[str, Values]) -> Estimate:
+    """Return the mean over environments of the probability that a run of A scores higher; ties count half."""
+
+    def probability(drawn: Sequence[Values]) -> Values:
+        pairs = zip(drawn[::2], drawn[1::2], strict=True)
+        signs = [np.sign(own[:, np.newaxis] - other).mean(axis=(0, 1)) for own, other in pairs]
+        return np.asarray(0.5 + 0.5 * np.mean(signs, axis=0))
+
+    strata = [own[task][:, np.newaxis] for task in a for own in (a, b)]
+    return _estimate(strata, probability, cells=max(len(a[task]) * len(b[task]) for task in a))
+
+
+def _positions(groups: Sequence[Group], metric: tuple[str, str], tasks: Sequence[str]) -> Values:
+    """Return the positions that every run in these environments covers, evenly spaced."""
+    curves = [points for run in _runs(groups, tasks) if (points := points_of(run, *metric, aligned=True))]
+    first, last = max(map(min, curves)), min(map(max, curves))
+    return np.linspace(first, last, POINTS) if first < last else np.array([float(last)])
+
+
+def _runs(groups: Sequence[Group], tasks: Sequence[str]) -> list[RunSeries]:
+    return [run for group in groups for run in group.runs if run.environment in tasks]
+
+
+def _curves(
+    group: Group, metric: tuple[str, str], bounds: Mapping[str, Bounds], positions: Values
+) -> list[Values]:
+    """Return the scores of a group's seeds at each position, [seeds, positions] for each environment."""
+    curves = []
+    for task, own in bounds.items():
+        seeds: dict[Seed, list[Values]] = {}
+        for run in _runs([group], [task]):
+            if points := points_of(run, *metric, aligned=True):
+                values = np.interp(positions, sorted(points), [points[at] for at in sorted(points)])
+                seeds.setdefault(seed_of(run), []).append(own.score(values))
+        curves.append(np.array([np.mean(runs, axis=0) for runs in seeds.values()]))
+    return curves
