@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -21,6 +22,8 @@ class Section:
     title: str
     sentences: list[str] = field(default_factory=list)
     grids: list[Grid] = field(default_factory=list)
+    diffs: list[list[str]] = field(default_factory=list)
+    """Unified diffs, each as its lines."""
 
 
 def markdown(made: Sequence[Section]) -> Iterator[str]:
@@ -34,6 +37,9 @@ def markdown(made: Sequence[Section]) -> Iterator[str]:
             yield _row(("---",) * len(grid.headings))
             yield from (_row(row) for row in grid.rows)
             yield ""
+        for lines in section.diffs:
+            fence = "`" * max([3, *(len(run) + 1 for line in lines for run in re.findall("`{3,}", line))])
+            yield from (f"{fence}diff", *lines, fence, "")
 
 
 def _row(cells: tuple[str, ...]) -> str:

@@ -161,6 +161,13 @@ def _extras(recording: Recording) -> dict[str, RecordedExtras]:
     }
 
 
+def brief_provenance(provenance: Mapping[str, str]) -> dict[str, str]:
+    """Return provenance with the number of packages in place of each one's version."""
+    packages = sum(key.startswith("package.") for key in provenance)
+    brief = {key: text for key, text in provenance.items() if not key.startswith("package.")}
+    return brief | ({"packages": f"{packages:,}"} if packages else {})
+
+
 def random_policy_sentence(recording: Recording) -> str:
     """Return what a random policy achieves in a recording's environment; empty where that is no measure.
 

@@ -170,6 +170,18 @@ def aligned(lines: Sequence[Sequence[str]], left: Sequence[bool]) -> list[str]:
     ]
 
 
+def patch_text(lines: Iterable[str]) -> Text:
+    """Return the lines of a patch, coloured, without control characters of terminals."""
+    from rich.text import Text
+
+    text = Text()
+    for line in lines:
+        is_head = line.startswith(("diff ", "--- ", "+++ ", "@@"))
+        style = "bold" if is_head else {"+": "green", "-": "red"}.get(line[:1], "")
+        text.append(printable(line) + "\n", style)
+    return text
+
+
 def printable(text: str) -> str:
     """Return a text on one line, without control characters of terminals."""
     return "".join(character if character.isprintable() else " " for character in text)
@@ -191,6 +203,8 @@ def print_sections(sections: Sequence[Section], as_markdown: bool) -> None:
             for row in part.rows:
                 grid.add_row(*row)
             draw(grid)
+        for lines in section.diffs:
+            draw(patch_text(lines))
 
 
 def require_one_form(as_json: bool, as_markdown: bool) -> None:

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, TypedDict
 
 from runner.analysis.diff.causes import Cause, Row, find_cause, find_kind
+from runner.analysis.diff.code import FileChange, code_changes
 from runner.analysis.diff.divergence import (
     Divergence,
     branch_divergence,
@@ -45,6 +46,7 @@ __all__ = [
     "Change",
     "Divergence",
     "EnvironmentDiff",
+    "FileChange",
     "MetricDiff",
     "Overlap",
     "Row",
@@ -86,6 +88,8 @@ class RunDiff:
     config: list[Change]
     provenance: list[Change]
     environment: EnvironmentDiff
+    code: list[FileChange] = field(default_factory=list)
+    """The files of the user's code that differ."""
     divergence: Divergence | None = None
     """The first step of training that differs."""
     cause: Cause | None = None
@@ -127,6 +131,7 @@ def diff(
         b=_identity(b),
         same_content=same,
         environment=environment_diff(a.mdp, b.mdp) if jobs else loop_environment_diff(a, b),
+        code=[] if first and jobs else code_changes(a, b),
         config=changes["config"],
         provenance=changes["provenance"],
         costs=changes["costs"],

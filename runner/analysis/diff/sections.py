@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from runner.analysis.diff import NOT_CONTENT, Cause, Change, Divergence, RunDiff
+from runner.analysis.diff.code import FileChange, code_changes, made_in_words
+from runner.analysis.diff.settings import changes_in
 from runner.analysis.sections import Grid, Section
 from runner.environments.naming import spoken
+from runner.recording.reader import Recording
 from runner.runs.branches import ORIGIN
 from runner.util.humanize import UNKNOWN
 
@@ -32,6 +35,7 @@ def sections(difference: RunDiff, everything: bool = False) -> list[Section]:
         _tables(difference),
         _metrics(difference, everything),
         _values("Costs", difference, "costs", _amount),
+        _code(difference.code),
         _values("Provenance", difference, "provenance"),
     ]
     filled = [section for section in found if section.sentences or section.grids]
@@ -81,6 +85,8 @@ def summary(difference: RunDiff) -> str:
     else:
         other = "other " if difference.ignored else ""
         sentences.append(f"No {other}setting that determines the content differs.")
+    if made := made_in_words(difference.code, difference.provenance):
+        sentences.append(f"How they were made differs: {', '.join(made)}.")
     divergence = difference.divergence
     if is_branch and cause is not None:
         sentences.append(f"{cause.text}.")
@@ -110,6 +116,30 @@ def _values(title: str, difference: RunDiff, field: str, text: Callable[[Any], s
     alike = [(path, text(value)) for path, value in difference.alike.get(field, {}).items()]
     grids = [Grid(("", "A", "B"), differ)] if differ else []
     return Section(title, grids=[*grids, *([Grid(("", "A and B"), alike)] if alike else [])])
+
+
+def made_sections(a: Recording, b: Recording) -> tuple[str, Section, Section]:
+    """Return how differently two runs were made: in a sentence, the code, and all of the provenance."""
+    files, changes = code_changes(a, b), changes_in(a.provenance, b.provenance)
+    rows = [(change.path, _text(change.a), _text(change.b)) for change in changes]
+    provenance = Section("Provenance", grids=[Grid(("", "A", "B"), rows)] if rows else [])
+    missing = [f"{name} has no recorded code." for name, one in (("A", a), ("B", b)) if not one.code.files]
+    code = _code(files)
+    if not code.sentences:
+        code = Section("Code", missing or ["the same, as far as it is recorded"])
+    made = ", ".join(made_in_words(files, changes))
+    return f"How they were made differs: {made}." if made else "", code, provenance
+
+
+def _code(files: Sequence[FileChange]) -> Section:
+    """Return the files of the user's code that differ, with the lines that do."""
+    sentences, diffs = [], []
+    for change in files:
+        more = f"; {change.left_out:,} lines of the diff are not shown" if change.left_out else ""
+        sentences.append(f"`{change.path}`: {change.added:,} lines added, {change.removed:,} removed{more}.")
+        if change.lines:
+            diffs.append(change.lines)
+    return Section("Code", sentences, diffs=diffs)
 
 
 def _environment(difference: RunDiff) -> Section:

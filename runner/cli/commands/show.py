@@ -12,7 +12,7 @@ import click
 
 from runner.cli import Command
 from runner.cli.options import json_option, recordings_option, run_argument
-from runner.cli.output import console, draw, facts, print_json, say, title
+from runner.cli.output import console, draw, facts, patch_text, print_json, printable, say, title
 from runner.cli.progress import stage_line
 from runner.cli.runs import command_for, find, restored
 from runner.util.humanize import UNKNOWN, age, counted, duration, number, size
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from runner.recording.reader import Recording
     from runner.recording.run_file import Summary
     from runner.runs.branches import BranchOrigin
+    from runner.runs.run import Run
 
 MAX_CYCLES: Final = 8
 """Cycles of states shown, in which episodes reach the step limit."""
@@ -33,8 +34,15 @@ MAX_CYCLES: Final = 8
 @run_argument
 @recordings_option
 @json_option
-def show_command(run_name: str, recordings: Path | None, as_json: bool) -> None:
+@click.option(
+    "--code", is_flag=True, help="Print the code that ran: commit, script, and a patch for `git apply`."
+)
+def show_command(run_name: str, recordings: Path | None, as_json: bool, code: bool) -> None:
     """Show a run: its evaluations, tables, configuration and provenance.
+
+    With --code the code that ran. `git checkout COMMIT && dualtaxi show RUN --code | git apply` restores it;
+    without a commit the patch has all files. With --json as well: under `files` the text of each recorded
+    file, `new` those that the commit does not have, `patch` the changes since the commit.
 
     With --json also the whole series: under `eval` an object for each evaluation, with the training episodes
     before it, success_percent, mean_length, mean_penalties and the count of every event; under `optimality`
@@ -46,11 +54,15 @@ def show_command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     Examples:
       dualtaxi show @latest
       dualtaxi show k3v9m2xq --json
+      dualtaxi show k3v9m2xq --code | git apply
     """
     from runner.analysis.summary import describe_run
     from runner.runs.catalogue.index import look
 
     run = restored(find(run_name, recordings))
+    if code:
+        _print_code(run, as_json)
+        return
     details = describe_run(run, say)
     folders = [] if run.stands_alone else [run.folder.parent]
     branches = look(folders, lambda index: index.branches(run.run_id), say)
@@ -60,8 +72,33 @@ def show_command(run_name: str, recordings: Path | None, as_json: bool) -> None:
         draw(*_parts(details, branches))
 
 
+def _print_code(run: Run, as_json: bool) -> None:
+    """Print the code of a run: facts as comments, which `git apply` ignores, and a patch."""
+    from runner.recording.reader import open_recording
+
+    with open_recording(run.recording) as recording:
+        found = recording.code
+        known = {
+            key: text
+            for key, text in recording.provenance.items()
+            if key.startswith(("git", "code.")) or key == "command"
+        }
+    if as_json:
+        print_json(known | {"files": dict(found.files), "new": found.new, "patch": found.patch})
+        return
+    if not any(key.startswith(("git", "code.")) for key in known):
+        known["code.not_recorded"] = "the code of this run"
+    committed = [path for path in found.files if path not in found.new]
+    head = [f"# {key}: {printable(text)}" for key, text in known.items()]
+    head += [f"# recorded by --json as well: {', '.join(map(printable, committed))}"] if committed else []
+    if console().is_terminal:
+        draw(*head, patch_text(found.to_patch().splitlines()))
+    else:
+        click.echo("\n".join(head) + "\n\n" + found.to_patch(), nl=False)
+
+
 def _parts(details: RunDetails, branches: Mapping[str, BranchOrigin]) -> list[RenderableType]:
-    from runner.analysis.summary import random_policy_sentence
+    from runner.analysis.summary import brief_provenance, random_policy_sentence
     from runner.cli.evaluations import evaluation_table
     from runner.recording.reader import open_recording
 
@@ -102,7 +139,7 @@ def _parts(details: RunDetails, branches: Mapping[str, BranchOrigin]) -> list[Re
     config = {key: _yaml(value) for key, value in given.items() if value not in ([], {})}
     parts += [title("Configuration"), facts(config)]
     if details.provenance:
-        parts += [title("Provenance"), facts(details.provenance)]
+        parts += [title("Provenance"), facts(brief_provenance(details.provenance))]
     return parts
 
 

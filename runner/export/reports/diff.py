@@ -146,7 +146,7 @@ def difference_view(
         metrics_section=parts["Metrics"],
         tables=parts["Q-tables"],
         table_figures=list(_table_figures(difference, a, b)),
-        others=[parts[title] for title in ("Configuration", "Environment", "Costs", "Provenance")],
+        others=[parts[title] for title in ("Configuration", "Environment", "Code", "Costs", "Provenance")],
         runs=Section("Runs", grids=parts["Runs"].grids[:1]),
     )
 

@@ -16,7 +16,7 @@ from runner.analysis.axes import EPISODES, Axis
 from runner.analysis.evaluations import EvaluationRecord, evaluation_records
 from runner.analysis.groups import groups_of
 from runner.analysis.series import RunSeries, read_series, values_left_out
-from runner.analysis.summary import random_policy_sentence
+from runner.analysis.summary import brief_provenance, random_policy_sentence
 from runner.drawing import svg
 from runner.environments.naming import spoken
 from runner.errors import RecordingError
@@ -187,7 +187,7 @@ def _run(
         broad=drawing is not None and drawing.width > svg.BROAD,
         facts=_facts(recording),
         config=flat_text(recording.config),
-        provenance=recording.provenance,
+        provenance=brief_provenance(recording.provenance),
         notes=_notes(recording),
         maps=_maps(recording, next(iter(episodes), None)),
         replay=replay,

@@ -10,7 +10,9 @@ from typing import Annotated, Any, ClassVar, Final
 from fastapi import APIRouter, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
+from runner.analysis.diff.sections import made_sections
 from runner.analysis.groups import flat_config
+from runner.analysis.sections import Section
 from runner.analysis.step_reference import StepRef
 from runner.errors import RunnerError
 from runner.export.reports.rendering import View
@@ -34,6 +36,7 @@ TABS: Final = (
     ("/divergence", "Where they diverge"),
     ("/replay", "Replays in step"),
     ("/tables", "Q-tables"),
+    ("/code", "Code"),
 )
 MAX_RUNS: Final = 12
 """Runs that a page compares."""
@@ -108,6 +111,14 @@ class _TablesView(CompareView):
 
 
 @dataclass(frozen=True)
+class _CodeView(CompareView):
+    TEMPLATE: ClassVar = "compare_code.html"
+    lead: str
+    code: Section
+    provenance: Section
+
+
+@dataclass(frozen=True)
 class _ReplaysView(CompareView):
     TEMPLATE: ClassVar = "compare_replay.html"
     shown: list[Panel]
@@ -163,6 +174,19 @@ async def tables(
     runs = _two(await _chosen(catalogue, run))
     body = (await _difference(runs, cache, processes))["tables"]
     return await run_in_threadpool(page, request, _TablesView(_compared(runs, "/tables"), body))
+
+
+@router.get("/code")
+async def code(request: Request, catalogue: CatalogueOf, run: Names = None) -> Response:
+    """Show how the code of two runs differs, and how else they were made."""
+    runs = _two(await _chosen(catalogue, run))
+
+    def show() -> Response:
+        with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
+            made, files, changes = made_sections(a, b)
+        return page(request, _CodeView(_compared(runs, "/code"), made, files, changes))
+
+    return await run_in_threadpool(show)
 
 
 @router.get("/replay")

@@ -19,6 +19,7 @@ TABS: Final = (
     ("evaluations", "Evaluations"),
     ("learned", "What was learned"),
     ("config", "Configuration"),
+    ("code", "Code"),
     ("system", "System"),
     ("console", "Console"),
     ("rerun", "Rerun"),

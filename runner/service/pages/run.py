@@ -15,12 +15,14 @@ from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.evaluations import evaluation_record, evaluation_records
+from runner.analysis.summary import brief_provenance
 from runner.client.jobs import RunProgress
 from runner.config.document import write_yaml
 from runner.errors import RecordingError, RunnerError
 from runner.export.reports.evaluations import EvaluationTable, evaluation_table
 from runner.export.reports.rendering import View
 from runner.recording import schema
+from runner.recording.code import Code
 from runner.recording.labels import MAX_NOTE
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
@@ -55,6 +57,18 @@ router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 MAX_LINES: Final = 500
 """Lines at the end of a run's log that its page shows."""
 MAX_EVALUATIONS: Final = 500
+MAX_PATCH_LINES: Final = 5000
+MAX_CODE_FILES: Final = 100
+"""Lines of the changes, and files, on the page of a run's code."""
+CODE_FACTS: Final = {
+    "git": "Commit",
+    "git.branch": "Branch",
+    "git.remote": "Remote",
+    "command": "Command",
+    "code.script": "Script",
+    "code.not_recorded": "Not recorded",
+    "code.left_out": "Left out",
+}
 MAX_LOGGED: Final = 8
 """Logged values on the first page of a run."""
 _LEVELS: Final = {1: "debug", 2: "info", 3: "warning", 4: "error", 5: "fatal"}
@@ -104,6 +118,27 @@ class _EvaluationsView(RunView):
 class _LearnedView(RunView):
     TEMPLATE: ClassVar = "run_learned.html"
     maps: str
+
+
+class CodeFile(NamedTuple):
+    """A recorded source."""
+
+    path: str
+    state: str
+    """How it relates to the commit, if it is not as the commit has it."""
+    text: str
+
+
+@dataclass(frozen=True)
+class _CodeView(RunView):
+    TEMPLATE: ClassVar = "run_code.html"
+    facts: Mapping[str, str]
+    packages: Mapping[str, str]
+    patch: list[str]
+    patch_left_out: int
+    files: list[CodeFile]
+    files_left_out: int
+    problem: str
 
 
 class LogLine(NamedTuple):
@@ -215,12 +250,50 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
     try:
         with open_recording(run.recording) as recording:
             facts |= {"Job hash": recording.job, "Size": humanize.size(recording.size)}
-            provenance, log = recording.provenance, _log(recording)
+            provenance, log = brief_provenance(recording.provenance), _log(recording)
     except RecordingError as error:
         facts["Recording"] = settings.without_folders(str(error))
     return page(
         request, _ConfigView(head_of(run), "config", write_yaml(run.file.config), facts, provenance, log)
     )
+
+
+@router.get("/code")
+def code(request: Request, run: RecordedRun, recording: OpenRecording) -> Response:
+    """Show the user's code and the installed packages."""
+    provenance, problem, found = recording.provenance, "", Code()
+    try:
+        found = recording.code
+    except RecordingError as error:
+        problem = message_of(error, request)
+    patch = found.patch.splitlines()
+    files = [
+        CodeFile(path, "not in the commit" if path in found.new else "", text)
+        for path, text in sorted(
+            found.files.items(), key=lambda file: file[0] != provenance.get("code.script")
+        )
+    ]
+    is_code = ("git", "code.")
+    view = _CodeView(
+        head_of(run),
+        "code",
+        facts={
+            CODE_FACTS.get(key, key): text
+            for key, text in provenance.items()
+            if key.startswith(is_code) or key == "command"
+        },
+        packages={
+            key.removeprefix("package."): text
+            for key, text in provenance.items()
+            if key.startswith("package.")
+        },
+        patch=patch[:MAX_PATCH_LINES],
+        patch_left_out=max(0, len(patch) - MAX_PATCH_LINES),
+        files=files[:MAX_CODE_FILES],
+        files_left_out=max(0, len(files) - MAX_CODE_FILES),
+        problem=problem,
+    )
+    return page(request, view)
 
 
 async def _random_policy(run: Run, cache: ResponseCache, processes: ProcessPool) -> str:

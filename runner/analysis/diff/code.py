@@ -1,0 +1,144 @@
+"""How the code of two runs differs, and in a few words how else they were made."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Final
+
+from runner.analysis.diff.settings import Change
+from runner.recording.code import Code, patch_parts, unified_diff
+from runner.recording.reader import Recording
+
+MAX_LINES: Final = 200
+"""The most lines of a file's diff that are shown."""
+MAX_FILES: Final = 20
+"""The most files whose lines are shown."""
+_MAX_COMPARED: Final = 10_000
+"""Longer files are not compared line by line."""
+_MAX_NAMED: Final = 4
+"""Files, and packages, that are named in a sentence."""
+_SHOWN_COMMIT: Final = 10
+
+
+@dataclass(frozen=True)
+class FileChange:
+    """A file of the user's code that is not the same in two runs."""
+
+    path: str
+    added: int
+    """Lines of B that A does not have."""
+    removed: int
+    """Lines of A that B does not have."""
+    lines: list[str] = field(default_factory=list)
+    """A unified diff from A to B, without secrets; its first lines if it is long."""
+    left_out: int = 0
+    """Lines of the diff that are not in `lines`."""
+
+    @property
+    def words(self) -> str:
+        """Return what differs: `14 lines of ppo.py`."""
+        count = self.added + self.removed
+        return f"{count:,} line{'s' if count != 1 else ''} of `{self.path}`"
+
+
+def code_changes(a: Recording, b: Recording) -> list[FileChange]:
+    """Return the recorded files that differ; none if a run did not record its code.
+
+    A file that one run did not load, and that it has as its commit has it, is not compared.
+
+    Raises:
+        RecordingError: the code in a recording is damaged.
+    """
+    ours, theirs = a.code, b.code
+    if not (ours.files or ours.patch) or not (theirs.files or theirs.patch):
+        return []
+    commits = [one.provenance.get("git", "").removesuffix("-dirty") for one in (a, b)]
+    return list(_changes(ours, theirs, same_commit=commits[0] == commits[1]))
+
+
+def _changes(a: Code, b: Code, same_commit: bool) -> Iterator[FileChange]:
+    parts = patch_parts(a.patch), patch_parts(b.patch)
+    paths = sorted({*a.files, *b.files, *parts[0], *parts[1]})
+    shown = 0
+    for path in paths:
+        ours, theirs = a.files.get(path), b.files.get(path)
+        if ours is None and theirs is not None and path in b.new:
+            ours = ""
+        elif theirs is None and ours is not None and path in a.new:
+            theirs = ""
+        if ours is not None and theirs is not None:
+            lines = [] if ours == theirs else _compared(ours, theirs, path)
+        elif same_commit and parts[0].get(path) != parts[1].get(path):
+            lines = _patches(parts[0].get(path), parts[1].get(path))
+        else:
+            continue
+        if lines:
+            yield _change(path, lines, MAX_LINES if shown < MAX_FILES else 0)
+            shown += 1
+
+
+def _compared(a: str, b: str, path: str) -> list[str]:
+    """Return the unified diff of two texts; of very long ones that all lines differ."""
+    if max(a.count("\n"), b.count("\n")) < _MAX_COMPARED:
+        return unified_diff(a, b, path)
+    return [*(f"-{line}" for line in a.splitlines()), *(f"+{line}" for line in b.splitlines())]
+
+
+def _patches(a: str | None, b: str | None) -> list[str]:
+    """Return how one run's changes since the same commit differ from the other's."""
+    if a is None:
+        return (b or "").splitlines()
+    if b is not None:
+        return unified_diff(a, b, "changes since the commit")
+    opposite = {"+": "-", "-": "+"}
+    return [opposite.get(line[:1], line[:1]) + line[1:] for line in a.splitlines()]
+
+
+def _change(path: str, lines: Sequence[str], limit: int) -> FileChange:
+    heads = ("+++", "---")
+    added = sum(line.startswith("+") and not line.startswith(heads) for line in lines)
+    removed = sum(line.startswith("-") and not line.startswith(heads) for line in lines)
+    shown = list(islice(lines, limit))
+    return FileChange(path, added, removed, shown, len(lines) - len(shown))
+
+
+def made_in_words(files: Sequence[FileChange], provenance: Sequence[Change]) -> list[str]:
+    """Return what differs in how two runs were made, in a few words each.
+
+    For example `14 lines of ppo.py`, `torch 2.9.0 to 2.10.0`, `another GPU: A100 to H100`.
+    """
+    values: Mapping[str, tuple[str, str]] = {
+        change.path: (str(change.a or "none"), str(change.b or "none")) for change in provenance
+    }
+    words = _some([change.words for change in files], "files")
+    if "git" in values:
+        words.append("commit " + " to ".join(map(_short, values["git"])))
+    for key, name in (("python", "Python"), ("dualtaxi", "dualtaxi")):
+        if key in values:
+            words.append(f"{name} {' to '.join(values[key])}")
+    packages = [
+        f"{path.removeprefix('package.')} {' to '.join(pair)}"
+        for path, pair in values.items()
+        if path.startswith("package.") and path != "package.dualtaxi"
+    ]
+    words += _some(packages, "packages")
+    gpus = [pair for path, pair in values.items() if re.fullmatch(r"gpu\.\d+", path)]
+    if gpus:
+        words.append(f"another GPU: {' to '.join(gpus[0])}")
+    for key, name in (("processor", "processor"), ("gpu.driver", "driver"), ("torch.cuda", "CUDA")):
+        if key in values:
+            words.append(f"another {name}: {' to '.join(values[key])}")
+    return words
+
+
+def _some(words: list[str], what: str) -> list[str]:
+    more = len(words) - _MAX_NAMED
+    return words[:_MAX_NAMED] + ([f"{more} more {what}"] if more > 0 else [])
+
+
+def _short(commit: str) -> str:
+    text, _, dirty = commit.partition("-")
+    return text[:_SHOWN_COMMIT] + (" with changes" if dirty else "")
