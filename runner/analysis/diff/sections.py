@@ -136,7 +136,7 @@ def _code(files: Sequence[FileChange]) -> Section:
     sentences, diffs = [], []
     for change in files:
         more = f"; {change.left_out:,} lines of the diff are not shown" if change.left_out else ""
-        sentences.append(f"`{change.path}`: {change.added:,} lines added, {change.removed:,} removed{more}.")
+        sentences.append(f"{change.words}: {change.added:,} added, {change.removed:,} removed{more}.")
         if change.lines:
             diffs.append(change.lines)
     return Section("Code", sentences, diffs=diffs)
