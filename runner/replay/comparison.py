@@ -13,10 +13,9 @@ from runner.recording import schema
 from runner.recording.actions import EpisodeDigests
 from runner.recording.reader import Recording
 from runner.replay.differences import Difference, differing_value, first_differing_row
-from runner.replay.recorded import RecordedReset
+from runner.replay.recorded import RecordedReset, ended_episode
 from runner.replay.redone import RedoneStart, RedoneSteps, Values
 from runner.replay.stepping import Results
-from runner.replay.steps import ended_episode
 
 
 class Part(NamedTuple):

@@ -346,3 +346,12 @@ def _aligned(blocks: Iterator[NDArray[np.void]], n: int) -> Iterator[NDArray[np.
         left = rows[whole:]
         if whole:
             yield rows[:whole]
+
+
+def ended_episode(recording: Recording, phase: str, environment: int, step: int) -> int | None:
+    """Return the number of the episode that a step of an environment belongs to; None if it never ended."""
+    for block in recording.blocks(recording.topic(f"/{phase}/episode")):
+        own = (block["last_step"] >= step) & (block["last_step"] % recording.environments == environment)
+        if own.any():
+            return int(block["episode"][np.argmax(own)])
+    return None

@@ -182,15 +182,6 @@ def environment_of(recording: Recording, phase: str, episode: int) -> int:
     return recording.episode_span(phase, episode).start % recording.environments
 
 
-def ended_episode(recording: Recording, phase: str, environment: int, step: int) -> int | None:
-    """Return the number of the episode that a step of an environment belongs to; None if it never ended."""
-    for block in recording.blocks(recording.topic(f"/{phase}/episode")):
-        own = (block["last_step"] >= step) & (block["last_step"] % recording.environments == environment)
-        if own.any():
-            return int(block["episode"][np.argmax(own)])
-    return None
-
-
 def last_step(recording: Recording) -> int:
     """Return the last training step at which the tables can be had."""
     snapshots = max((snapshot.step for snapshot in recording.snapshots()), default=0)

@@ -16,7 +16,7 @@ from runner.export.contents import require_steps
 from runner.export.rerun.selection import Request, episodes_of, evaluations_with_steps, select
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
-from runner.replay.steps import ended_episode
+from runner.replay.recorded import ended_episode
 from runner.runs.run import Run
 
 
