@@ -39,7 +39,7 @@ class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
         self._owner = owner
         self._env_step = env.step
         self._has_messages = bool(loop.options.info or loop.options.frames_every)
-        self._watch = GeneratorWatch(env)
+        self._watch = GeneratorWatch(env, sparse=loop.options.steps == "actions")
         self._record_into(loop, is_owner=owner is None)
         self._enter(phase)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import gymnasium
 import numpy as np
@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 
 from runner.loops.vec_env import mode_of
 from runner.recording.reset_states import SEED_BYTES, STEPS_BETWEEN, ResetState
+
+_SPARSE_STEPS_A_BYTE: Final = 2
+"""An emulator's state takes some 14 kB, half of it after compression: a quarter of a byte for each step."""
 
 States = dict[int, ResetState]
 """What resets depend on, by the index of the environment."""
@@ -28,9 +31,11 @@ class GeneratorWatch:
 
     Args:
         env: the environment, wrapped or not.
+        sparse: whether the states of emulators, which take kilobytes, are recorded less often.
     """
 
-    def __init__(self, env: Any) -> None:
+    def __init__(self, env: Any, sparse: bool = False) -> None:
+        self._steps_a_byte = _SPARSE_STEPS_A_BYTE if sparse else 0
         self._base: Any = getattr(env, "unwrapped", env)
         self._ale: Any = self._base.ale if is_atari(self._base) else None
         has_private = isinstance(self._base, gymnasium.Env | VectorEnv)
@@ -54,7 +59,7 @@ class GeneratorWatch:
         ale_state = b"" if self._ale is None else self._ale.cloneState(include_rng=True).serialize()
         bits = getattr(generator, "bit_generator", None)
         state: Any = bits.state if type(bits) is np.random.PCG64 else None
-        self.due = steps + STEPS_BETWEEN
+        self.due = steps + max(STEPS_BETWEEN, self._steps_a_byte * len(ale_state))
         if state is None and not ale_state:
             return None
         return ResetState(bit_generator=state, ale_state=ale_state)
@@ -83,9 +88,12 @@ class VectorWatch:
         envs: the vector environment.
         first: its first environment, or one made as that was; the vector itself if there is none.
         autoreset: how its environments reset themselves.
+        sparse: as for `GeneratorWatch`.
     """
 
-    def __init__(self, envs: VectorEnv[Any, Any, Any], first: Any, autoreset: AutoresetMode) -> None:
+    def __init__(
+        self, envs: VectorEnv[Any, Any, Any], first: Any, autoreset: AutoresetMode, sparse: bool = False
+    ) -> None:
         base: Any = envs.unwrapped
         self._watches: list[GeneratorWatch] = []
         self._async: Any = None
@@ -94,7 +102,7 @@ class VectorWatch:
         mode = mode_of(base)
         self._resets_itself = mode == "sync" and autoreset == AutoresetMode.NEXT_STEP
         if mode == "sync":
-            self._watches = [GeneratorWatch(env) for env in base.envs]
+            self._watches = [GeneratorWatch(env, sparse) for env in base.envs]
         elif mode == "custom":
             self._watches = [GeneratorWatch(base)]
         elif not (isinstance(first, gymnasium.Env) and is_atari(first.unwrapped)):

@@ -233,7 +233,7 @@ def record_vector(
         described = described_vector(envs, first)
         require_fixed(described)
         maker = vector_maker_of(envs, first, mode, checked_make(make))
-        watch = VectorWatch(envs, first, mode)
+        watch = VectorWatch(envs, first, mode, sparse=packing.get("steps") == "actions")
     if frames_every:
         require_pictures(envs)
     chosen = None if frames_of is None else tuple(sorted(set(np.atleast_1d(frames_of).tolist())))
