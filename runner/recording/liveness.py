@@ -7,6 +7,7 @@ import os
 import socket
 import time
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,13 +20,13 @@ HEARTBEAT_SECONDS: Final = 15.0
 
 def owner() -> dict[str, Any]:
     """Return the identity of this process: host, boot, process id and start."""
-    pid = os.getpid()
-    return {
-        "host": socket.gethostname(),
-        "boot_id": boot_id(),
-        "pid": pid,
-        "process_started": process_start(pid),
-    }
+    return {"host": socket.gethostname(), **_of_process(os.getpid())}
+
+
+@lru_cache(1)
+def _of_process(pid: int) -> dict[str, Any]:
+    """Return what does not change while this process lives."""
+    return {"boot_id": boot_id(), "pid": pid, "process_started": process_start(pid)}
 
 
 def is_alive(owner: Mapping[str, Any], heartbeat: Path) -> bool:

@@ -117,7 +117,9 @@ class CodeCollector:
         self._thread = threading.Thread(
             target=self._collect, args=(_cells(),), name="recording-code", daemon=True
         )
-        if self._is_wanted:
+        if self._is_wanted and (found := _recent.fresh(_cells())) is not None:
+            self._found = found
+        elif self._is_wanted:
             self._thread.start()
 
     def _collect(self, cells: str) -> None:
@@ -152,7 +154,7 @@ class CodeCollector:
         """
         if not self._is_wanted or self.entries:
             return
-        if wait:
+        if wait and self._found is None:
             self._thread.join(max(0.0, self._deadline - time.monotonic()))
         found = self._found
         if found is None:
@@ -185,16 +187,30 @@ class _Recent:
         """Replace the lock, in a forked process."""
         self.lock = threading.Lock()
 
+    def fresh(self, cells: str) -> RecordedCode | None:
+        """Return the code of this process, if it was read a few seconds ago."""
+        _, _, key = self._place(cells)
+        is_fresh = key == self.key and time.monotonic() - self.read_at <= _FRESH_SECONDS
+        return self.code if is_fresh else None
+
     def read(self, cells: str) -> RecordedCode:
         """Return the code of this process, read now or a few seconds ago."""
+        folder, script, key = self._place(cells)
+        with self.lock:
+            if (found := self.fresh(cells)) is not None:
+                return found
+            code = collect(folder, script, cells)
+            # In this order: `fresh` is called without the lock.
+            self.key, self.code = (), code
+            self.key, self.read_at = key, time.monotonic()
+            return code
+
+    @staticmethod
+    def _place(cells: str) -> tuple[Path, Path | None, tuple[str, ...]]:
+        """Return the folder of the user's script, the script, and a key of what is collected."""
         script = user_script()
         folder = Path.cwd() if script is None else script.parent
-        key = (str(folder), str(script), cells)
-        with self.lock:
-            if key != self.key or time.monotonic() - self.read_at > _FRESH_SECONDS:
-                self.code = collect(folder, script, cells)
-                self.key, self.read_at = key, time.monotonic()
-            return self.code
+        return folder, script, (str(folder), str(script), cells)
 
 
 _recent = _Recent()
