@@ -30,7 +30,7 @@ from runner.loops.values import as_array
 from runner.recording.gym_spaces import restore_space
 from runner.recording.gym_values import element_of
 from runner.recording.reader import Recording, open_recording
-from runner.replay.makers import is_whole_vector, make_environment, why_not_made
+from runner.replay.makers import make_environment, why_not_alone, why_not_made
 from runner.runs.checkpoints import Checkpoint
 from runner.runs.run import Run
 
@@ -99,8 +99,8 @@ def play_checkpoint(
         maker = recording.maker_of("eval")
     if maker is None or (reason := why_not_made(maker, trust)):
         raise CannotRedo(reason if maker else why_not_made(None, trust))
-    if is_whole_vector(maker):
-        raise CannotRedo("The environments of this vector cannot be made one by one, and one is needed here.")
+    if reason := why_not_alone(maker):
+        raise CannotRedo(reason)
     make, weights = policy_named(policy), checkpoint.load(trust)
     env = make_environment(maker, trust)
     is_game = maker.kind == "pettingzoo"

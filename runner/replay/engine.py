@@ -59,7 +59,10 @@ class Replay:
         make: Callable[[], Any] | None = None,
         draw_from: int = 0,
     ) -> None:
-        self._draw_from = draw_from
+        self.draw_from = draw_from
+        """The number of the first step after which pictures are drawn."""
+        self.drawn = 0
+        """The environment that is drawn, of a vector that is stepped as a whole."""
         self._recording, self._trust, self._make = recording, trust, make
         self._comparison = Comparison(recording, tolerance)
         self._report, self.render = report, render
@@ -116,7 +119,7 @@ class Replay:
         stepper = self.stepper(phase, environment)
         stepper.draws, first_drawn = False, 0
         if draws:
-            first_drawn = int(np.searchsorted(rows["step"].astype(np.int64), self._draw_from)) // width
+            first_drawn = int(np.searchsorted(rows["step"].astype(np.int64), self.draw_from)) // width
         end, stop = begin, len(rows) // width
         while end < stop or resets:
             if draws and not stepper.draws and end >= first_drawn:
@@ -171,7 +174,8 @@ class Replay:
             env = self._environment(maker, environment)
             try:
                 if environment == ALL and maker is not None and maker.vector is not None:
-                    stepper: Stepper = VectorStepper(env, self._recording, maker.vector.autoreset)
+                    autoreset = maker.vector.autoreset
+                    stepper: Stepper = VectorStepper(env, self._recording, autoreset, self.drawn)
                 elif maker is not None and maker.kind == "pettingzoo":
                     stepper = GameStepper(env, self._recording)
                 else:
@@ -188,14 +192,12 @@ class Replay:
         return self._steppers[key]
 
     def _environment(self, maker: EnvironmentMaker | None, environment: int) -> Any:
-        if environment == ALL and self.render:
-            raise CannotRedo("The environments of this vector cannot be made one by one, to draw themselves.")
         if self._make is not None:
             return self._make()
         if maker is None:
             raise CannotRedo(why_not_made(maker, self._trust))
         if environment == ALL:
-            return make_vector(maker, self._trust)
+            return make_vector(maker, self._trust, self.render)
         return make_environment(maker, self._trust, self.render)
 
 

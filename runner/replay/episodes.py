@@ -229,12 +229,15 @@ def _episode(
 
 def _episode_of_whole(recording: Recording, replay: Replay, target: _Target) -> Iterator[RedoneSteps]:
     """Yield the steps of one episode of a vector that is stepped as a whole, from its beginning."""
+    replay.drawn, replay.draw_from = target.environment, max(replay.draw_from, target.reset.step)
     for piece in pieces(recording, schema.PHASES, stop_time=target.stop_time):
-        for steps in replay.steps(piece, ALL, draws=False):
+        for steps in replay.steps(piece, ALL, draws=replay.render and piece.phase == target.phase):
             own = steps.without_rows()
             if piece.phase == target.phase and steps.environment == target.environment:
                 own = steps.since(target.reset.step)
-            if len(own) or own.difference is not None:
+                starts = tuple(start for start in own.starts if start.episode == target.reset.episode)
+                own = replace(own, starts=starts)
+            if len(own) or own.starts or own.difference is not None:
                 yield _numbered(own, target.number)
             if own.difference is not None:
                 return

@@ -27,6 +27,8 @@ from runner.replay.specifications import (
     why_not_imported,
 )
 
+_OF_VECTORS: Final = frozenset({"num_envs", "vectorization_mode", "vector_kwargs", "max_episode_steps"})
+"""Arguments of `make_vec` in the specification of a vector, which its environments do not take."""
 _PARALLEL: Final = "parallel_env"
 """The name of the function that makes a PettingZoo environment, in every package of them."""
 
@@ -91,16 +93,34 @@ def is_whole_vector(maker: EnvironmentMaker) -> bool:
     return vector.mode == "custom" or bool(maker.make) or bool(vector_wrappers(vector))
 
 
-def make_vector(maker: EnvironmentMaker, trust: bool) -> Any:
+def why_not_alone(maker: EnvironmentMaker) -> str:
+    """Return why one environment of a vector cannot be made; empty if it can be tried."""
+    reason = "The environments of this vector cannot be made one by one, and one is needed here."
+    vector = maker.vector
+    if vector is None or not is_whole_vector(maker):
+        return ""
+    return reason if maker.make or vector_wrappers(vector) or not parse_spec(maker.spec).entry_point else ""
+
+
+def make_vector(maker: EnvironmentMaker, trust: bool, render: bool = False) -> Any:
     """Return a vector environment as a loop had it, an asynchronous one as a `SyncVectorEnv`.
+
+    Args:
+        maker: of the recording.
+        trust: whether what the recording names may be imported.
+        render: whether its `render()` returns pictures, one of each environment.
 
     Raises:
         CannotRedo: it cannot be made; the message is why.
     """
     if reason := why_not_made(maker, trust):
         raise CannotRedo(reason)
+    if render:
+        _without_display()
     try:
-        return _made_by_function(maker.make, False) if maker.make and trust else _made_vector(maker, trust)
+        if maker.make and trust:
+            return _made_by_function(maker.make, render)
+        return _made_vector(maker, trust, render)
     except (CannotRedo, MemoryError):
         raise
     except Exception as error:  # foreign code raises anything
@@ -109,19 +129,22 @@ def make_vector(maker: EnvironmentMaker, trust: bool) -> Any:
         ) from error
 
 
-def _made_vector(maker: EnvironmentMaker, trust: bool) -> Any:
+def _made_vector(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
     import gymnasium
 
     assert maker.vector is not None
     if maker.vector.mode == "custom":
         spec, registered = _registered(maker, trust)
-        settings = {key: value for key, value in spec.kwargs.items() if key != "vectorization_mode"}
-        settings |= {"num_envs": maker.vector.number, "vectorization_mode": "vector_entry_point"}
+        settings = spec.kwargs | {
+            "num_envs": maker.vector.number,
+            "vectorization_mode": "vector_entry_point",
+        }
+        settings |= {"render_mode": "rgb_array"} if render else {}
         limit = spec.kwargs.get("max_episode_steps", spec.max_episode_steps)
         envs = gymnasium.make_vec(dataclasses.replace(registered, kwargs=settings, max_episode_steps=limit))
     else:
         envs = gymnasium.vector.SyncVectorEnv(
-            [lambda: make_environment(maker, trust)] * maker.vector.number,
+            [lambda: make_environment(maker, trust, render)] * maker.vector.number,
             autoreset_mode=gymnasium.vector.AutoresetMode(maker.vector.autoreset),
         )
     for name, entry_point, kwargs in vector_wrappers(maker.vector):
@@ -136,7 +159,7 @@ def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
     import gymnasium
 
     spec, registered = _registered(maker, trust)
-    kwargs = dict(spec.kwargs)
+    kwargs = {key: value for key, value in spec.kwargs.items() if key not in _OF_VECTORS}
     if render:
         creator = gymnasium.envs.registration.load_env_creator(spec.entry_point)
         modes = (getattr(creator, "metadata", None) or {}).get("render_modes", ())

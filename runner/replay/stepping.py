@@ -40,7 +40,8 @@ class Dtypes:
 class Results:
     """What an environment returned for some steps and resets, as it is recorded: arrays [rows], [resets]."""
 
-    def __init__(self, rows: int, resets: int, dtypes: Dtypes, learners: int) -> None:
+    def __init__(self, rows: int, resets: int, dtypes: Dtypes, learners: int, drawn: int = 0) -> None:
+        self._drawn = drawn
         self.observations: NDArray[Any] = np.empty(rows, dtypes.step)
         self.rewards: NDArray[np.float64] = np.zeros((rows, learners))
         self.terminated: NDArray[np.bool_] = np.zeros(rows, np.bool_)
@@ -51,6 +52,7 @@ class Results:
         self.agents_truncated = np.zeros(masks, np.uint32)
         self.first_observations: NDArray[Any] = np.empty(resets, dtypes.reset)
         self.frames: list[Frame] = []
+        """After each row; of a vector, after each step of all environments, of the one that is drawn."""
         self.first_frames: list[Frame] = []
         self.done = self.resets_done = 0
         """Rows and resets that are filled in; fewer than all if the environment raised `error`."""
@@ -75,7 +77,9 @@ class Results:
             setattr(part, name, getattr(self, name)[first::stride][rows])
         part.agents_terminated, part.agents_truncated = self.agents_terminated, self.agents_truncated
         part.first_observations = self.first_observations[list(resets)]
-        part.frames, part.first_frames, part.error = [], [], self.error
+        is_drawn, part.error = first == self._drawn, self.error
+        part.frames = [frame for frame, own in zip(self.frames, rows, strict=False) if own and is_drawn]
+        part.first_frames = self.first_frames if is_drawn else []
         part.done = int(np.count_nonzero(rows[: self.done // stride]))
         part.resets_done = sum(number < self.resets_done for number in resets)
         return part
@@ -157,6 +161,9 @@ class Stepper(ABC):
             base.ale.restoreState(ale_py.ALEState(state.ale_state))
         return None
 
+    def _render(self) -> Any:
+        return self.env.render()
+
     def draw(self) -> Frame:
         """Return a picture of the environment, [height, width, 3].
 
@@ -164,8 +171,8 @@ class Stepper(ABC):
             CannotRedo: it draws none.
         """
         try:
-            picture = np.asarray(self.env.render())
-        except MemoryError:
+            picture = np.asarray(self._render())
+        except (MemoryError, CannotRedo):
             raise
         except Exception as error:  # foreign code raises anything
             raise CannotRedo(

@@ -14,6 +14,7 @@ from runner.recording.gym_spaces import Space
 from runner.recording.gym_values import filler, leaves_of, put_chosen
 from runner.recording.reader import Recording
 from runner.replay.recorded import RecordedReset
+from runner.replay.redone import Frame
 from runner.replay.stepping import Results, Stepper
 
 _Numbered = tuple[int, RecordedReset]
@@ -26,11 +27,14 @@ class VectorStepper(Stepper):
     Args:
         env: the vector environment.
         recording: of a loop over such a vector.
-        autoreset: `NextStep`, `SameStep` or `Disabled`.
+        autoreset: `NextStep`, `SameStep` or `Disabled`; with `SameStep`, the picture after the last step of
+            an episode shows the beginning of the next one.
+        drawn: the environment that is drawn.
     """
 
-    def __init__(self, env: Any, recording: Recording, autoreset: str) -> None:
+    def __init__(self, env: Any, recording: Recording, autoreset: str, drawn: int = 0) -> None:
         super().__init__(env, recording)
+        self._drawn = drawn
         self._autoreset, self._n = autoreset, recording.environments
         if env.num_envs != self._n:
             raise CannotRedo(f"The vector has {env.num_envs} environments, and the recording {self._n}.")
@@ -52,7 +56,7 @@ class VectorStepper(Stepper):
             resets: step of each environment, and reset, in order; each comes before its step.
         """
         n, times = self._n, len(rows) // self._n
-        results = Results(len(rows), len(resets), self.dtypes, 1)
+        results = Results(len(rows), len(resets), self.dtypes, 1, self._drawn)
         by_time: dict[int, list[_Numbered]] = {}
         for number, (time, reset) in enumerate(resets):
             by_time.setdefault(time, []).append((number, reset))
@@ -63,19 +67,36 @@ class VectorStepper(Stepper):
                 here = by_time.get(time, [])
                 automatic = only_reset[time]
                 self._reset_before(here, automatic, results)
+                first = self._first_frame(here, automatic)
                 self._step(time, actions[time], results)
+                if self.draws:
+                    results.frames.append(self.draw())
+                    results.first_frames += first or ([results.frames[-1]] if automatic[self._drawn] else [])
                 for number, reset in here:
                     if automatic[reset.environment]:
                         results.first_observations[number] = self._last[reset.environment]
                 results.done += n
                 results.resets_done += len(here)
-            self._reset_before(by_time.get(times, []), np.zeros(n, np.bool_), results)
+            left, none = by_time.get(times, []), np.zeros(n, np.bool_)
+            self._reset_before(left, none, results)
+            results.first_frames += self._first_frame(left, none)
             results.resets_done = len(resets)
         except (MemoryError, CannotRedo):
             raise
         except Exception as error:  # foreign code raises anything
             results.error = error
         return results
+
+    def _first_frame(self, resets: Sequence[_Numbered], automatic: NDArray[np.bool_]) -> list[Frame]:
+        """Return a picture for each reset of the environment that is drawn, but those that a step does."""
+        own = [reset for _, reset in resets if reset.environment == self._drawn]
+        return [self.draw() for _ in own] if self.draws and not automatic[self._drawn] else []
+
+    def _render(self) -> Any:
+        pictures = self.env.render()
+        if pictures is None or len(pictures) != self._n:
+            raise CannotRedo("The vector environment draws no pictures of its environments.")
+        return pictures[self._drawn]
 
     def _raw_actions(self, rows: NDArray[np.void]) -> NDArray[Any]:
         if self._recording.kind != "step":

@@ -169,3 +169,12 @@ def test_what_cannot_be_evaluated_says_why(folder):
         assert dualtaxi(folder, "values", pole.run_id, *words).exit_code == 2
     words = ["--episode", "9999", "--checkpoint", "@0", "--policy", "agent_of_test:values"]
     assert "no training episode 9999" in dualtaxi(folder, "values", pole.run_id, *words).output
+
+
+def test_a_vector_of_a_class_of_its_own_is_played_by_one_environment(tmp_path):
+    envs = gymnasium.make_vec("CartPole-v1", 2, vectorization_mode="vector_entry_point")
+    with runner.record_vector(envs, tmp_path) as rec:
+        rec.checkpoint("policy", {"w": BALANCING})
+    (checkpoint,) = rec.run.checkpoints()
+    played = play_checkpoint(rec.run, checkpoint, "agent_of_test:policy", tmp_path, 2, 5)
+    assert played.summary["last_evaluation"]["mean_return"] == 500

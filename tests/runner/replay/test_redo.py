@@ -200,6 +200,38 @@ def test_few_pictures_are_in_memory_after_episodes_that_are_not_drawn(tmp_path):
     assert max(blocks) <= 32
 
 
+@pytest.mark.parametrize("kind", ["own class", "wrapped"])
+def test_a_vector_that_cannot_be_taken_apart_draws_its_episodes(kind, tmp_path):
+    def make_envs(render_mode=None):
+        mode = "vector_entry_point" if kind == "own class" else "sync"
+        envs = gymnasium.make_vec("CartPole-v1", 3, vectorization_mode=mode, render_mode=render_mode)
+        return envs if kind == "own class" else NormalizeVector(envs)
+
+    envs = make_envs("rgb_array")
+    with runner.record_vector(make_envs(), tmp_path) as recorded:
+        recorded.action_space.seed(1)
+        actions = [recorded.action_space.sample() for _ in range(150)]
+        recorded.reset(seed=4)
+        for action in actions:
+            recorded.step(action)
+    envs.reset(seed=4)
+    shown = [envs.render()[1].copy()] + [
+        [envs.step(action), envs.render()[1].copy()][1] for action in actions
+    ]
+    with open_recording(recorded.run.recording) as recording:
+        own = (k for k in range(12) if recording.episode_span("train", k).start % 3 == 1)
+        first, second = next(own), next(own)
+        spans = [recording.episode_span("train", k) for k in (first, second)]
+    for number, span in ((first, spans[0]), (second, spans[1])):
+        blocks = list(redo_in_child(recorded.run.recording, "train", [number], render=True))
+        assert all(block.difference is None for block in blocks)
+        frames = [start.frame for block in blocks for start in block.starts]
+        frames += [frame for block in blocks for frame in block.frames]
+        assert len(frames) == len(span) + 1
+        for k, frame in enumerate(frames):
+            assert (frame == shown[span.start // 3 + k]).all(), k
+
+
 def test_large_pictures_come_one_by_one(tmp_path):
     path = record(loops.Wide(), tmp_path, 100, make="tests.runner.replay.loops:Wide")
     with open_recording(path) as recording:
