@@ -24,7 +24,7 @@ from runner.integrations.hooks import WatchedEnvironment, hook_environments, ope
 from runner.loops.description import Described
 from runner.loops.env import record
 from runner.loops.loop import Loop, open_loops
-from runner.loops.options import options_of
+from runner.loops.options import PACKING, options_of
 from runner.loops.pictures import Picture
 from runner.loops.recorded import ending_of
 from runner.loops.values import arrays_of, warn_user
@@ -37,6 +37,10 @@ from runner.util.values import is_whole
 STEP_NAME: Final = "global_step"
 """The name under which the script's own step is recorded, before the values that it gave with it."""
 MAX_NAMES: Final = 10_000
+OPTIONS: Final = frozenset(
+    {*("frame_format", "frames_every", "frames_of", "info", "make", "on_error", "steps"), *PACKING}
+)
+"""The arguments of `runner.record` and `record_vector` that a script may add."""
 _MAX_WAITING: Final = 10_000
 """The most values that wait for an environment."""
 _MAX_WAITING_BYTES: Final = 1 << 28
@@ -81,6 +85,10 @@ class ScriptRun:
         note: a note.
         has_environment: whether to wait for an environment, and to record it.
         takes_writers: whether a `SummaryWriter` made meanwhile logs into this run.
+        options: further arguments of `runner.record`, such as `steps`, `frames_every` and `on_error`.
+
+    Raises:
+        ConfigError: `runner.record` has no such argument.
     """
 
     def __init__(
@@ -92,7 +100,12 @@ class ScriptRun:
         note: str = "",
         has_environment: bool = True,
         takes_writers: bool = False,
+        **options: Any,
     ) -> None:
+        if unknown := sorted(options.keys() - OPTIONS):
+            expected = ", ".join(sorted(OPTIONS))
+            raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {expected}")
+        self._options = options
         self.settings: dict[str, Any] = dict(settings or {})
         self.name, self.takes_writers = name, takes_writers
         self.closed = self.has_writer = False
@@ -246,7 +259,10 @@ class ScriptRun:
         described = Described("step", nothing, nothing, env_id="none")
         given = self._arguments()
         name = given.pop("name") or script_name()
-        options = options_of(self._recordings, name, info=(), packing={"run_id": self.run_id}, **given)
+        packing = {key: value for key, value in self._options.items() if key in PACKING}
+        options = options_of(
+            self._recordings, name, info=(), packing=packing | {"run_id": self.run_id}, **given
+        )
         maker = EnvironmentMaker("gymnasium", reason="values were logged, and no environment was recorded")
         self._values = rows = ValueRows()
         loop: Loop[Any] = Loop(described, options, maker, lambda *_: rows)
@@ -263,7 +279,7 @@ class ScriptRun:
             return
         recorder: Any = record_vector if isinstance(env, VectorEnv) else record
         given = self._arguments()
-        recorded = recorder(env, self._recordings, run_id=self.run_id, **given)
+        recorded = recorder(env, self._recordings, run_id=self.run_id, **given, **self._options)
         self._watched = WatchedEnvironment(env, recorded)
         self._begin_own(recorded._loop)
 

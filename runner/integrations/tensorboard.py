@@ -57,7 +57,11 @@ class SummaryWriter:
         filename_suffix: ignored.
         recordings: the recordings folder or a server, as for `runner.record`.
         monitor_gym: whether to record an environment.
-        **more: ignored: what only other writers take.
+        **options: further arguments of `runner.record`, such as `steps`, `frames_every` and `on_error`;
+            what only the writer of tensorboardX takes is ignored.
+
+    Raises:
+        ConfigError: an argument is unknown.
     """
 
     def __init__(
@@ -71,8 +75,10 @@ class SummaryWriter:
         *,
         recordings: str | os.PathLike[str] | None = None,
         monitor_gym: bool = True,
-        **more: Any,  # noqa: ARG002
+        **options: Any,
     ) -> None:
+        log_dir = options.pop("logdir", log_dir)
+        options.pop("write_to_disk", None)
         if log_dir is None:
             self.log_dir = f"runs/{datetime.now():%b%d_%H-%M-%S}_{socket.gethostname()}{comment}"
         else:
@@ -86,7 +92,7 @@ class SummaryWriter:
             self._run.has_writer = True
         else:
             name = None if log_dir is None else run_name(self.log_dir)
-            self._run = ScriptRun(recordings, name, has_environment=monitor_gym)
+            self._run = ScriptRun(recordings, name, has_environment=monitor_gym, **options)
 
     @property
     def run(self) -> Run | None:

@@ -310,7 +310,7 @@ def init(
     tensorboard: bool | None = None,
     monitor_gym: bool | None = None,
     recordings: str | os.PathLike[str] | None = None,
-    **ignored: Any,
+    **more: Any,
 ) -> Tracked:
     """Begin a run.
 
@@ -328,14 +328,13 @@ def init(
         tensorboard: the same.
         monitor_gym: False records values only, and not the environment.
         recordings: the recordings folder, or the address of a server, as for `runner.record`.
-        **ignored: other arguments of wandb's, without effect.
+        **more: further arguments of `runner.record`, such as `steps`, `frames_every` and `on_error`; other
+            arguments of wandb's have no effect.
 
     Raises:
         ConfigError: an argument is unknown or cannot be used.
     """
     global run  # noqa: PLW0603 - wandb.run is part of the shape
-    if unknown := sorted(set(ignored) - _IGNORED):
-        raise ConfigError(f"init: found the argument {unknown[0]!r}, which wandb.init does not have")
     if run is not None and not run.script.closed:
         if not reinit or reinit == "return_previous":
             warn_user(
@@ -354,6 +353,7 @@ def init(
         note=notes or "",
         has_environment=monitor_gym is not False,
         takes_writers=True,
+        **{key: value for key, value in more.items() if key not in _IGNORED},
     )
     if is_disabled:
         script.discard()

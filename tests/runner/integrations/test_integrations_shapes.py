@@ -197,6 +197,18 @@ def test_values_without_an_environment_are_a_run_of_their_own():
     assert verify_by_redoing(run.recording).reason == "No steps were recorded."
 
 
+def test_options_of_recording_can_be_given():
+    env = gymnasium.make("CartPole-v1", render_mode="rgb_array")
+    with SummaryWriter(steps="actions", frames_every=10, index="chunk"):
+        env.reset(seed=1)
+        env.step(0)
+    with runner.open_recording(the_run().recording) as recording:
+        assert recording.count(recording.topic("/train/frame")) == 1
+        assert recording.config["recording"]["steps"] == "actions"
+    with pytest.raises(ConfigError, match="found the argument 'step', expected one of chunk_steps"):
+        SummaryWriter(step="actions")
+
+
 def test_many_values_do_not_wait_for_an_environment_for_ever():
     writer = SummaryWriter("runs/many")
     for step in range(10_000):
@@ -425,7 +437,8 @@ def test_calls_without_effect_say_so_once_and_unknown_names_what_there_is(monkey
         wandb.sweep  # noqa: B018
     with pytest.raises(AttributeError, match="has no 'log_artifact', but config"):
         wandb.run.log_artifact  # noqa: B018
-    with pytest.raises(ConfigError, match="found the argument 'projekt'"):
+    wandb.finish()
+    with pytest.raises(ConfigError, match="found the argument 'projekt', expected one of"):
         wandb.init(projekt="x")
 
 
