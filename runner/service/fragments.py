@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import importlib
 import json
 import os
 import sys
 import threading
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from functools import lru_cache
@@ -33,6 +35,7 @@ from runner.export.reports.playback import playback_of
 from runner.export.reports.rendering import Link, partials
 from runner.export.rerun.location import locate
 from runner.export.rerun.selection import Request
+from runner.recording import schema
 from runner.recording.clock import read_clock
 from runner.recording.console import read_console
 from runner.recording.host import read_host
@@ -47,6 +50,9 @@ from runner.sweep.state import read_sweep
 
 MAX_OUTPUT_LINES: Final = 1000
 """Lines of output that a page shows."""
+MAX_PICTURES: Final = 48
+"""Logged pictures that a page shows, of `MAX_PICTURE_BYTES` together."""
+MAX_PICTURE_BYTES: Final = 16 << 20
 _STEPS_BEFORE: Final = 1
 """Steps before the first one of a part, so that it includes the step that led there."""
 
@@ -116,6 +122,40 @@ def system(path: Path) -> bytes:
     text = "Use of the machine was not recorded." if host is None else ""
     html = shown.pairs("Time and machine", facts)
     return str(html + shown.charts("machine", "Over time", text, machine_plots(clock, host))).encode()
+
+
+def pictures(path: Path) -> bytes:
+    """Return the last pictures and films that were logged under a name, the newest first, as HTML."""
+    last: deque[tuple[str, int, bytes]] = deque()
+    size = total = 0
+    with open_recording(path) as recording:
+        for image in recording.decoded(schema.IMAGE_TOPIC):
+            total, size = total + 1, size + len(image["data"])
+            last.append((image["frame_id"], image["log_time"] // schema.STEP_NANOSECONDS, image["data"]))
+            while len(last) > MAX_PICTURES or size > MAX_PICTURE_BYTES:
+                size -= len(last.popleft()[2])
+    figures = [
+        Markup(
+            '<figure><img src="data:{};base64,{}" alt=""><figcaption>{}, step {:,}</figcaption></figure>'
+        ).format(media_type, base64.b64encode(data).decode(), name, step)
+        for name, step, data in reversed(last)
+        if (media_type := _media_type(data))
+    ]
+    texts = ["No picture was logged."] if not total else []
+    if len(figures) < total:
+        texts = [f"The last {len(figures):,} of {total:,} pictures."]
+    return str(
+        partials().paragraphs(texts) + Markup('<div class="logged">{}</div>').format(Markup().join(figures))
+    ).encode()
+
+
+def _media_type(data: bytes) -> str | None:
+    """Return the media type of a picture; None if it is none that browsers show."""
+    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "image/png"
+    if data.startswith(b"\xff\xd8\xff"):
+        return "image/jpeg"
+    return "image/webp" if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else None
 
 
 def console(path: Path, sought: str, stream: str) -> bytes:

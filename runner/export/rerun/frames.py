@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -12,11 +14,13 @@ from runner.errors import CannotRedo
 from runner.export.encoded import encoded_picture
 from runner.export.painting import EnvironmentDiffers, redrawn
 from runner.export.pictures import Source, source_of
+from runner.export.rerun.members import entity_name
 from runner.export.rerun.selection import MAX_MEMBERS
 from runner.recording.messages import frame_place
 from runner.recording.reader import Recording
-from runner.recording.schema import STEP_NANOSECONDS
+from runner.recording.schema import IMAGE_TOPIC, STEP_NANOSECONDS
 from runner.replay.steps import environment_of, frames_every, log_times_of
+from runner.util.extras import require
 
 
 class FrameSender:
@@ -35,6 +39,8 @@ class FrameSender:
         self._stream, self._root, self._recording, self._names = stream, root, recording, names
         self._sent: dict[str, dict[int, int]] = {}
         """The step of the last picture, by phase and environment."""
+        self._logged: dict[str, None] = {}
+        """The names of logged pictures, in order."""
 
     def send_recorded(self, phase: str) -> None:
         """Send the frames that were recorded, each with the step of its own environment."""
@@ -44,6 +50,18 @@ class FrameSender:
             if environment < n:
                 step = max(0, frame["log_time"] // STEP_NANOSECONDS - (n - 1 - environment))
                 self._send(phase, environment, step, frame["data"], is_each_step)
+
+    def send_logged(self) -> None:
+        """Send the pictures that were logged under a name; of a film its first frame."""
+        for image in self._recording.decoded(IMAGE_TOPIC):
+            name, data = entity_name(image["frame_id"]), image["data"]
+            if (kind := _media_type(data)) is None:
+                data, kind = _first_frame(data), "image/png"
+            if data:
+                self._logged[name] = None
+                self._stream.set_time("step", sequence=image["log_time"] // STEP_NANOSECONDS)
+                picture = rr.EncodedImage(contents=data, media_type=kind)
+                self._stream.log(f"{self._root}/picture/{name}", picture)
 
     def draw(
         self, phase: str, episodes: Sequence[int], trust: bool, stage: Callable[[str], None]
@@ -85,9 +103,8 @@ class FrameSender:
         sent = self._sent.setdefault(phase, {})
         if not is_each_step or sent.get(environment, -1) < step:
             sent[environment] = step
-            kind = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
             self._stream.set_time("step", sequence=step)
-            image = rr.EncodedImage(contents=data, media_type=kind)
+            image = rr.EncodedImage(contents=data, media_type=_media_type(data) or "image/jpeg")
             self._stream.log(self._entity(phase, environment), image)
 
     def views(self) -> list[rrb.Container]:
@@ -103,7 +120,31 @@ class FrameSender:
                 for environment in shown
             ]
             grids.append(rrb.Grid(*views, grid_columns=math.ceil(math.sqrt(len(views)))))
+        if self._logged:
+            pictures = [
+                rrb.Spatial2DView(origin=f"{self._root}/picture/{name}", name=name)
+                for name in islice(self._logged, MAX_MEMBERS)
+            ]
+            grids.append(rrb.Grid(*pictures, grid_columns=math.ceil(math.sqrt(len(pictures)))))
         return grids
 
     def _entity(self, phase: str, environment: int) -> str:
         return "/".join([self._root, phase, *filter(None, [self._names[environment]]), "frame"])
+
+
+def _media_type(data: bytes) -> str | None:
+    """Return the media type of a picture if Rerun shows it."""
+    if data.startswith(b"\x89PNG"):
+        return "image/png"
+    return "image/jpeg" if data.startswith(b"\xff\xd8") else None
+
+
+def _first_frame(data: bytes) -> bytes:
+    """Return the first frame of a film as PNG; empty if it is none."""
+    image = require("PIL.Image", extra="plots", purpose="logged films in Rerun")
+    try:
+        with image.open(io.BytesIO(data), formats=["WEBP"]) as film:
+            film.convert("RGB").save(buffer := io.BytesIO(), "png")
+    except (OSError, ValueError, image.DecompressionBombError):
+        return b""
+    return buffer.getvalue()

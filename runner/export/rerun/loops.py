@@ -103,6 +103,7 @@ class LoopExporter:
         for phase in schema.PHASES:
             self._send_episodes(phase)
             self._frames.send_recorded(phase)
+        self._frames.send_logged()
         self._send_logged()
         self._send_texts()
         self._send_arrays()

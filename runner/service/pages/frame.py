@@ -8,6 +8,7 @@ from typing import Final
 from runner.analysis.evaluations import loop_summary
 from runner.errors import RecordingError
 from runner.export.reports.rendering import View
+from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics, Summary
 from runner.runs.run import Run
@@ -20,6 +21,7 @@ TABS: Final = (
     ("learned", "What was learned"),
     ("config", "Configuration"),
     ("code", "Code"),
+    ("pictures", "Pictures"),
     ("system", "System"),
     ("console", "Console"),
     ("rerun", "Rerun"),
@@ -51,6 +53,11 @@ class RunView(View):
 
 def head_of(run: Run) -> RunHead:
     """Return the facts of a run that all of its pages show."""
+    has_tab = {
+        "learned": has_tables(run),
+        "pictures": bool(run.summary.messages.get(schema.IMAGE_TOPIC.name))
+        or (run.status == "running" and not has_tables(run)),
+    }
     return RunHead(
         id=run.run_id,
         name=run.name,
@@ -59,7 +66,7 @@ def head_of(run: Run) -> RunHead:
         created=run.created.isoformat(),
         tags=run.tags,
         note=run.note,
-        tabs=tuple(tab for tab in TABS if str(tab[0]) != "learned" or has_tables(run)),
+        tabs=tuple(tab for tab in TABS if has_tab.get(tab[0], True)),
     )
 
 

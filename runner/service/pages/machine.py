@@ -1,4 +1,4 @@
-"""The pages of how a run went on its machine: what it used over time, and what it printed."""
+"""The pages of how a run went: what it used of its machine over time, what it printed, and its pictures."""
 
 from __future__ import annotations
 
@@ -73,6 +73,13 @@ async def system_part(run: RecordedRun, compute: ComputationOf, status: Status =
     if run.status != status:
         return Response(status_code=HTTPStatus.NO_CONTENT)
     return Response(await compute(fragments.system), media_type="text/html")
+
+
+@router.get("/pictures")
+async def pictures(request: Request, run: RecordedRun, compute: ComputationOf) -> Response:
+    """Show the last pictures and films that were logged."""
+    body = (await compute(fragments.pictures)).decode()
+    return await run_in_threadpool(page, request, _SystemView(head_of(run), "pictures", body, ""))
 
 
 @router.get("/console")

@@ -22,6 +22,7 @@ from runner.export.rerun.location import locate
 from runner.export.rerun.runs import Source
 from runner.export.rerun.selection import Request, select
 from runner.export.rerun.writing import export
+from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from tests.runner.export.making import made_otherwise
@@ -224,3 +225,17 @@ def test_a_loop_whose_environment_cannot_be_made_again_is_exported_without_pictu
     assert any("No train pictures: " in text for text in exported.selection.warnings)
     assert "/train/frame" not in exported.entities
     assert "/train/reward" in exported.entities
+
+
+def test_logged_pictures_are_shown_by_name_and_of_films_the_first_frame(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (2, 6, 8, 3), np.uint8)
+    with SummaryWriter(recordings=tmp_path, monitor_gym=False) as writer:
+        writer.add_image("one", pixels[0], 3, dataformats="HWC")
+        writer.add_video("film", pixels[None], 5, dataformats="NTHWC")
+    with open_recording(writer.run.recording) as recording:
+        exported = Exported(recording, tmp_path / "run.rrd")
+    ((step, shown),) = picture_rows(exported, "/picture/one")
+    assert step == 3
+    assert (np.asarray(Image.open(io.BytesIO(bytes(shown)))) == pixels[0]).all()
+    ((step, shown),) = picture_rows(exported, "/picture/film")
+    assert (step, Image.open(io.BytesIO(bytes(shown))).size) == (5, (8, 6))

@@ -8,11 +8,13 @@ import json
 import re
 import sys
 
+import numpy as np
 import pytest
 from submitted import ICY
 
 import runner
 from runner.environments.naming import deeds_in_words, states_in_words
+from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import reader
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
@@ -234,6 +236,20 @@ def test_output_is_shown_escaped_and_searched(client, recordings, capsys):
     assert "No line was found" in page_of(client, "/runs/printing/console?q=nothing")
     assert client.get("/runs/printing/console/part?status=running").status_code == 204
     assert client.get("/runs/printing/console?stream=else", headers=ACCEPT_HTML).status_code == 422
+
+
+def test_logged_pictures_are_shown_newest_first_with_their_steps(client, recordings):
+    with SummaryWriter("runs/pictured", recordings=recordings, monitor_gym=False) as writer:
+        for step in (1, 2):
+            writer.add_image("<b>", np.full((3, 4, 4), 50 * step, np.uint8), step)
+        writer.add_video("film", np.zeros((1, 2, 3, 4, 4), np.uint8), 1_234)
+    page = page_of(client, "/runs/pictured/pictures")
+    assert page.count("<img src=") == 3
+    assert page.index("film, step 1,234") < page.index("&lt;b&gt;, step 2") < page.index("&lt;b&gt;, step 1<")
+    assert "data:image/webp;base64," in page
+    assert "/pictures" in page_of(client, "/runs/pictured")
+    assert "/pictures" not in page_of(client, "/runs/first")
+    assert "No picture was logged" in page_of(client, "/runs/first/pictures")
 
 
 def test_the_time_and_the_machine_are_shown(client, recordings):
