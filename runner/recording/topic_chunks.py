@@ -152,6 +152,8 @@ class TopicChunks:
         self._dtype = dtype
         self._lost = lost
         self._path = path
+        self._last: tuple[bytes, NDArray[np.void]] | None = None
+        """The records of a chunk that was checked last, and the array of them."""
 
     def __len__(self) -> int:
         return len(self._places)
@@ -256,11 +258,14 @@ class TopicChunks:
     def _block(self, k: int, data: bytes) -> NDArray[np.void]:
         """Return chunk number k as an array, after checking its constant bytes."""
         assert self._dtype is not None
+        if self._last is not None and self._last[0] is data:
+            return self._last[1]
         block = np.frombuffer(data, dtype=self._dtype)
         if (block["channel_id"] != self._topic.channel).any() or (
             block["record_length"] != self._dtype.itemsize - RECORD_HEAD.size
         ).any():
             raise self._damaged(k, f"other messages than of {self._topic.name}")
+        self._last = data, block
         return block
 
     def _damaged(self, k: int, found: str) -> RecordingError:

@@ -1,0 +1,175 @@
+"""RLlib's env runners record one run: training, evaluation, results, a killed runner, trials of Tune."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+
+import runner
+from runner.errors import RunnerError
+from runner.execution.redo import verify_by_redoing
+from runner.recording.reader import open_recording
+from runner.runs.shards import shards_of
+
+ray = pytest.importorskip("ray")
+pytest.importorskip("ray.rllib")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cluster():
+    ray.init(num_cpus=4, include_dashboard=False, log_to_driver=False, ignore_reinit_error=True)
+    yield
+    ray.shutdown()
+
+
+def configured(recording, **env_runners):
+    from ray.rllib.algorithms.ppo import PPOConfig
+
+    return (
+        PPOConfig()
+        .environment("CartPole-v1")
+        .env_runners(num_env_runners=2, num_envs_per_env_runner=2, **env_runners)
+        .training(train_batch_size=400, minibatch_size=100, num_epochs=1, lr=0.001)
+        .debugging(seed=3)
+        .callbacks(recording)
+    )
+
+
+def test_env_runners_and_evaluation_make_one_run(recordings):
+    from runner.integrations.rllib import Recording
+
+    recording = Recording(recordings, name="ppo", config={"mine": 1}, checkpoint_every=2)
+    config = configured(recording).evaluation(
+        evaluation_interval=1, evaluation_num_env_runners=1, evaluation_duration=2
+    )
+    algorithm = config.build_algo()
+    (live,) = runner.list_runs(recordings)
+    assert live.status == "running"
+    results = [algorithm.train() for _ in range(3)]
+    assert [shard.run_id for shard in shards_of(live)] == ["env-runner-1", "env-runner-2", "evaluation-1"]
+    algorithm.stop()
+
+    (run,) = runner.list_runs(recordings)
+    assert (run.status, run.name, run.seed) == ("finished", "ppo", 3)
+    assert run.summary.train_steps == results[-1]["num_env_steps_sampled_lifetime"]
+    assert run.file.config["config"]["lr"] == 0.001
+    assert run.file.config["config"]["algorithm"] == "PPO"
+    assert run.file.config["config"]["mine"] == 1
+    logged = run.summary.logged
+    assert logged["training_iteration"] == 3
+    assert not any("timer" in name or "throughput" in name for name in logged)
+    with open_recording(run.recording) as recording:
+        assert [(shard.name, shard.environments) for shard in recording.shards] == [
+            ("", 1),
+            ("env-runner-1", 2),
+            ("env-runner-2", 2),
+            ("evaluation-1", 2),
+        ]
+        returns = [
+            (one["step"], one["value"])
+            for one in recording.decoded(recording.topic("/scalar"))
+            if one["name"] == "env_runners/episode_return_mean"
+        ]
+        ended = recording.episodes("train")
+        assert {len(block) for block in recording.blocks(recording.topic("/eval/reset"))}
+    steps = [result["num_env_steps_sampled_lifetime"] for result in results]
+    expected = [result["env_runners"]["episode_return_mean"] for result in results]
+    assert returns == list(zip(steps, expected, strict=True))
+    ended_by_themselves = int(np.count_nonzero(ended["terminated"] | ended["truncated"]))
+    assert ended_by_themselves == results[-1]["env_runners"]["num_episodes_lifetime"]
+    assert len(run.checkpoints()) == 2
+    redone = verify_by_redoing(run.recording)
+    assert (redone.verdict, redone.left_out) == ("reproduced", 0)
+    assert redone.steps == run.summary.train_steps + run.summary.eval_steps
+
+
+def test_an_env_runner_that_is_killed_is_replaced(recordings):
+    from runner.integrations.rllib import Recording
+
+    config = configured(Recording(recordings)).fault_tolerance(
+        restart_failed_env_runners=True, delay_between_env_runner_restarts_s=0
+    )
+    algorithm = config.build_algo()
+    algorithm.train()
+    time.sleep(1.2)  # what is older than a second is kept
+    pids = algorithm.env_runner_group.foreach_env_runner(lambda _: os.getpid(), local_env_runner=False)
+    os.kill(pids[0], signal.SIGKILL)
+    for _ in range(8):
+        algorithm.train()
+        (live,) = runner.list_runs(recordings)
+        if len(shards_of(live)) == 3:
+            break
+        time.sleep(1)
+    algorithm.train()
+    algorithm.stop()
+    (run,) = runner.list_runs(recordings)
+    assert run.status == "finished"
+    with open_recording(run.recording) as recording:
+        shards = {shard.name: shard for shard in recording.shards}
+    assert len(shards) == 4
+    assert sorted(shard.status for shard in shards.values()) == [
+        "finished",
+        "finished",
+        "finished",
+        "interrupted",
+    ]
+    killed = next(shard for shard in shards.values() if shard.status == "interrupted")
+    assert killed.train_steps > 100
+    assert sum(shard.train_steps for shard in shards.values()) == run.summary.train_steps
+    assert verify_by_redoing(run.recording).verdict == "reproduced"
+
+
+def test_without_env_runners_the_algorithm_steps_itself(recordings):
+    from runner.integrations.rllib import Recording
+
+    config = configured(Recording(recordings)).env_runners(num_env_runners=0)
+    algorithm = config.build_algo()
+    algorithm.train()
+    algorithm.stop()
+    (run,) = runner.list_runs(recordings)
+    assert run.summary.train_steps >= 400
+    assert run.name == "PPO-CartPole-v1"
+
+
+def test_a_trial_of_tune_is_a_run(recordings):
+    from ray import tune
+
+    from runner.integrations.rllib import Recording
+
+    config = configured(Recording(recordings)).env_runners(num_env_runners=1)
+    config = config.training(lr=tune.grid_search([0.001, 0.01]))
+    results = tune.Tuner(
+        "PPO",
+        param_space=config,
+        run_config=tune.RunConfig(
+            stop={"training_iteration": 1}, storage_path=str(recordings.parent / "tune"), verbose=0
+        ),
+    ).fit()
+    assert not results.errors
+    runs = runner.list_runs(recordings)
+    assert sorted(run.file.config["config"]["lr"] for run in runs) == [0.001, 0.01]
+    assert all(run.name.startswith("PPO_CartPole-v1") for run in runs), [run.name for run in runs]
+    assert {run.status for run in runs} <= {"finished", "interrupted"}
+    assert all(run.summary.train_steps >= 400 for run in runs)
+
+
+def test_environments_of_several_agents_are_refused(recordings):
+    from ray.rllib.algorithms.ppo import PPOConfig
+    from ray.rllib.examples.envs.classes.multi_agent import MultiAgentCartPole
+
+    from runner.integrations.rllib import Recording
+
+    config = (
+        PPOConfig()
+        .environment(MultiAgentCartPole, env_config={"num_agents": 2})
+        .env_runners(num_env_runners=0)
+        .multi_agent(policies={"shared"}, policy_mapping_fn=lambda *_, **__: "shared")
+        .callbacks(Recording(recordings))
+    )
+    with pytest.raises(RunnerError, match="environments of several agents cannot be recorded"):
+        config.build_algo()
+    assert not runner.list_runs(recordings)
