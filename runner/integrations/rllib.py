@@ -171,7 +171,7 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
             name = re.sub(r"_[\d-]{10}_[\d-]{8}$", "", trial)  # RLlib keeps no other name of a trial
         options = options_of(
             recording.recordings,
-            recording.name or name,
+            recording.name or re.sub(r"[^A-Za-z0-9_.+/-]", "-", name)[:100],
             config.seed if recording.seed is None else recording.seed,
             {**_settings(algorithm), **recording.config},
             recording.options["info"],
