@@ -79,7 +79,7 @@ def recorded(run: Run) -> Run:
         return run
     if run.status == "running":
         raise RunnerError(f"run {run.run_id} has no recording yet: it has just begun.")
-    if "made_by" in run.file.config:
+    if run.is_loop:
         raise RunnerError(
             f"run {run.run_id} has no recording, and only the loop that recorded it can make another."
         )

@@ -124,19 +124,20 @@ class Follower:
             self._client.close()
 
     def _follow(self) -> None:
-        pause, upload, is_stale = FOLLOW_SECONDS, None, False
+        pause, upload = FOLLOW_SECONDS, None
         while not self._over.wait(pause):
             try:
                 if upload is None:
                     upload = self._client.begin_upload(name=self._run.name, run_id=self._run.run_id)
                     _write_push_file(self._run, _Push(self._client.url, upload.id))
-                if is_stale:
-                    upload, is_stale = self._client.upload_status(upload), False
+                upload = self._client.upload_status(upload)  # so the server knows that the loop goes on
+                if upload.stop_requested and not self._run.is_stop_requested:
+                    self._run.request_stop()
                 while upload.offset < (size := self._size()) and not self._over.is_set():
                     upload = self._client.append_upload(upload, self._run.recording, size)
                 pause = FOLLOW_SECONDS
             except ServerUnavailable:
-                pause, is_stale = min(2 * pause, MAX_PAUSE), upload is not None
+                pause = min(2 * pause, MAX_PAUSE)
             except RunnerError:
                 return  # reported when the rest is pushed
 

@@ -83,6 +83,9 @@ class Loop(Generic[R]):
         StorageError: the recordings folder cannot be written.
     """
 
+    should_stop = False
+    """Whether somebody requested that the loop stops."""
+
     def __init__(
         self,
         described: Described,
@@ -473,6 +476,7 @@ class Loop(Generic[R]):
 
         Returns whether to call it again.
         """
+        self.should_stop = self.should_stop or (self.options.join or self.run).is_stop_requested
         if not self.lock.acquire(timeout=0.1):
             return True
         try:

@@ -58,7 +58,7 @@ def find_joined(join: object, recordings: str | os.PathLike[str] | None) -> Run:
 
 
 def _require_open(run: Run) -> None:
-    if "made_by" not in run.file.config:
+    if not run.is_loop:
         raise RunnerError(
             f"join: run {run.run_id} is a job, which the runner trains; expected one of runner.record."
         )

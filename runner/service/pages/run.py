@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from http import HTTPStatus
 from itertools import islice
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, NamedTuple
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
@@ -87,6 +88,9 @@ class Status:
     """Number of the job that makes the run."""
     is_live: bool
     """Whether all of this may change."""
+    run_id: str
+    stop: Literal["", "possible", "requested"]
+    """Whether its loop can be requested to stop."""
 
 
 @dataclass(frozen=True)
@@ -191,6 +195,17 @@ def label(
         view = _overview(run, jobs, settings, problem=message_of(error, request))
         return page(request, view, HTTPStatus.BAD_REQUEST)
     return RedirectResponse(f"/runs/{run.run_id}#labels-title", HTTPStatus.SEE_OTHER)
+
+
+@router.post("/stop")
+def stop(request: Request, run: FoundRun, jobs: JobsOf, settings: SettingsOf) -> Response:
+    """Request that the loop which records the run stops."""
+    try:
+        run.request_stop()
+    except RunnerError as error:
+        view = _overview(run, jobs, settings, problem=message_of(error, request))
+        return page(request, view, HTTPStatus.BAD_REQUEST)
+    return RedirectResponse(f"/runs/{run.run_id}", HTTPStatus.SEE_OTHER)
 
 
 @router.get("/status")
@@ -316,7 +331,7 @@ def _overview(
 
 def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:
     number, live = _job_of(run, jobs)
-    summary = live or run.summary
+    summary = live or (_done_by(run) if run.is_loop and run.status == "running" else run.summary)
     episodes = summary.get("episode", summary.get("episodes"))
     facts = _results(run, EvaluationMetrics.of(summary.get("last_evaluation") or {})) | {
         "Training episodes": humanize.number(episodes, 0),
@@ -336,7 +351,22 @@ def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:
         error=settings.without_folders(run.problem or run.summary.error or ""),
         job=number,
         is_live=run.status == "running" or (number is not None and run.status != "finished"),
+        run_id=run.run_id,
+        stop=_stop_of(run),
     )
+
+
+def _done_by(run: Run) -> dict[str, Any]:
+    """Return what a loop that is being recorded has done so far."""
+    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
+        return {**recording.done(), "bytes": recording.size}
+    return {}
+
+
+def _stop_of(run: Run) -> Literal["", "possible", "requested"]:
+    if not run.is_loop or run.status != "running":
+        return ""
+    return "requested" if run.is_stop_requested else "possible"
 
 
 def _results(run: Run, last: EvaluationMetrics) -> dict[str, str]:
