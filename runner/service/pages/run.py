@@ -12,9 +12,10 @@ from itertools import islice
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, NamedTuple
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import RedirectResponse
+from fastapi.responses import HTMLResponse, RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
+from runner.analysis.axes import EPISODES
 from runner.analysis.evaluations import evaluation_record, evaluation_records
 from runner.analysis.summary import brief_provenance
 from runner.client.jobs import RunProgress
@@ -30,6 +31,7 @@ from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import EvaluationMetrics, RecentTraining
 from runner.runs.run import Run
 from runner.service import fragments
+from runner.service.api.reading import AxisName
 from runner.service.api.replay import LONG
 from runner.service.api.runs import LabelChanges, relabelled
 from runner.service.dependencies import (
@@ -224,6 +226,18 @@ def status(
     if run.status != status or not now.is_live:
         return Response(status_code=HTTPStatus.NO_CONTENT)
     return page(request, _StatusView(now))
+
+
+@router.get("/distributions")
+async def distributions(
+    run: RecordedRun, cache: CacheOf, processes: ProcessesOf, axis: AxisName = EPISODES.name
+) -> Response:
+    """Return the histograms of training, as a part of the run's page."""
+    key = ("distributions", recording_state(run), axis)
+    body = await cache.get_or_await(
+        key, lambda: processes(fragments.distributions, run.recording, axis), LONG
+    )
+    return HTMLResponse(body)
 
 
 @router.get("/evaluations")
