@@ -25,6 +25,9 @@ Values = NDArray[np.float64]
 
 STRETCHES: Final = 60
 """The most stretches of training."""
+_FEWEST: Final = 10
+_EPISODES_EACH: Final = 6
+"""Episodes of a stretch on average, so that its shares mean something; at least `_FEWEST` stretches."""
 LEVELS: Final = 30
 """Ranges of values, where these are not few distinct ones."""
 _MAX_DISTINCT: Final = 20
@@ -125,10 +128,12 @@ def histograms(recording: Recording, axis: Axis = EPISODES) -> tuple[list[Histog
     """
     places = positions(recording, axis)
     done = recording.done()
-    edges = edges_of(axis, float(places.at(done["episodes"], done["train_steps"])), STRETCHES)
+    last = float(places.at(done["episodes"], done["train_steps"]))
     found: list[Histogram] = []
     notes: list[str] = []
     for read in (_episodes, _steps):
+        few = min(STRETCHES, max(_FEWEST, done["episodes"] // _EPISODES_EACH))
+        edges = edges_of(axis, last, few if read is _episodes else STRETCHES)
         columns: dict[tuple[str, str], _Column] = {}
         for _, block in read(recording, places, columns, notes):
             for key, values in block.items():
@@ -241,7 +246,7 @@ def _numbers(path: str, values: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any
     else:
         flat = values.reshape(len(values), -1)
         for i in range(flat.shape[1]):
-            yield f"{path}[{i}]", flat[:, i]
+            yield path if flat.shape[1] == 1 else f"{path}[{i}]", flat[:, i]
 
 
 def _action_name(recording: Recording, part: str) -> Callable[[float], str]:

@@ -42,7 +42,7 @@ def heatmap_chart(histogram: Histogram) -> Chart:
     shares = np.divide(counts, totals, out=np.zeros_like(counts), where=totals > 0)
     rows = counts.shape[1]
     left = 74.0 if histogram.names else 56.0
-    x = Scale(0.0, histogram.edges[-1], left, WIDTH - 8)
+    x = Scale(0.0, histogram.edges[-1], left, WIDTH - 16)
     low, high = (0.0, float(rows)) if histogram.names else (histogram.values[0], histogram.values[-1])
     y = Scale(low, high, HEIGHT - 34, 34.0)
     title = title_of(histogram)
