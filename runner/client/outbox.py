@@ -22,7 +22,7 @@ from runner.client.connection import Report, ServerUnavailable, find_token
 from runner.errors import RunnerError
 from runner.runs.listing import list_runs
 from runner.runs.locking import locked
-from runner.runs.run import Run
+from runner.runs.run import SHARDS_FOLDER, Run
 from runner.runs.store import Store
 from runner.util.files import read_object, write_object
 
@@ -75,6 +75,11 @@ def deliver(run: Run, client: Client, report: Report = lambda *_: None) -> Uploa
         RunnerError: another process has it.
     """
     with locked(run) as own:
+        if (own.folder / SHARDS_FOLDER).exists():
+            raise RunnerError(
+                f"its shards are not added to it yet: `dualtaxi show {own.folder}` does it when all of its "
+                "processes have ended."
+            )
         push, begun = _read_push_file(own), None
         if push.upload and push.server == client.url:
             begun = UploadStatus(push.upload)
@@ -140,6 +145,12 @@ class Follower:
                 pause = min(2 * pause, MAX_PAUSE)
             except RunnerError:
                 return  # reported when the rest is pushed
+
+
+def forget_upload(run: Run) -> None:
+    """Have a run of the outbox pushed from its beginning: its recording is another file now."""
+    if (push := _read_push_file(run)).server:
+        _write_push_file(run, _Push(push.server))
 
 
 def connect(url: str) -> Client:

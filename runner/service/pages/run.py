@@ -30,6 +30,7 @@ from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import EvaluationMetrics, RecentTraining
 from runner.runs.run import Run
+from runner.runs.shards import shards_in_words
 from runner.service import fragments
 from runner.service.api.reading import AxisName
 from runner.service.api.replay import LONG
@@ -352,6 +353,7 @@ def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:
         "Training steps": humanize.number(summary.get("train_steps"), 0),
         "Evaluation steps": humanize.number(summary.get("eval_steps"), 0),
         "Time": _duration(run),
+        **({"Other processes": f"{others}, added at the end"} if (others := shards_in_words(run)) else {}),
         "Recording": humanize.size(summary["bytes"]) if summary.get("bytes") else humanize.UNKNOWN,
     }
     planned, share, progress = run.episodes_to_do, None, ""
