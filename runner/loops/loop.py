@@ -117,11 +117,11 @@ class Loop(Generic[R]):
         self._warnings: set[str] = set()
         self._is_described = False
         self._is_settled = not can_widen(described.action)
-        self._code = CodeCollector(options.packing.code)
         self._made_by = provenance(with_command=options.packing.code)
         made_by = {key: self._made_by[key] for key in runs.MADE_BY if key in self._made_by}
         facts = {"provenance": made_by, "spaces": described.common}
         self.run = self._new_run(outbox_folder() if client else None, facts)
+        self._code = CodeCollector(self.run.folder.parent, options.packing.code)
         path = self.run.folder / RECORDING_FILE
         topics = schema.KINDS[described.kind]
         with unless_empty(self.run):
