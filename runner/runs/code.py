@@ -163,13 +163,13 @@ class CodeCollector:
                 return
             found = RecordedCode({"code.not_recorded": f"reading it took more than {WAIT_SECONDS:g} s"})
         try:
+            file.add_metadata(CODE_RECORD, found.entries)
+            self.entries = found.entries  # from here on it is not tried again
             if found.attachment:
                 file.add_attachment(CODE_ATTACHMENT, "application/zstd", found.attachment)
-            file.add_metadata(CODE_RECORD, found.entries)
         except OSError as error:
             file.cut_back()
             raise storage_error(file, error) from error
-        self.entries = found.entries
 
 
 # --- what is collected --------------------------------------------------------------------------------------

@@ -161,7 +161,7 @@ def test_an_anonymous_file_has_no_code(project, tmp_path):
 def test_two_commits_of_a_script(project, tmp_path):
     a = loop_in(project, 10)
     git(project, "commit", "-qam", "Train ten steps")
-    git(project, "commit", "-q", "--allow-empty", "-m", "Begin anew")
+    git(project, "commit", "-q", "--allow-empty", "-m", "Begin again")
     b = loop_in(project, 20)
     git(project, "commit", "-qam", "Train twenty steps")
     text = dualtaxi(project, "diff", a, b)
