@@ -96,6 +96,13 @@ def typical_episode(path: Path) -> bytes:
         return f"eval/{after}/{number}".encode()
 
 
+def latest_episode(path: Path) -> bytes:
+    """Return the address of the training episode that ended last, as `typical_episode`; empty without one."""
+    with open_recording(path) as recording:
+        ended = recording.count(recording.topic("/train/episode"))
+        return f"train/{ended - 1}".encode() if ended and recording.has_steps else b""
+
+
 def maps(path: Path) -> bytes:
     """Return the maps of policy and values at stages of learning, as HTML."""
     with open_recording(path) as recording:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import time
 from dataclasses import replace
 
 import gymnasium
 import httpx2
 import pytest
-from served import Served
+from selenium.webdriver.common.by import By
+from served import Served, wait
 
 import runner
 from runner.errors import RunnerError
@@ -78,6 +80,49 @@ def test_a_loop_that_is_pushed_is_listed_at_once_and_stopped_from_its_page(serve
     assert verify(folder / "recording.mcap").sound
     again = server.client.post(f"/runs/{run_id}/stop")
     assert (again.status_code, "is finished" in message(again)) == (400, True)
+
+
+def test_the_latest_whole_episode_is_sent_until_the_run_is_over(connect, settings, recordings):
+    client = connect(settings)
+    latest = "/runs/growing/replay/latest"
+    with runner.record(make("CartPole-v1"), recordings, name="growing") as env:
+        env.reset(seed=0)
+        until(lambda answer: answer.status_code == 204, lambda: client.get(latest))
+        assert "x-run-over" not in client.get(latest).headers
+        for _ in play(env, 200):
+            pass
+        shown = until(lambda answer: answer.status_code == 200, lambda: client.get(latest)).text
+        path = re.search('data-episode="([^"]+)"', shown)[1]
+        assert path.startswith("train/")
+        assert client.get(latest, params={"shown": path}).status_code in (200, 204)
+        page = client.get("/runs/growing", headers={"Accept": "text/html"}).text
+        assert f'data-latest="/runs/{env.run.run_id}/replay/latest"' in page
+    last = re.search('data-episode="([^"]+)"', client.get(latest).text)[1]
+    over = client.get(latest, params={"shown": last})
+    assert (over.status_code, over.headers["x-run-over"]) == (204, "true")
+    assert "data-latest" not in client.get("/runs/growing", headers={"Accept": "text/html"}).text
+
+
+def test_two_loops_replay_next_to_each_other(server, browser):
+    with (
+        runner.record(make("CartPole-v1"), server.url, name="left") as left,
+        runner.record(make("CartPole-v1"), server.url, name="right") as right,
+    ):
+        ids = [env.run.run_id for env in (left, right)]
+        for env in (left, right):
+            for _ in play(env, 100):
+                pass
+        for run_id in ids:
+            until(lambda run: run, lambda run_id=run_id: listed(server, run_id))
+        browser.get(f"{server.url}/compare?run={ids[0]}&run={ids[1]}")
+
+        def counts():
+            return [count.text for count in browser.find_elements(By.CSS_SELECTOR, "[data-latest] .count")]
+
+        before = wait(
+            browser, lambda: len(counts()) == 2 and all("of" in text for text in counts()) and counts()
+        )
+        wait(browser, lambda: all(now != then for now, then in zip(counts(), before, strict=True)))
 
 
 def test_a_loop_in_a_folder_is_stopped_by_its_page(connect, settings, recordings):
