@@ -5,30 +5,18 @@ from __future__ import annotations
 import os
 import time
 from types import TracebackType
-from typing import Final, Self
+from typing import Self
 
 import psutil
 
 from runner.runs.provenance import provenance
-
-_PACKAGES: Final = (
-    "numpy",
-    "numba",
-    "llvmlite",
-    "gymnasium",
-    "mcap",
-    "protobuf",
-    "zstandard",
-    "blake3",
-    "pydantic",
-)
 
 
 def machine() -> dict[str, str]:
     """Return processor, cores, memory, and the versions that speed depends on."""
     facts = provenance()
     keys = ("processor", "platform", "git", "python")
-    packages = {key: facts[key] for name in _PACKAGES if (key := f"package.{name}") in facts}
+    packages = {key: value for key, value in facts.items() if key.startswith("package.")}
     return {
         **{key: facts[key] for key in keys if key in facts},
         "cores": str(os.cpu_count()),

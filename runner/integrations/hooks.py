@@ -116,7 +116,7 @@ def _reset(env: Any, original: Callable[..., Any], arguments: Any, named: Mappin
 def _find_run(env: Any) -> None:
     """Give an environment that is about to be reset to the run that waits for one, if any."""
     waiting = [run for run in open_runs if run.waits_for_environment]
-    library = _library_that_resets() if waiting else None
+    library = _library_that_resets() if waiting and not isinstance(env, Recorded) else None
     if library is not None:
         for run in waiting:
             run.warn_once(

@@ -8,14 +8,11 @@ from pathlib import Path
 import pytest
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # PyTorch reads it: its threads wait for one another otherwise
-HERE = Path(__file__).parent
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        if item.path.is_relative_to(HERE):
-            item.add_marker(pytest.mark.filterwarnings("ignore"), append=False)
-            item.add_marker(pytest.mark.filterwarnings("error::RuntimeWarning:tests"))
+def pytest_configure(config: pytest.Config) -> None:
+    for line in ("ignore", "error::RuntimeWarning"):  # the last is what this project warns of
+        config.addinivalue_line("filterwarnings", line)
 
 
 @pytest.fixture

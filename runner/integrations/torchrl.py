@@ -1,0 +1,262 @@
+"""TorchRL: environments and collectors that are recorded, and a `Logger` that logs into the recording.
+
+env = runner.integrations.torchrl.record(env)                          # GymEnv, with any transforms
+for data in runner.integrations.torchrl.recorded(collector): ...       # any other environment
+logger = runner.integrations.torchrl.Logger("ppo")
+"""
+
+from __future__ import annotations
+
+import os
+import weakref
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import VectorEnv
+
+from runner.errors import ConfigError
+from runner.integrations.hooks import open_runs
+from runner.integrations.libraries import require_tested
+from runner.integrations.tensorboard import SummaryWriter
+from runner.loops.batches import RecordedBatches, record_batches
+from runner.loops.env import record as record_env
+from runner.loops.loop import Loop
+from runner.loops.recorded import Recorded
+from runner.loops.values import as_array
+from runner.loops.vector import record_vector
+from runner.util.jsonable import as_mapping
+
+require_tested("torchrl", "torchrl", ("0.14", "0.14"))
+
+from torchrl.data import Categorical, OneHot  # noqa: E402
+from torchrl.envs import GymWrapper  # noqa: E402
+from torchrl.record.loggers import Logger as _Logger  # noqa: E402
+
+
+def record(env: Any, recordings: str | os.PathLike[str] | None = None, **options: Any) -> Any:
+    """Record the Gymnasium environment inside of TorchRL's, and return TorchRL's.
+
+    Its actions, observations and rewards are recorded as they are before TorchRL's transforms, with seeds, so
+    that the run can be reproduced. The run ends when the environment is closed, as a collector does at its
+    end, and the `Logger` if there is one.
+
+    Args:
+        env: a `GymEnv` or `GymWrapper`, with or without transforms, that this process steps.
+        recordings: the recordings folder or a server, as for `runner.record`.
+        options: the others of `runner.record`, or of `runner.record_vector` for several environments.
+
+    Raises:
+        ConfigError: it is another environment, or recorded already, or an argument cannot be used.
+        EnvironmentNotUsable: a space cannot be recorded.
+        StorageError: the recordings folder cannot be written.
+    """
+    base = env
+    while not isinstance(base, GymWrapper) and hasattr(base, "base_env"):
+        base = base.base_env
+    if not isinstance(base, GymWrapper):
+        raise ConfigError(
+            f"found {type(base).__name__}, expected GymEnv or GymWrapper. Steps of other environments are "
+            "recorded where they are collected: for data in runner.integrations.torchrl.recorded(collector)"
+        )
+    if isinstance(base._env, Recorded):
+        raise ConfigError("found an environment that is recorded already, expected one that is not")
+    recorder: Any = record_vector if isinstance(base._env, VectorEnv) else record_env
+    base._env = made = recorder(base._env, recordings, **options)
+    made.close = partial(_close, made)
+    return env
+
+
+_to_close: list[Loop[Any]] = []
+"""The recordings of closed environments, which end with the logger."""
+
+
+def _close(made: Recorded[Any], **arguments: Any) -> None:
+    """Close an environment, and the recording if no logger needs it any more.
+
+    A collector closes its environment before it yields the last batch, whose losses are logged after that.
+    """
+    made.env.close(**arguments)
+    if open_runs:
+        _to_close.append(made._loop)
+        weakref.finalize(made, made._loop.close)
+    else:
+        made._loop.close()
+
+
+def recorded(
+    collector: Any,
+    recordings: str | os.PathLike[str] | None = None,
+    *,
+    name: str | None = None,
+    seed: int | None = None,
+    config: object = None,
+    **packing: Any,
+) -> Iterator[Any]:
+    """Yield what a collector yields, and record its steps.
+
+        for data in runner.integrations.torchrl.recorded(collector, name="ppo"):
+
+    The observations are those after TorchRL's transforms; several of them are recorded as a `Dict`. One-hot
+    actions are recorded as numbers. The run ends with the iteration, also by `break`.
+
+    Args:
+        collector: a collector that steps its environments, also several of them, in this process.
+        recordings: as for `runner.record`, as are the others.
+        name: the name of the run; that of the environment unless given.
+        seed: the seed that the run is listed with.
+        config: your own settings.
+        packing: as for `runner.record`.
+
+    Raises:
+        ConfigError: the collector is of another kind, or an argument cannot be used.
+        StorageError: the recordings folder cannot be written.
+    """
+    env = getattr(collector, "env", None)
+    if env is None:
+        raise ConfigError(
+            f"found {type(collector).__name__}, expected a collector whose environments are in this process"
+        )
+    if getattr(collector, "split_trajs", False):
+        raise ConfigError("found a collector with split_trajs=True, expected split_trajs=False")
+    rec = record_batches(
+        _name_of(env),
+        recordings,
+        name=name,
+        seed=seed,
+        config=config,
+        action_space=_action_space(env),
+        autoreset_mode="SameStep",
+        **packing,
+    )
+    return _recorded(collector, env, rec)
+
+
+def _recorded(collector: Any, env: Any, rec: RecordedBatches) -> Iterator[Any]:
+    keys = list(env.observation_spec.keys(include_nested=True, leaves_only=True))
+    error: BaseException | None = None
+    try:
+        for data in collector:
+            _record_batch(rec, data, getattr(collector, "_carrier", None), keys, env)
+            yield data
+    except GeneratorExit:  # the loop was left by `break`
+        raise
+    except BaseException as raised:
+        error = raised
+        raise
+    finally:
+        rec.__exit__(None, error, None)
+
+
+def _record_batch(rec: RecordedBatches, data: Any, carrier: Any, keys: Sequence[Any], env: Any) -> None:
+    """Record the steps of a batch, [*environments, time]."""
+    number = int(np.prod(env.batch_size, dtype=np.int64))
+
+    def by_time(values: Any) -> Any:
+        """Return a tensor [*environments, time, ...] as a copy [time, environments, ...]."""
+        array = np.array(as_array(values))
+        array = array.reshape(number, -1, *array.shape[len(env.batch_size) + 1 :])
+        return np.ascontiguousarray(array.swapaxes(0, 1))
+
+    def flag(key: str, default: Any) -> Any:
+        return by_time(after[key])[..., 0] if key in after.keys() else default  # noqa: SIM118 - no mapping
+
+    after = data["next"]
+    done = by_time(after["done"])[..., 0]
+    terminated = flag("terminated", done)
+    truncated = flag("truncated", done & ~terminated)
+    rewards = by_time(after["reward"])
+    if rewards.shape[2:] != (1,):
+        raise ConfigError(f"found rewards of shape {rewards.shape[2:]}, expected one for each environment")
+    roots = {_text(key): by_time(data[key]) for key in keys}
+    finals = {_text(key): by_time(after[key]) for key in keys}
+    following = {}
+    for key in keys:
+        name = _text(key)
+        last = finals[name][-1]
+        if carrier is not None and carrier.get(key, None) is not None:  # after a reset, if the episode ended
+            last = np.array(as_array(carrier.get(key))).reshape(last.shape)
+        following[name] = np.concatenate([roots[name], last[np.newaxis]])
+    actions = by_time(data[env.action_key])
+    if isinstance(env.action_spec_unbatched, OneHot):
+        actions = actions.argmax(-1)
+    is_one = len(keys) == 1
+    rec.batch(
+        next(iter(following.values())) if is_one else following,
+        actions,
+        rewards[..., 0],
+        terminated,
+        truncated,
+        final_observations=next(iter(finals.values())) if is_one else finals,
+    )
+
+
+def _text(key: Any) -> str:
+    return key if isinstance(key, str) else "/".join(key)
+
+
+def _name_of(env: Any) -> str:
+    """Return the name of an environment without its transforms."""
+    while hasattr(env, "base_env"):
+        env = env.base_env
+    name = getattr(env, "env_name", None)
+    return name if isinstance(name, str) and name else type(env).__name__
+
+
+def _action_space(env: Any) -> Any:
+    """Return the space of discrete actions; None where the space follows from the first batch."""
+    spec = env.action_spec_unbatched
+    if isinstance(spec, OneHot | Categorical):
+        return spaces.Discrete(int(spec.space.n))
+    return None
+
+
+class Logger(_Logger):  # type: ignore[misc]
+    """A logger of TorchRL whose values go into the recording.
+
+    That is the one that the script makes by `record`, `recorded` or `runner.record`, or of the environment of
+    Gymnasium that it resets first; a script that steps none gets a run of its own for the values.
+
+    Args:
+        exp_name: the name of the run, if the script does not record one itself.
+        log_dir: the recordings folder, if the script does not record one itself.
+    """
+
+    def __init__(self, exp_name: str, log_dir: str | os.PathLike[str] | None = None) -> None:
+        super().__init__(exp_name=exp_name, log_dir=log_dir)
+
+    def _create_experiment(self) -> SummaryWriter:
+        writer = SummaryWriter(recordings=self.log_dir)
+        writer._run.name = self.exp_name
+        return writer
+
+    def log_scalar(self, name: str, value: Any, step: int | None = None) -> None:
+        """Log a number."""
+        self.experiment.add_scalar(name, value, step)
+
+    def log_str(self, name: str, value: str, step: int | None = None) -> None:
+        """Log a text."""
+        self.experiment.add_text(name, value, step)
+
+    def log_video(self, name: str, video: Any, step: int | None = None, **more: Any) -> None:
+        """Record a film, [batch, time, channels, height, width]."""
+        self.experiment.add_video(name, video, step, more.get("fps", 30))
+
+    def log_hparams(self, cfg: Any) -> None:
+        """Record settings."""
+        self.experiment.add_hparams(as_mapping(cfg) or {"config": str(cfg)}, {})
+
+    def log_histogram(self, name: str, data: Any, **more: Any) -> None:
+        """Record a histogram of 64 bins: the arrays `name/counts` and `name/edges`."""
+        self.experiment.add_histogram(name, data, more.get("step"))
+
+    def shutdown(self, timeout: float | None = None) -> None:
+        """Close the logger, and the recordings of environments that are closed."""
+        super().shutdown(timeout)
+        while _to_close:
+            _to_close.pop().close()
+
+    def __repr__(self) -> str:
+        return f"Logger({self.exp_name!r})"
