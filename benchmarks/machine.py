@@ -5,18 +5,30 @@ from __future__ import annotations
 import os
 import time
 from types import TracebackType
-from typing import Self
+from typing import Final, Self
 
 import psutil
 
 from runner.runs.provenance import provenance
+
+_PACKAGES: Final = (
+    "numpy",
+    "numba",
+    "llvmlite",
+    "gymnasium",
+    "mcap",
+    "protobuf",
+    "zstandard",
+    "blake3",
+    "pydantic",
+)
 
 
 def machine() -> dict[str, str]:
     """Return processor, cores, memory, and the versions that speed depends on."""
     facts = provenance()
     keys = ("processor", "platform", "git", "python")
-    packages = {key: value for key, value in facts.items() if key.startswith("package.")}
+    packages = {key: facts[key] for name in _PACKAGES if (key := f"package.{name}") in facts}
     return {
         **{key: facts[key] for key in keys if key in facts},
         "cores": str(os.cpu_count()),

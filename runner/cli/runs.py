@@ -51,12 +51,11 @@ def folded(run: Run) -> Run:
     if not (run.folder / SHARDS_FOLDER).is_dir():
         return run
     from runner.loops.folding import fold_if_over
-    from runner.runs.shards import are_over, shards_of
+    from runner.runs.shards import are_over, shards_in_words
 
-    shards = shards_of(run)
-    what = f"{len(shards)} shard{'s' if len(shards) != 1 else ''}"
+    what = shards_in_words(run)
     if not are_over(run):
-        say(f"Run {run.run_id} has {what} of other processes, which are added when all of them have ended.")
+        say(f"Run {run.run_id} has {what} of other processes, which are added when the last of them ends.")
         return run
     try:
         with steps_line(f"adding {what} to {run.run_id}") as report:
@@ -79,7 +78,7 @@ def recorded(run: Run) -> Run:
         return run
     if run.status == "running":
         raise RunnerError(f"run {run.run_id} has no recording yet: it has just begun.")
-    if "made_by" in run.file.config:
+    if run.is_loop:
         raise RunnerError(
             f"run {run.run_id} has no recording, and only the loop that recorded it can make another."
         )

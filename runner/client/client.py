@@ -52,6 +52,8 @@ class UploadStatus:
     """Why it was refused; of one that is being received again, why it could not be stored."""
     created: str = ""
     """In UTC, as ISO 8601."""
+    stop_requested: bool = False
+    """Whether the loop that records the run is requested to stop."""
 
 
 class Client(Connection):

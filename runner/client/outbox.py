@@ -22,7 +22,7 @@ from runner.client.connection import Report, ServerUnavailable, find_token
 from runner.errors import RunnerError
 from runner.runs.listing import list_runs
 from runner.runs.locking import locked
-from runner.runs.run import Run
+from runner.runs.run import SHARDS_FOLDER, Run
 from runner.runs.store import Store
 from runner.util.files import read_object, write_object
 
@@ -75,6 +75,11 @@ def deliver(run: Run, client: Client, report: Report = lambda *_: None) -> Uploa
         RunnerError: another process has it.
     """
     with locked(run) as own:
+        if (own.folder / SHARDS_FOLDER).exists():
+            raise RunnerError(
+                f"its shards are not added to it yet: `dualtaxi show {own.folder}` does it when all of its "
+                "processes have ended."
+            )
         push, begun = _read_push_file(own), None
         if push.upload and push.server == client.url:
             begun = UploadStatus(push.upload)
@@ -124,21 +129,28 @@ class Follower:
             self._client.close()
 
     def _follow(self) -> None:
-        pause, upload, is_stale = FOLLOW_SECONDS, None, False
+        pause, upload = FOLLOW_SECONDS, None
         while not self._over.wait(pause):
             try:
                 if upload is None:
                     upload = self._client.begin_upload(name=self._run.name, run_id=self._run.run_id)
                     _write_push_file(self._run, _Push(self._client.url, upload.id))
-                if is_stale:
-                    upload, is_stale = self._client.upload_status(upload), False
+                upload = self._client.upload_status(upload)  # so the server knows that the loop goes on
+                if upload.stop_requested and not self._run.is_stop_requested:
+                    self._run.request_stop()
                 while upload.offset < (size := self._size()) and not self._over.is_set():
                     upload = self._client.append_upload(upload, self._run.recording, size)
                 pause = FOLLOW_SECONDS
             except ServerUnavailable:
-                pause, is_stale = min(2 * pause, MAX_PAUSE), upload is not None
+                pause = min(2 * pause, MAX_PAUSE)
             except RunnerError:
                 return  # reported when the rest is pushed
+
+
+def forget_upload(run: Run) -> None:
+    """Have a run of the outbox pushed from its beginning: its recording is another file now."""
+    if (push := _read_push_file(run)).server:
+        _write_push_file(run, _Push(push.server))
 
 
 def connect(url: str) -> Client:

@@ -136,7 +136,7 @@ def _resume(run: Run, accept_changes: bool, report: Report, stop: Stop) -> Run:
         ):
             reference = Reference(recording, without_steps=job.config.recording.steps == "none")
             is_recorded = any(entry.name == CODE_RECORD for entry in contents.metadata)
-            code = CodeCollector(job.config.recording.code and not is_recorded)
+            code = CodeCollector(run.folder.parent, job.config.recording.code and not is_recorded)
             recorder = recorder_for(job, learner, file, reference, beat=code.beat(run, file))
             session = _ResumedSession(recording, reference, job, learner, recorder, report, stop)
             done = execute(session, file, run, started, code)

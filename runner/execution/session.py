@@ -99,7 +99,7 @@ def run_job(
         RunnerError: the environment cannot be used, or the disk is full; the run is then marked failed.
     """
     started = time.monotonic()
-    code = CodeCollector(job.config.recording.code)
+    code = CodeCollector(run.folder.parent, job.config.recording.code)
     with _failing(run):
         mdp = mdp or load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
         job, run = resolve_job(job, run)

@@ -183,7 +183,7 @@ class Recording(BaseCallback):  # type: ignore[misc]
         if self._checkpoint_every and self.num_timesteps >= self._next_checkpoint:
             self._checkpoint()
             self._next_checkpoint = self.num_timesteps + self._checkpoint_every
-        return True
+        return not self.recorded.should_stop
 
     def _on_training_end(self) -> None:
         logger = self.logger

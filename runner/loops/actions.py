@@ -13,6 +13,7 @@ from gymnasium.wrappers import StickyAction
 
 from runner.environments.naming import spoken
 from runner.errors import ConfigError, nearest
+from runner.recording.gym_json import registered, value_of
 from runner.recording.gym_spaces import Space
 from runner.recording.maker import MAX_NAMES
 from runner.util.values import is_text
@@ -116,6 +117,8 @@ def _parsed(space: Space, given: Any, recorded: Any, names: Sequence[str], where
         if isinstance(given, str) and given in space:
             return given
         raise ConfigError(f"{where}: found {_short(given)}, expected a text of {space}")
+    if registered(space) or isinstance(space, spaces.Graph | spaces.OneOf | spaces.Sequence):
+        return _parsed_json(space, given, where)
     try:
         values = given.split(",") if isinstance(given, str) else given
         array = np.asarray(values, np.asarray(recorded).dtype).reshape(np.shape(recorded))
@@ -133,6 +136,17 @@ def _parsed(space: Space, given: Any, recorded: Any, names: Sequence[str], where
     elif array not in space:
         raise ConfigError(f"{where}: found {_short(given)}, expected an element of {space}")
     return array
+
+
+def _parsed_json(space: Space, given: Any, where: str) -> Any:
+    """Return an action of a space whose values are recorded as text; as text it is JSON."""
+    try:
+        value = value_of(space, given) if isinstance(given, str) else given
+        if value in space:
+            return value
+    except ValueError as error:
+        raise ConfigError(f"{where}: found {_short(given)}, expected JSON for {space} ({error})") from error
+    raise ConfigError(f"{where}: found {_short(given)}, expected an element of {space}")
 
 
 def _parsed_parts(space: Any, given: Any, recorded: Any, where: str) -> Any:

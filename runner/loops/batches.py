@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -24,6 +25,7 @@ from runner.loops.vector import autoreset_mode_of, described_vector, first_of, r
 from runner.loops.vector_counts import Flags
 from runner.recording.gym_spaces import Space
 from runner.recording.gym_values import element_of
+from runner.runs.run import Run
 
 
 class NamedEnvironments(VectorEnv[Any, Any, Any]):
@@ -70,6 +72,9 @@ class RecordedBatches(Recorded[BatchRows]):
             described = described_vector(envs, first)
             require_fixed(described)
             maker = vector_maker_of(envs, first, self._mode, self._make)
+        if isinstance(envs, NamedEnvironments):
+            reason = "it was recorded in batches, and is known by its name alone"
+            maker = replace(maker, reason=f'{reason}; name a function that makes it: make="module:function"')
         rows = partial(BatchRows, mode=self._mode)
         self.env = envs
         self._record_into(Loop(described, self._options, maker, rows, (described.environments,)))
@@ -94,10 +99,13 @@ class RecordedBatches(Recorded[BatchRows]):
         if "_loop" not in vars(self):
             self._first = observations  # until the actions are known too
             return
-        with self._loop.lock:
-            if self._loop.records():
-                self._loop.activate(self._rows)
-                self._rows.reset(observations, (), np.ones(self.env.num_envs, np.bool_), {})
+        try:
+            with self._loop.lock:
+                if self._loop.records():
+                    self._loop.activate(self._rows)
+                    self._rows.reset(observations, (), np.ones(self.env.num_envs, np.bool_), {})
+        except Exception as error:
+            self._loop.fail(error)
 
     def batch(
         self,
@@ -131,6 +139,18 @@ class RecordedBatches(Recorded[BatchRows]):
             RecordingError: an array has another shape than [T, N, ...], or values that are not of the space.
             ResetNeeded: the batch has no observations before its first step, and `reset` was not called.
         """
+        try:
+            self._record_batch(
+                (observations, actions, rewards, terminated, truncated), final_observations, extras or {}
+            )
+        except Exception as error:
+            if "_loop" not in vars(self):
+                raise
+            self._loop.fail(error)
+
+    def _record_batch(self, arrays: tuple[Any, ...], finals: Any, extras: Mapping[str, Any]) -> None:
+        """Record T steps, from the arguments of `batch`."""
+        observations, actions, rewards, terminated, truncated = arrays
         paid = np.asarray(as_array(rewards))
         if paid.ndim != 2 or not paid.size or paid.dtype.kind not in "biuf":
             raise ConfigError(f"rewards: found {paid.dtype} of shape {paid.shape}, expected numbers [T, N]")
@@ -143,15 +163,15 @@ class RecordedBatches(Recorded[BatchRows]):
             before, seen = element_of(seen, 0), element_of(seen, slice(1, None))
         if "_loop" not in vars(self):
             self._open_from(before, seen, done)
-        self._check_finals(final_observations, ends | cut, seen)
+        self._check_finals(finals, ends | cut, seen)
         with self._loop.lock:
             if not self._loop.records():
                 return
             self._loop.activate(self._rows)
             if before is not None:
                 self._begin_with(before)
-            final = None if final_observations is None else _numpy(final_observations)
-            values = self._loop.extras.checked_batch(extras or {}, paid.shape)
+            final = None if finals is None else _numpy(finals)
+            values = self._loop.extras.checked_batch(extras, paid.shape)
             self._rows.take_batch(seen, done, paid.astype(np.float64, copy=False), ends, cut, final)
             if values:
                 self._loop.extras.put_batch(self._phase, self._rows, values)
@@ -217,6 +237,9 @@ def record_batches(
     seed: int | None = None,
     config: object = None,
     make: str | Callable[[], Any] | None = None,
+    join: Run | str | os.PathLike[str] | Literal[True] | None = None,
+    shard: str | None = None,
+    on_error: Literal["raise", "warn"] = "raise",
     **packing: Any,
 ) -> RecordedBatches:
     """Return a recording of N environments that takes their steps in batches, without an object a step.
@@ -243,6 +266,9 @@ def record_batches(
         seed: as for `record`.
         config: as for `record`.
         make: as for `record`; the function makes the vector environment.
+        join: as for `record`.
+        shard: as for `record`.
+        on_error: as for `record`.
         packing: as for `record`.
 
     Raises:
@@ -255,7 +281,9 @@ def record_batches(
     if isinstance(envs, VectorEnv) and not observation_space is action_space is None:
         raise ConfigError("found spaces next to a vector environment, which has its own")
     mode = autoreset_mode_of(None if isinstance(envs, str) else envs, autoreset_mode)
-    options = options_of(recordings, name, seed, config, (), packing)
+    options = options_of(
+        recordings, name, seed, config, (), packing, join=join, shard=shard, on_error=on_error
+    )
     own_spaces = _as_space(observation_space), _as_space(action_space)
     return RecordedBatches(envs, mode, own_spaces, options, checked_make(make))
 

@@ -20,6 +20,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from runner.client.outbox import forget_upload
 from runner.config.loading import packing_from
 from runner.errors import ConfigError, RecordingError
 from runner.loops.copied_rows import Copied, CopiedMessages, CopiedRows
@@ -39,7 +40,7 @@ from runner.recording.shards import SHARD_MAKER, Shard
 from runner.recording.writer import create_recording
 from runner.runs.listing import run_at
 from runner.runs.run import RECORDING_FILE, SHARDS_FOLDER, Run
-from runner.runs.shards import are_over, shards_locked, shards_of
+from runner.runs.shards import ENDS_AS, are_over, handed_over, shards_locked, shards_of
 from runner.util.files import open_regular, storage_errors
 
 OWNER_WAITS: Final = 5.0
@@ -72,7 +73,7 @@ def fold_if_over(run: Run, seconds: float = 0.0, report: Report = lambda *_: Non
     with shards_locked(run):
         run = run_at(run.folder)
         if not are_over(run):
-            return run
+            return handed_over(run)
         with storage_errors(run.folder, "free some disk; `dualtaxi repair` folds its shards in then"):
             return _fold(run, report)
 
@@ -88,11 +89,18 @@ def _fold(run: Run, report: Report) -> Run:
             summary = _Fold(run, sources, report).write(fresh)
     if summary is not None:
         fresh.replace(run.folder / RECORDING_FILE)
-        status = "interrupted" if run.file.status == "running" else run.file.status
-        run = run.update(status=status, summary={**run.file.summary, **summary})
+        forget_upload(run)
+        facts = {key: value for key, value in run.facts.items() if key != ENDS_AS}
+        run = Run(run.folder, facts).update(status=_status(run), summary={**run.file.summary, **summary})
     if summary is not None or is_folded:
         shutil.rmtree(run.folder / SHARDS_FOLDER)
     return run
+
+
+def _status(run: Run) -> str:
+    """Return how a run ended whose processes are gone."""
+    status = str(run.facts.get(ENDS_AS) or run.file.status)
+    return status if status in ("finished", "failed") else "interrupted"
 
 
 def _sources(run: Run, stack: ExitStack) -> list[Source]:
@@ -183,8 +191,7 @@ class _Fold:
                 result["rewards_off_table"] = off_table
             if error := self._run.file.summary.error:
                 result["error"] = error
-            status = "interrupted" if self._run.file.status == "running" else self._run.file.status
-            write_result(file, status, result)
+            write_result(file, _status(self._run), result)
             before = self._run.file.summary.seconds or 0.0
             return result | {"seconds": before + round(time.monotonic() - started, 3), "bytes": file.size}
 

@@ -83,6 +83,9 @@ class Loop(Generic[R]):
         StorageError: the recordings folder cannot be written.
     """
 
+    should_stop = False
+    """Whether somebody requested that the loop stops."""
+
     def __init__(
         self,
         described: Described,
@@ -114,11 +117,11 @@ class Loop(Generic[R]):
         self._warnings: set[str] = set()
         self._is_described = False
         self._is_settled = not can_widen(described.action)
-        self._code = CodeCollector(options.packing.code)
         self._made_by = provenance(with_command=options.packing.code)
         made_by = {key: self._made_by[key] for key in runs.MADE_BY if key in self._made_by}
         facts = {"provenance": made_by, "spaces": described.common}
         self.run = self._new_run(outbox_folder() if client else None, facts)
+        self._code = CodeCollector(self.run.folder.parent, options.packing.code)
         path = self.run.folder / RECORDING_FILE
         topics = schema.KINDS[described.kind]
         with unless_empty(self.run):
@@ -473,6 +476,7 @@ class Loop(Generic[R]):
 
         Returns whether to call it again.
         """
+        self.should_stop = self.should_stop or (self.options.join or self.run).is_stop_requested
         if not self.lock.acquire(timeout=0.1):
             return True
         try:

@@ -39,6 +39,14 @@ class Recorded(Generic[R]):
         """The run that is recorded; it has a `summary` once it is closed."""
         return self._loop.run
 
+    @property
+    def should_stop(self) -> bool:
+        """Whether the run's page, or somebody else, requested that the training stops.
+
+        The request is noticed within about a second; the loop has to look, and to end by itself.
+        """
+        return self._loop.should_stop
+
     def log(self, name: str | Mapping[str, Any], value: Any = None) -> None:
         """Record a number or a text under a name: `rec.log("loss", loss)`, `rec.log({"loss": loss})`.
 

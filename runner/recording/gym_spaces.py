@@ -6,16 +6,17 @@ of their bytes, which needs no Gymnasium.
 
 from __future__ import annotations
 
-import json
 import string
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 from gymnasium import spaces
 
 from runner.errors import EnvironmentNotUsable
+from runner.recording.gym_json import registered, structure_of, text_of
 from runner.recording.spaces import MAX_VALUE_BYTES
 from runner.util.jsonable import as_json
 from runner.util.values import is_text
@@ -100,13 +101,10 @@ class _Kind:
     """A space whose values have no layout; they are recorded as JSON text."""
 
     def parts(self, space: Space, where: str, keys: Keys) -> Iterator[Part]:  # noqa: ARG002
-        yield Part(keys, None, lambda value: value if isinstance(value, str) else self.text(value))
-
-    def text(self, value: Any) -> str:
-        return json.dumps(as_json(value))
+        yield Part(keys, None, partial(text_of, space))
 
     def describe(self, space: Space) -> dict[str, Any]:
-        return {"type": "Text", "max_length": _MAX_TEXT, "holds": repr(space)[:1000]}
+        return {"type": "Text", "max_length": _MAX_TEXT, **structure_of(space, describe_space)}
 
     def restore(self, description: Description) -> Space:
         raise KeyError(description["type"])
@@ -116,11 +114,6 @@ class _Kind:
 
     def can_widen(self, space: Space) -> bool:  # noqa: ARG002
         return False
-
-
-class _Graph(_Kind):
-    def text(self, value: Any) -> str:
-        return super().text({"nodes": value.nodes, "edges": value.edges, "edge_links": value.edge_links})
 
 
 class _Text(_Kind):
@@ -275,7 +268,7 @@ _KINDS: Final[dict[type[Space], _Kind]] = {
     spaces.Dict: _Dict(),
     spaces.Tuple: _Tuple(),
     spaces.Text: _Text(),
-    spaces.Graph: _Graph(),
+    spaces.Graph: _JSON,
     spaces.Sequence: _JSON,
     spaces.OneOf: _JSON,
     spaces.Discrete: _Discrete(),
@@ -287,6 +280,8 @@ _BY_NAME: Final = {kind.__name__: own for kind, own in _KINDS.items()}
 
 
 def _kind(space: Space) -> _Kind:
+    if registered(space) is not None:
+        return _JSON
     for kind, own in _KINDS.items():
         if isinstance(space, kind):
             return own

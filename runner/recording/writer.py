@@ -305,7 +305,7 @@ def metadata_record(name: str, entries: Mapping[str, str]) -> bytes:
     return RECORD_HEAD.pack(Opcode.METADATA, len(body)) + body
 
 
-@lru_cache(4)
+@lru_cache(16)
 def _pairs(entries: tuple[tuple[str, str], ...]) -> bytes:
     """Return the entries of a metadata record; those that list packages are the same in the next run."""
     return b"".join(_prefixed(text) for pair in entries for text in pair)

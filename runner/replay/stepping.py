@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import CannotRedo
+from runner.recording.gym_json import value_of
 from runner.recording.gym_spaces import Space, describe_space
 from runner.recording.gym_values import Put, filler, filler_by_agent, leaves_by_agent, leaves_of, value_bytes
 from runner.recording.reader import Recording
@@ -138,7 +139,8 @@ class Stepper(ABC):
                 [(leaf.path, leaf.dtype and leaf.dtype.shape) for leaf in recorded_leaves(each, name)]
                 for each in (recorded, found)
             ]
-            if shapes[0] != shapes[1] or recorded.get("n") != found.get("n"):
+            is_alike = all(recorded.get(key) == found.get(key) for key in ("n", "space"))
+            if shapes[0] != shapes[1] or not is_alike:
                 raise CannotRedo(
                     f"The environment has another {name} space than recorded: found {_text(found)}, expected "
                     f"{_text(recorded)}. It is another environment, or another version."
@@ -391,5 +393,12 @@ def keyed(space: Space, value: Any) -> Any:
     if isinstance(space, spaces.Tuple):
         return tuple(keyed(part, own) for part, own in zip(space.spaces, value, strict=True))
     if isinstance(value, str) and not isinstance(space, spaces.Text):
-        raise CannotRedo(f"Its actions are of the space {type(space).__name__}, which is recorded as text.")
+        try:
+            return value_of(space, value)
+        except ValueError as error:
+            raise CannotRedo(
+                f"Its actions are of the space {type(space).__name__}, and recorded as a text that is no "
+                f"value of it ({error}). Those of a space of your own come back if it is registered by "
+                "runner.register_space."
+            ) from error
     return value.item() if isinstance(value, np.integer) else value

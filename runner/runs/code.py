@@ -105,26 +105,27 @@ class CodeCollector:
     """Reads the code in a thread, and writes it into the recording as soon as it is known.
 
     Args:
+        recordings: the folder of runs, in which nothing is code.
         is_wanted: False records nothing.
     """
 
-    def __init__(self, is_wanted: bool = True) -> None:
+    def __init__(self, recordings: Path, is_wanted: bool = True) -> None:
         self.entries: dict[str, str] = {}
         """The entries of the metadata record; empty until it is written."""
         self._is_wanted = is_wanted and is_code_wanted()
         self._found: RecordedCode | None = None
         self._deadline = time.monotonic() + WAIT_SECONDS
         self._thread = threading.Thread(
-            target=self._collect, args=(_cells(),), name="recording-code", daemon=True
+            target=self._collect, args=(_cells(), recordings), name="recording-code", daemon=True
         )
-        if self._is_wanted and (found := _recent.fresh(_cells())) is not None:
+        if self._is_wanted and (found := _recent.fresh(_cells(), recordings)) is not None:
             self._found = found
         elif self._is_wanted:
             self._thread.start()
 
-    def _collect(self, cells: str) -> None:
+    def _collect(self, cells: str, recordings: Path) -> None:
         try:
-            self._found = _recent.read(cells)
+            self._found = _recent.read(cells, recordings)
         except Exception as error:  # a run is worth more than what is known of its code
             self._found = RecordedCode({"code.not_recorded": f"{type(error).__name__}: {error}"[:500]})
 
@@ -162,13 +163,13 @@ class CodeCollector:
                 return
             found = RecordedCode({"code.not_recorded": f"reading it took more than {WAIT_SECONDS:g} s"})
         try:
+            file.add_metadata(CODE_RECORD, found.entries)
+            self.entries = found.entries  # from here on it is not tried again
             if found.attachment:
                 file.add_attachment(CODE_ATTACHMENT, "application/zstd", found.attachment)
-            file.add_metadata(CODE_RECORD, found.entries)
         except OSError as error:
             file.cut_back()
             raise storage_error(file, error) from error
-        self.entries = found.entries
 
 
 # --- what is collected --------------------------------------------------------------------------------------
@@ -187,30 +188,30 @@ class _Recent:
         """Replace the lock, in a forked process."""
         self.lock = threading.Lock()
 
-    def fresh(self, cells: str) -> RecordedCode | None:
+    def fresh(self, cells: str, recordings: Path) -> RecordedCode | None:
         """Return the code of this process, if it was read a few seconds ago."""
-        _, _, key = self._place(cells)
+        _, _, key = self._place(cells, recordings)
         is_fresh = key == self.key and time.monotonic() - self.read_at <= _FRESH_SECONDS
         return self.code if is_fresh else None
 
-    def read(self, cells: str) -> RecordedCode:
+    def read(self, cells: str, recordings: Path) -> RecordedCode:
         """Return the code of this process, read now or a few seconds ago."""
-        folder, script, key = self._place(cells)
+        folder, script, key = self._place(cells, recordings)
         with self.lock:
-            if (found := self.fresh(cells)) is not None:
+            if (found := self.fresh(cells, recordings)) is not None:
                 return found
-            code = collect(folder, script, cells)
+            code = collect(folder, script, cells, recordings)
             # In this order: `fresh` is called without the lock.
             self.key, self.code = (), code
             self.key, self.read_at = key, time.monotonic()
             return code
 
     @staticmethod
-    def _place(cells: str) -> tuple[Path, Path | None, tuple[str, ...]]:
+    def _place(cells: str, recordings: Path) -> tuple[Path, Path | None, tuple[str, ...]]:
         """Return the folder of the user's script, the script, and a key of what is collected."""
         script = user_script()
         folder = Path.cwd() if script is None else script.parent
-        return folder, script, (str(folder), str(script), cells)
+        return folder, script, (str(folder), str(script), cells, str(recordings))
 
 
 _recent = _Recent()
@@ -218,69 +219,62 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_recent.unlock)  # a thread that is not there may hold it
 
 
-def collect(folder: Path, script: Path | None = None, cells: str = "") -> RecordedCode:
+def collect(
+    folder: Path, script: Path | None = None, cells: str = "", recordings: Path | None = None
+) -> RecordedCode:
     """Return the code in a folder.
 
     Args:
         folder: of the script; the current one if there is none.
         script: the script, if it is the user's.
         cells: the cells of a notebook that were executed.
+        recordings: a folder whose untracked files are no code.
     """
-    entries, problems, repository = {}, [], None
 
     def used(root: Path) -> list[str]:
         """Return the paths of the script and of the loaded modules in a folder."""
         first = "" if script is None else _within(root, script)
         return ([first] if first else []) + [path for path in _modules(root) if path != first]
 
+    repository, problems = Repository(folder), []
     try:
         repository = read_repository(folder, used)
-        problems += repository.problems
+        problems += repository.problems + ([] if repository.commit else ["there is no commit yet"])
     except NotRecorded as reason:
         problems.append(str(reason))
-    root = folder.resolve() if repository is None else repository.root.resolve()
-    sources, paths = _Sources(), used(root)
-    if script is not None and (path := _within(root, script)):
-        entries["code.script"] = path
-        sources.add_file(root, path)
+    root, sources = repository.root.resolve(), _Sources()
+    outputs = "" if recordings is None else _within(root, recordings)
+    untracked = [path for path in repository.untracked if not (outputs and path.startswith(f"{outputs}/"))]
+    paths, others = used(root), [path for path in untracked if _is_source(path)]
+    changed = [path for path in repository.changed if Path(path).suffix in _SOURCES]
+    if script is not None and paths:
+        sources.add_file(root, paths[0])
     if cells:
         sources.add(_CELLS, cells)
-    patch = "" if repository is None else _fitting_patch(repository, sources)
-    for path in paths:
+    patch = _fitting_patch(repository, sources)
+    for path in (*paths, *changed, *others):
         sources.add_file(root, path)
-    new = set(sources.files)
-    if repository is not None:
-        untracked = set(repository.untracked)
-        for name in repository.changed:
-            if Path(name).suffix in _SOURCES:
-                sources.add_file(root, name)
-        for name in filter(_is_source, repository.untracked):
-            sources.add_file(root, name)
-        entries |= _repository_entries(repository)
-        if not repository.commit:
-            problems.append("there is no commit yet")
-        else:
-            new = set(sources.files) & (untracked | {_CELLS})
-    if problems:
-        entries["code.not_recorded"] = "; ".join(problems)
-    if sources.left_out:
-        more = len(sources.left_out) - _MAX_NAMED
-        entries["code.left_out"] = ", ".join(sources.left_out[:_MAX_NAMED]) + (
-            f" and {more:,} more" if more > 0 else ""
-        )
-    code = Code(sources.files, tuple(sorted(new)), patch)
-    entries = {key: as_utf8(text) for key, text in entries.items()}
-    return RecordedCode(entries, code.to_attachment() if code.files or code.patch else b"")
-
-
-def _repository_entries(repository: Repository) -> dict[str, str]:
-    is_dirty = bool(repository.changed or any(map(_is_source, repository.untracked)))
+    new = set(sources.files) & {*untracked, _CELLS} if repository.commit else set(sources.files)
+    is_dirty = repository.commit and (repository.changed or others)
     entries = {
-        "git": repository.commit and repository.commit + ("-dirty" if is_dirty else ""),
+        "git": repository.commit + ("-dirty" if is_dirty else ""),
         "git.branch": repository.branch,
         "git.remote": redacted_text(repository.remote),
+        "code.script": "" if script is None else _within(root, script),
+        "code.not_recorded": "; ".join(problems),
+        "code.left_out": _named(sources.left_out),
     }
-    return {key: text for key, text in entries.items() if text}
+    code = Code(sources.files, tuple(sorted(new)), patch)
+    return RecordedCode(
+        {key: as_utf8(text) for key, text in entries.items() if text},
+        code.to_attachment() if code.files or code.patch else b"",
+    )
+
+
+def _named(left_out: list[str]) -> str:
+    """Return what was left out as a text of bounded length."""
+    more = len(left_out) - _MAX_NAMED
+    return ", ".join(left_out[:_MAX_NAMED]) + (f" and {more:,} more" if more > 0 else "")
 
 
 def _fitting_patch(repository: Repository, sources: _Sources) -> str:

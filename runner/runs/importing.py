@@ -26,7 +26,7 @@ from runner.runs.checkpoints import read_checkpoints
 from runner.runs.listing import run_at
 from runner.runs.locking import locked
 from runner.runs.resolve import run_with_id
-from runner.runs.run import MADE_BY, RECORDING_FILE, RUN_FILE, Run, new_run_id
+from runner.runs.run import MADE_BY, PREVIEW, RECORDING_FILE, RUN_FILE, Run, new_run_id
 from runner.runs.store import Store
 from runner.util.files import storage_errors, sync, write_object
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN
@@ -72,7 +72,8 @@ def import_recording(
     """Import a recording into a folder of runs; the file stays where it is.
 
     An interrupted run that is there already is replaced by a recording that continues it, and keeps its
-    labels. When this returns the run is on disk, even if the power fails now.
+    labels, as does the preview of an upload. When this returns the run is on disk, even if the power fails
+    now.
 
     Args:
         recording: the file, to which nothing is written any more. If it is finished, nothing in it changes
@@ -91,7 +92,7 @@ def import_recording(
     """
     with open_recording(recording) as opened:
         exported = _export_record(opened)
-        facts = _checked_facts(opened, exported if details is None else details)
+        facts = checked_facts(opened, exported if details is None else details)
         finished = opened.finished
         contents = [checkpoint.digest for checkpoint in read_checkpoints(opened, recordings)]
     if not finished and not is_merely_cut_off(recording):
@@ -107,6 +108,9 @@ def import_recording(
         recordings.mkdir(parents=True, exist_ok=True)
         Store(recordings).refer(target.name, contents)
     existing = None if as_new else _existing_run(target)
+    preview = existing if existing is not None and PREVIEW in existing.facts else None
+    if preview is not None:
+        existing, labels = None, _merged(preview.labels, labels)
     if existing is not None and _has_content(existing, digest):
         return Imported(_finish(existing, facts), digest, already=True, anonymous=anonymous)
     with _staging_folder(recordings, recording) as folder:
@@ -120,6 +124,8 @@ def import_recording(
             write_object(folder / LABELS_FILE, as_json(labels))
         for path in (*folder.iterdir(), folder):
             sync(path)
+        if preview is not None:
+            target.rename(folder.with_name("preview"))  # removed with the hidden folder
         folder.rename(target)
         sync(recordings)
     return Imported(run_at(target), digest, already=False, anonymous=anonymous)
@@ -163,7 +169,7 @@ def _export_record(recording: Recording) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _checked_facts(recording: Recording, details: Mapping[str, Any]) -> dict[str, Any]:
+def checked_facts(recording: Recording, details: Mapping[str, Any]) -> dict[str, Any]:
     """Return the contents of `run.json`.
 
     Raises:

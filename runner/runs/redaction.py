@@ -33,7 +33,8 @@ _AFTER_NAME: Final = (
 SHAPES: Final = (
     (
         "private keys",
-        r"-----BEGIN [A-Z ]{0,30}PRIVATE KEY-----[\s\S]{0,20000}?-----END [A-Z ]{0,30}PRIVATE KEY-----",
+        r"-----BEGIN [A-Z ]{0,30}PRIVATE KEY-----(?:[^-]|-(?!----)){0,20000}"
+        r"-----END [A-Z ]{0,30}PRIVATE KEY-----",
     ),
     ("AWS", r"\b(?:AKIA|ASIA)[0-9A-Z]{16}\b"),
     ("GitHub", r"\b(?:gh[pousr]_[A-Za-z0-9]{30,255}|github_pat_[A-Za-z0-9_]{22,255})"),

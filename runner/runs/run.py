@@ -35,6 +35,10 @@ if TYPE_CHECKING:  # listing runs must be quick
 
 RUN_FILE: Final = "run.json"
 RECORDING_FILE: Final = "recording.mcap"
+PREVIEW: Final = "upload"
+"""The fact of a run that is being uploaded, and not verified yet: the id of its upload."""
+STOP_FILE: Final = "stop"
+"""Its presence requests that the loop stops."""
 SHARDS_FOLDER: Final = "shards"
 """The folder, in that of a run, of what processes that joined it record until the run is over."""
 MADE_BY: Final = ("host", "git", "dualtaxi")
@@ -193,6 +197,32 @@ class Run:
         """Record that the owner is alive."""
         with contextlib.suppress(OSError):
             os.utime(self.folder / RUN_FILE)
+
+    @property
+    def is_loop(self) -> bool:
+        """Whether it was recorded from a user's own loop."""
+        return "made_by" in self.file.config
+
+    @property
+    def is_stop_requested(self) -> bool:
+        """Whether the loop that records it was requested to stop."""
+        return (self.folder / STOP_FILE).exists()
+
+    def request_stop(self) -> None:
+        """Request that the loop which records the run stops: `should_stop` of its environment becomes True.
+
+        Raises:
+            RunnerError: no loop records it now.
+            StorageError: its folder cannot be written.
+        """
+        if not self.is_loop:
+            raise RunnerError(f"run {self.run_id} is made by a job; cancel the job, or press Ctrl-C there.")
+        if self.status != "running":
+            raise RunnerError(
+                f"run {self.run_id} is {self.status}; only a run that is running can be stopped."
+            )
+        with storage_errors(self.folder / STOP_FILE):
+            (self.folder / STOP_FILE).touch()
 
     def update(self, **facts: Any) -> Run:
         """Write facts to `run.json`, and return the run with them.

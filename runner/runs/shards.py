@@ -20,9 +20,12 @@ from runner.runs.listing import run_at, run_entries, run_in
 from runner.runs.resolve import find_run
 from runner.runs.run import SHARDS_FOLDER, Run, new_run
 from runner.util.files import storage_errors
+from runner.util.humanize import size
 
 RUN_VARIABLE: Final = "DUALTAXI_RUN"
 """The folder of the run that this process recorded last, which its child processes can join."""
+ENDS_AS: Final = "ends_as"
+"""In `run.json` after the process that began the run has ended: the status that the run will have."""
 _NAME: Final = re.compile(r"[\w.-]{1,80}")
 _LOCK: Final = "shards.lock"
 
@@ -58,15 +61,16 @@ def find_joined(join: object, recordings: str | os.PathLike[str] | None) -> Run:
 
 
 def _require_open(run: Run) -> None:
-    if "made_by" not in run.file.config:
+    if not run.is_loop:
         raise RunnerError(
             f"join: run {run.run_id} is a job, which the runner trains; expected one of runner.record."
         )
     if (steps := run.file.config.get("recording", {}).get("steps", "all")) != "all":
         raise RunnerError(f"join: run {run.run_id} is recorded with steps {steps!r}, expected all.")
-    if run.status != "running":
+    if is_ended(run):
+        status = run.facts.get(ENDS_AS) or run.status
         raise RunnerError(
-            f"join: run {run.run_id} is {run.status}, expected one that is still being recorded. "
+            f"join: run {run.run_id} is {status}, expected one that is still being recorded. "
             "Processes join while the process that began the run has it open."
         )
 
@@ -113,9 +117,37 @@ def _order(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
+def is_ended(run: Run) -> bool:
+    """Return whether the process that began a run has ended."""
+    return ENDS_AS in run.facts or run.status != "running"
+
+
 def are_over(run: Run) -> bool:
     """Return whether no process records into a run or its shards any more."""
-    return run.status != "running" and all(shard.status != "running" for shard in shards_of(run))
+    return is_ended(run) and all(shard.status != "running" for shard in shards_of(run))
+
+
+def handed_over(run: Run) -> Run:
+    """Return a run that lasts until its shards end; it is owned by a process that still records one.
+
+    Raises:
+        StorageError: its `run.json` cannot be written.
+    """
+    if not is_ended(run):
+        return run
+    ends_as = run.facts.get(ENDS_AS) or ("interrupted" if run.file.status == "running" else run.file.status)
+    others = (shard.file.owner for shard in shards_of(run) if shard.status == "running")
+    return run.update(status="running", owner=dict(next(others, run.file.owner)), **{ENDS_AS: ends_as})
+
+
+def shards_in_words(run: Run) -> str:
+    """Return how many shards of a run are not folded into it yet, and their size; empty if there are none."""
+    shards = shards_of(run)
+    if not shards:
+        return ""
+    parts = [shard.recording for shard in shards if shard.recording.exists()]
+    recorded = size(sum(part.stat().st_size for part in parts))
+    return f"{len(shards)} {'shard' if len(shards) == 1 else 'shards'} ({recorded})"
 
 
 @contextlib.contextmanager

@@ -25,6 +25,7 @@ from runner.analysis.compare.statistics import require_scipy
 from runner.analysis.evaluations import evaluation_records, training_records
 from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.analysis.groups import grouped, groups_of, metrics_of, require_two
+from runner.analysis.histograms import histograms
 from runner.analysis.qtable import describe_tables, one_array, replay_at
 from runner.analysis.series import RunSeries, parse_target, read_series
 from runner.errors import RunnerError
@@ -95,6 +96,19 @@ def curves(
 def run_curves(path: Path, *options: Any) -> bytes:
     """Return the metrics of one run; options as for `curves`."""
     return curves([path], *options)
+
+
+def run_histograms(path: Path, axis: str) -> bytes:
+    """Return the histograms of a run's training over an axis, as JSON.
+
+    Raises:
+        RecordingError: the recording cannot be read, or does not have the axis.
+        RunnerError: there is no such axis.
+    """
+    with open_recording(path) as recording:
+        found, notes = histograms(recording, axis_of(axis))
+        shown = [dataclasses.asdict(each) | {"axis": each.axis.name} for each in found]
+        return as_json({"run_id": recording.run_id, "histograms": shown, "notes": notes})
 
 
 def _shown_curve(

@@ -18,7 +18,9 @@ from typing import Any, Final
 
 from markupsafe import Markup
 
+from runner.analysis.axes import axis_of
 from runner.analysis.diff import diff, with_seconds, without_ignored
+from runner.analysis.histograms import histograms
 from runner.analysis.sections import Grid, Section
 from runner.analysis.step_reference import StepRef
 from runner.analysis.summary import random_policy_sentence
@@ -27,6 +29,7 @@ from runner.errors import RecordingError, RunnerError
 from runner.export.encoded import picture_note
 from runner.export.episodes import last_episode, last_whole_evaluation, typical_trial
 from runner.export.plots.curves import footnote, panel_plots
+from runner.export.plots.heatmaps import EXPLANATION, heatmap_plots
 from runner.export.plots.machine import machine_facts, machine_plots
 from runner.export.reports.diff import ShownDivergence, difference_view
 from runner.export.reports.episode import trial
@@ -93,6 +96,13 @@ def typical_episode(path: Path) -> bytes:
         return f"eval/{after}/{number}".encode()
 
 
+def latest_episode(path: Path) -> bytes:
+    """Return the address of the training episode that ended last, as `typical_episode`; empty without one."""
+    with open_recording(path) as recording:
+        ended = recording.count(recording.topic("/train/episode"))
+        return f"train/{ended - 1}".encode() if ended and recording.has_steps else b""
+
+
 def maps(path: Path) -> bytes:
     """Return the maps of policy and values at stages of learning, as HTML."""
     with open_recording(path) as recording:
@@ -101,6 +111,21 @@ def maps(path: Path) -> bytes:
         if recording.has_tables:
             rows = maps_of(recording.mdp, recording.agents, stages_of(recording), _typical_start(recording))
         return str(partials().maps(rows, drawing is not None and drawing.width > svg.BROAD)).encode()
+
+
+def distributions(path: Path, axis: str) -> bytes:
+    """Return the histograms of a run's training over an axis, as HTML.
+
+    Raises:
+        RecordingError: the recording cannot be read, or does not have the axis.
+        RunnerError: there is no such axis.
+    """
+    with open_recording(path) as recording:
+        found, notes = histograms(recording, axis_of(axis))
+    if not found:
+        return b""
+    text = " ".join([EXPLANATION, *notes])
+    return str(partials().charts("distributions", "Distributions", text, heatmap_plots(found))).encode()
 
 
 def _typical_start(recording: Recording) -> int:

@@ -31,6 +31,7 @@ from runner.runs.store import Store
 from runner.service.errors import Busy, TooManyUploads, UploadConflict, UploadTooLarge
 from runner.service.jobs.store import lock_folder, now
 from runner.service.logs import LOG
+from runner.service.previews import Previews
 from runner.service.processes import ProcessPool
 from runner.service.settings import Limits
 from runner.service.upload import Announcement, Completion, Upload, verify
@@ -75,6 +76,7 @@ class Uploads:
     ) -> None:
         self._limits, self._on_verified = limits, on_verified
         self._recordings, self._folder = recordings, recordings / FOLDER
+        self._previews = Previews(recordings)
         self._lock = threading.RLock()
         """Held while uploads change, not while they are read: the server's event loop must not wait."""
         self._file_lock = lock_folder(recordings, f"{FOLDER}/lock")
@@ -214,7 +216,17 @@ class Uploads:
                 finally:
                     received = offset + len(data) - len(view)
                     upload = self._uploads[upload_id] = upload.replace(offset=received)
+        if not more:
+            self._previews.update(upload, self._body(upload))
+        return upload
+
+    def alive(self, upload: Upload) -> Upload:
+        """Note that the sender of an upload goes on; return it with whether its run is requested to stop."""
+        if upload.state != "receiving" or upload.digest is not None:
             return upload
+        self._previews.update(upload, self._body(upload))
+        run = self._previews.of(upload)
+        return replace(upload, stop_requested=run is not None and run.is_stop_requested)
 
     def complete(self, upload_id: str, owner: str, completion: Completion) -> Upload:
         """Finish an upload: it is synced to disk, and queued for verification. Returns its new state.
@@ -255,6 +267,7 @@ class Uploads:
             if upload.state == "verifying":
                 raise UploadConflict("the upload is being verified; wait for its end.")
             del self._uploads[upload_id]
+        self._previews.remove(upload)
         shutil.rmtree(self._body(upload).parent, ignore_errors=True)
 
     def _body(self, upload: Upload) -> Path:
@@ -308,6 +321,7 @@ class Uploads:
         with contextlib.suppress(StorageError):  # after a restart it is verified again, with the same result
             self._save(upload)
         if upload.is_over:
+            self._previews.remove(upload)  # of one that was refused
             with contextlib.suppress(OSError):  # removed with the rest of it, when it is forgotten
                 self._body(upload).unlink(missing_ok=True)
         try:

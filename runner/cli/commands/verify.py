@@ -282,7 +282,7 @@ def _repair(repaired: Repair, run: Run | None) -> dict[str, str]:
         rows["lost"] = "\n".join(_losses(repaired))
     if repaired.original is not None:
         rows["damaged"] = f"{repaired.original} is kept"
-    if run is not None and not repaired.lossless and "made_by" not in run.file.config:
+    if run is not None and not repaired.lossless and not run.is_loop:
         rows["next"] = command_for(run, "resume")
     return rows
 

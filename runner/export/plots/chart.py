@@ -125,7 +125,15 @@ class Text:
     halo: bool = False
 
 
-Mark = Shape | Markers | Text
+@dataclass(frozen=True)
+class Cells:
+    """Filled rectangles [n, 4]: x and y of the upper left corner, width and height."""
+
+    points: Values
+    fill: str
+
+
+Mark = Shape | Markers | Cells | Text
 
 
 @dataclass
@@ -145,13 +153,18 @@ class Canvas:
         """Draw a line or a polygon; the style has the other fields of `Shape`."""
         self.marks.append(Shape(np.asarray(points, np.float64), **style))
 
+    def cells(self, rectangles: Values, fill: str) -> None:
+        """Fill rectangles [n, 4]: x and y of the upper left corner, width and height."""
+        self.marks.append(Cells(rectangles, fill))
+
     def place(self, other: Canvas, x: float, y: float) -> None:
         """Draw everything of another canvas with its corner at a point."""
         for mark in other.marks:
             if isinstance(mark, Text):
                 self.marks.append(replace(mark, x=mark.x + x, y=mark.y + y))
             else:
-                self.marks.append(replace(mark, points=mark.points + np.array((x, y))))
+                shift = (x, y, 0.0, 0.0) if isinstance(mark, Cells) else (x, y)
+                self.marks.append(replace(mark, points=mark.points + np.array(shift)))
 
     def svg(self, for_page: bool = True) -> str:
         """Return the `<svg>` element; one for a page has the page's colours."""
@@ -283,6 +296,9 @@ def _svg_of(mark: Mark, paints: dict[str, str]) -> str:
             attributes |= {"paint-order": "stroke", "stroke": paper, "stroke-width": "3"}
         place = f'x="{mark.x:.1f}" y="{mark.y:.1f}" text-anchor="{mark.anchor}"{_written(attributes)}'
         return f"<text {place}>{escape(mark.text)}</text>"
+    if isinstance(mark, Cells):
+        d = "".join(f"M{x:.2f},{y:.2f}h{w:.2f}v{h:.2f}h{-w:.2f}z" for x, y, w, h in mark.points.tolist())
+        return f'<path d="{d}" fill="{mark.fill}" shape-rendering="crispEdges"/>'
     attributes = {
         "fill": paints.get(mark.fill, mark.fill) or "none",
         "stroke": paints.get(mark.stroke, mark.stroke),

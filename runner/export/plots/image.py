@@ -7,7 +7,7 @@ from typing import IO, Any, Final
 
 from runner.drawing import palette
 from runner.errors import RunnerError
-from runner.export.plots.chart import DASHES, MARKERS, Canvas, Mark, Shape, Text
+from runner.export.plots.chart import DASHES, MARKERS, Canvas, Cells, Mark, Shape, Text
 from runner.util.extras import require
 
 SUFFIXES: Final = (".png", ".svg", ".pdf")
@@ -79,6 +79,12 @@ def _add_to_figure(mpl: Any, figure: Any, mark: Mark, transform: Any) -> None:
             parse_math=False,
             path_effects=[halo] if mark.halo else None,
         )
+        return
+    if isinstance(mark, Cells):
+        for x, y, width, height in mark.points.tolist():
+            own = mpl.patches.Rectangle((x, y), width, height, facecolor=mark.fill, linewidth=0)
+            own.set_transform(transform)
+            figure.add_artist(own)
         return
     style: dict[str, Any] = {"alpha": mark.opacity, "transform": transform}
     if isinstance(mark, Shape) and mark.fill:

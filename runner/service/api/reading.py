@@ -100,6 +100,35 @@ class Curves(BaseModel):
     curves: list[Curve]
 
 
+class HistogramModel(BaseModel):
+    """The counts of a quantity over an axis."""
+
+    quantity: Literal["return", "length", "action", "reward"]
+    line: str
+    """An agent, or a part of an action; empty if there is one."""
+    unit: str
+    axis: str
+    edges: list[float]
+    """Positions between the stretches, one more than there are of them."""
+    values: list[float]
+    """The distinct values, ascending, or else the edges of the ranges."""
+    names: list[str]
+    """The names of the distinct values; empty where there are ranges."""
+    counts: list[list[int]]
+    """A list for each stretch."""
+    left_out: int
+    """Number of values that are infinite, NaN or too large."""
+
+
+class Histograms(BaseModel):
+    """The histograms of a run's training."""
+
+    run_id: str
+    histograms: list[HistogramModel]
+    notes: list[str]
+    """What is left out, a sentence each."""
+
+
 class Records(BaseModel):
     """Some records of a run, one object each."""
 
@@ -134,6 +163,17 @@ async def metrics(
     true; `start` and `stop` select a part at full resolution.
     """
     return _json(await compute(computed.run_curves, axis, tuple(metric or ()), start, stop, points))
+
+
+@router.get(
+    "/histograms",
+    response_model=Histograms,
+    responses=BUSY,
+    summary="Histograms over training, as heat maps.",
+)
+async def histograms(compute: ComputationOf, axis: AxisName = EPISODES.name) -> Response:
+    """Return the counts of returns, lengths, actions and rewards in stretches of training."""
+    return _json(await compute(computed.run_histograms, axis))
 
 
 def _add_records_route(kind: computed.RecordKind, summary: str, description: str) -> None:

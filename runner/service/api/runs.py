@@ -153,6 +153,26 @@ def label_run(run: FoundRun, labels: LabelChanges, catalogue: CatalogueOf) -> di
     return relabelled(run, labels, catalogue)
 
 
+class StopResponse(BaseModel):
+    """A run that was requested to stop."""
+
+    run_id: str
+    stop_requested: bool
+
+
+@router.post(
+    "/runs/{run}/stop",
+    status_code=HTTPStatus.ACCEPTED,
+    response_model=StopResponse,
+    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND),
+    summary="Request that a loop which is being recorded stops.",
+)
+def stop_run(run: FoundRun) -> StopResponse:
+    """Make `should_stop` of the recorded environment True; the loop ends when it looks at it."""
+    run.request_stop()
+    return StopResponse(run_id=run.run_id, stop_requested=True)
+
+
 def relabelled(run: Run, labels: LabelChanges, catalogue: Catalogue) -> dict[str, Any]:
     """Change the labels of a run, and return them; errors as for `label`."""
     now = label(run, labels.name, labels.note, labels.tag, labels.untag)

@@ -11,6 +11,7 @@ from typing import Annotated, Final
 from anyio.to_thread import run_sync
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from pydantic import BaseModel
+from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
 from runner.client.client import UploadState, UploadStatus
@@ -97,7 +98,7 @@ async def one(
     while upload.state == "verifying" and time.monotonic() < end and not stopping.is_set():
         await asyncio.sleep(POLL_SECONDS)
         upload = uploads.get(upload_id, owner)
-    return upload
+    return await run_in_threadpool(uploads.alive, upload)
 
 
 @router.patch(

@@ -38,6 +38,8 @@ TABS: Final = (
     ("/tables", "Q-tables"),
     ("/code", "Code"),
 )
+MAX_LATEST: Final = 4
+"""Runs whose latest episodes a page replays."""
 MAX_RUNS: Final = 12
 """Runs that a page compares."""
 Names = Annotated[list[str] | None, Query(max_length=100)]
@@ -94,6 +96,8 @@ class _OverviewView(CompareView):
     results: Rows
     same: bool
     """Whether the content of all runs is the same."""
+    running: list[ComparedRun]
+    """The runs whose latest episodes replay by themselves."""
 
 
 @dataclass(frozen=True)
@@ -143,11 +147,13 @@ async def overview(request: Request, catalogue: CatalogueOf, run: Names = None) 
             for key in dict.fromkeys(key for each in settings for key in each)
         ]
         digests = {each.summary.content_digest for each in runs}
+        compared = _compared(runs, "")
         view = _OverviewView(
-            _compared(runs, ""),
+            compared,
             differing=[(key, values) for key, values in rows if len(set(values)) > 1],
             results=_results(runs),
             same=len(digests) == 1 and None not in digests,
+            running=[each for each in compared.runs if each.head.status == "running"][:MAX_LATEST],
         )
         return page(request, view)
 

@@ -31,6 +31,8 @@ class Panel:
     """The common step at which the episode begins."""
     address: str = ""
     """Address of the page of its replay alone."""
+    episode: str = ""
+    """Path of the episode below the run's replays, where another one may follow it."""
 
 
 def panel_of(

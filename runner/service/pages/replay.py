@@ -20,7 +20,7 @@ from runner.analysis.step_reference import StepRef
 from runner.drawing import svg
 from runner.errors import RunnerError
 from runner.export.episodes import EpisodePlace, place_of
-from runner.export.reports.rendering import Link
+from runner.export.reports.rendering import Link, View
 from runner.recording.reader import Recording, open_recording
 from runner.runs.branches import origin_in
 from runner.runs.run import Run
@@ -31,6 +31,7 @@ from runner.service.catalogue import Catalogue
 from runner.service.dependencies import (
     CacheOf,
     CatalogueOf,
+    ComputationOf,
     PicturesOf,
     ProcessesOf,
     RecordedRun,
@@ -121,6 +122,12 @@ class _EnvironmentsView(RunView):
     """Environments that are not shown."""
 
 
+@dataclass(frozen=True)
+class _LatestView(View):
+    TEMPLATE: ClassVar = "latest.html"
+    panel: Panel
+
+
 @router.get("")
 async def chosen_replay(
     run: RecordedRun,
@@ -141,6 +148,34 @@ async def chosen_replay(
         found = await cache.get_or_await(key, lambda: processes(fragments.typical_episode, run.recording))
         place = found.decode()
     return RedirectResponse(f"/runs/{run.run_id}/replay/{place}", HTTPStatus.FOUND)
+
+
+@router.get("/latest")
+async def latest(
+    request: Request,
+    run: RecordedRun,
+    compute: ComputationOf,
+    shown: Annotated[str, Query(max_length=40)] = "",
+) -> Response:
+    """Return the replay of the latest whole training episode as a part of a page.
+
+    204 if there is none after the one `shown`; with a header if there will be none, as the run is over.
+    """
+    path = (await compute(fragments.latest_episode)).decode()
+    if path in ("", shown):
+        over = {} if run.status == "running" else {"X-Run-Over": "true"}
+        return Response(status_code=HTTPStatus.NO_CONTENT, headers=over)
+
+    def show() -> Response:
+        address = f"/runs/{run.run_id}/replay/{path}"
+        label = f"{run.title}: training episode {int(path.partition('/')[2]):,}"
+        with open_recording(run.recording) as recording:
+            panel = panel_of(
+                recording, "train", f"/api/v1{address}", label, None, address=address, episode=path
+            )
+        return page(request, _LatestView(panel))
+
+    return await run_in_threadpool(show)
 
 
 @router.get("/train/{episode}")

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from http import HTTPStatus
 from itertools import islice
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, NamedTuple
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import RedirectResponse
+from fastapi.responses import HTMLResponse, RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
+from runner.analysis.axes import EPISODES
 from runner.analysis.evaluations import evaluation_record, evaluation_records
 from runner.analysis.summary import brief_provenance
 from runner.client.jobs import RunProgress
@@ -28,7 +30,9 @@ from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import EvaluationMetrics, RecentTraining
 from runner.runs.run import Run
+from runner.runs.shards import shards_in_words
 from runner.service import fragments
+from runner.service.api.reading import AxisName
 from runner.service.api.replay import LONG
 from runner.service.api.runs import LabelChanges, relabelled
 from runner.service.dependencies import (
@@ -87,6 +91,9 @@ class Status:
     """Number of the job that makes the run."""
     is_live: bool
     """Whether all of this may change."""
+    run_id: str
+    stop: Literal["", "possible", "requested"]
+    """Whether its loop can be requested to stop."""
 
 
 @dataclass(frozen=True)
@@ -193,6 +200,17 @@ def label(
     return RedirectResponse(f"/runs/{run.run_id}#labels-title", HTTPStatus.SEE_OTHER)
 
 
+@router.post("/stop")
+def stop(request: Request, run: FoundRun, jobs: JobsOf, settings: SettingsOf) -> Response:
+    """Request that the loop which records the run stops."""
+    try:
+        run.request_stop()
+    except RunnerError as error:
+        view = _overview(run, jobs, settings, problem=message_of(error, request))
+        return page(request, view, HTTPStatus.BAD_REQUEST)
+    return RedirectResponse(f"/runs/{run.run_id}", HTTPStatus.SEE_OTHER)
+
+
 @router.get("/status")
 def status(
     request: Request,
@@ -209,6 +227,18 @@ def status(
     if run.status != status or not now.is_live:
         return Response(status_code=HTTPStatus.NO_CONTENT)
     return page(request, _StatusView(now))
+
+
+@router.get("/distributions")
+async def distributions(
+    run: RecordedRun, cache: CacheOf, processes: ProcessesOf, axis: AxisName = EPISODES.name
+) -> Response:
+    """Return the histograms of training, as a part of the run's page."""
+    key = ("distributions", recording_state(run), axis)
+    body = await cache.get_or_await(
+        key, lambda: processes(fragments.distributions, run.recording, axis), LONG
+    )
+    return HTMLResponse(body)
 
 
 @router.get("/evaluations")
@@ -316,13 +346,14 @@ def _overview(
 
 def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:
     number, live = _job_of(run, jobs)
-    summary = live or run.summary
+    summary = live or (_done_by(run) if run.is_loop and run.status == "running" else run.summary)
     episodes = summary.get("episode", summary.get("episodes"))
     facts = _results(run, EvaluationMetrics.of(summary.get("last_evaluation") or {})) | {
         "Training episodes": humanize.number(episodes, 0),
         "Training steps": humanize.number(summary.get("train_steps"), 0),
         "Evaluation steps": humanize.number(summary.get("eval_steps"), 0),
         "Time": _duration(run),
+        **({"Other processes": f"{others}, added at the end"} if (others := shards_in_words(run)) else {}),
         "Recording": humanize.size(summary["bytes"]) if summary.get("bytes") else humanize.UNKNOWN,
     }
     planned, share, progress = run.episodes_to_do, None, ""
@@ -336,7 +367,22 @@ def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:
         error=settings.without_folders(run.problem or run.summary.error or ""),
         job=number,
         is_live=run.status == "running" or (number is not None and run.status != "finished"),
+        run_id=run.run_id,
+        stop=_stop_of(run),
     )
+
+
+def _done_by(run: Run) -> dict[str, Any]:
+    """Return what a loop that is being recorded has done so far."""
+    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
+        return {**recording.done(), "bytes": recording.size}
+    return {}
+
+
+def _stop_of(run: Run) -> Literal["", "possible", "requested"]:
+    if not run.is_loop or run.status != "running":
+        return ""
+    return "requested" if run.is_stop_requested else "possible"
 
 
 def _results(run: Run, last: EvaluationMetrics) -> dict[str, str]:

@@ -182,6 +182,18 @@ def test_states_before_resets_are_restored(tmp_path):
         assert restored.maker == recording.maker
 
 
+def test_a_run_of_several_processes_comes_back(tmp_path):
+    with runner.record(make("CartPole-v1"), tmp_path) as rec:
+        list(play(rec, 100, 1))
+        with runner.record(make("CartPole-v1"), join=rec.run, shard="two") as two:
+            list(play(two, 100, 2))
+    restore(archived(rec.run.recording, tmp_path / "archive"), tmp_path / "back.mcap")
+    assert contents(tmp_path / "back.mcap") == contents(rec.run.recording)
+    with open_recording(tmp_path / "back.mcap") as restored:
+        assert [shard.name for shard in restored.shards] == ["", "two"]
+    assert verify(tmp_path / "back.mcap").sound
+
+
 def test_every_number_of_an_observation_has_a_column(tmp_path):
     path = LOOPS["pole"](tmp_path)
     folder = archived(path, tmp_path / "archive")

@@ -227,3 +227,27 @@ def test_resets_and_modes_are_checked(tmp_path):
     envs = SyncVectorEnv([lambda: make("CartPole-v1")])
     with pytest.raises(ConfigError, match="which has its own"):
         runner.record_batches(envs, tmp_path, action_space=spaces.Discrete(2))
+
+
+def test_a_recorder_that_fails_does_not_end_the_training_if_that_is_wished(tmp_path):
+    wrong = (BATCH[0], np.zeros((5, 3), int), *BATCH[2:])
+    with runner.record_batches("A", tmp_path, autoreset_mode="NextStep", on_error="warn") as rec:
+        rec.reset(BATCH[0][0])
+        rec.batch(*BATCH)
+        with pytest.warns(RuntimeWarning, match=r"recording stopped at step 10.*shape \(5, 3\)"):
+            rec.batch(*wrong)
+        rec.batch(*BATCH)
+    assert rec.run.facts["status"] == "failed"
+    assert rec.run.summary["train_steps"] == 10
+
+
+def test_what_cannot_be_made_again_says_why_and_a_joined_shard_is_read_with_the_run(tmp_path):
+    with runner.record_batches("A", tmp_path, autoreset_mode="NextStep") as rec:
+        rec.reset(BATCH[0][0])
+        rec.batch(*BATCH)
+        with runner.record_batches("A", autoreset_mode="NextStep", join=rec.run) as other:
+            other.reset(BATCH[0][0])
+            other.batch(*BATCH)
+    with runner.open_recording(rec.run.recording) as recording:
+        assert "recorded in batches" in recording.maker.reason
+        assert recording.result["train_steps"] == 20

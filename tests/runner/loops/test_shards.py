@@ -420,6 +420,9 @@ def test_the_owner_may_end_before_its_shards(tmp_path, monkeypatch):
     rec.close()
     assert rec.run.summary.train_steps == 50
     assert len(shards_of(rec.run)) == 1
+    assert (rec.run.status, run_at(rec.run.folder).status) == ("running", "running")
+    with pytest.raises(RunnerError, match="is finished, expected"):
+        runner.record(gymnasium.make("CartPole-v1"), join=rec.run)
     play(two, 50, 1)
     two.close()
     run = run_at(rec.run.folder)

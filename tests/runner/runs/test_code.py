@@ -15,28 +15,14 @@ import pytest
 from runner.recording.code import MAX_CODE_BYTES, Code, parse_code
 from runner.runs.code import collect
 from runner.runs.git import NotRecorded, read_repository
+from tests.runner.runs.repositories import git, new_project
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
 
 
-def git(folder: Path, *arguments: str) -> str:
-    """Run git as a user would, with a name and without the user's own settings."""
-    settings = ("-c", "user.name=n", "-c", "user.email=n@example.org", "-c", "init.defaultBranch=main")
-    variables = {**os.environ, "GIT_CONFIG_GLOBAL": os.devnull, "GIT_CONFIG_NOSYSTEM": "1"}
-    command = ["git", *settings, "-C", str(folder), *arguments]
-    return subprocess.run(command, check=True, capture_output=True, text=True, env=variables).stdout.strip()
-
-
 @pytest.fixture
 def project(tmp_path):
-    folder = tmp_path / "project"
-    folder.mkdir()
-    git(folder, "init", "-q")
-    (folder / "train.py").write_text("rate = 1\nsteps = 10\n")
-    (folder / ".gitignore").write_text("ignored.py\n")
-    git(folder, "add", "-A")
-    git(folder, "commit", "-qm", "Begin")
-    return folder
+    return new_project(tmp_path / "project")
 
 
 def read(folder: Path, script: Path | None = None) -> tuple[dict[str, str], Code]:
@@ -331,7 +317,7 @@ def test_a_training_in_a_folder_that_hangs_ends_all_the_same(project, monkeypatc
     monkeypatch.setattr(module, "WAIT_SECONDS", 0.2)
     released = threading.Event()
     monkeypatch.setattr(module, "collect", lambda *_: released.wait(60))
-    collector = module.CodeCollector()
+    collector = module.CodeCollector(project / "recordings")
     with create_recording(project / "recording.mcap") as file:
         collector.write(file)
         assert not collector.entries

@@ -31,6 +31,7 @@ from runner.client.connection import Backoff, ServerError, ServerUnavailable, ch
 from runner.client.outbox import outbox_folder
 from runner.export.mcap import export_mcap
 from runner.recording.labels import change_labels
+from runner.recording.reader import open_recording
 from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
 from runner.runs.run import Run
@@ -358,6 +359,21 @@ def test_a_loop_recorded_for_a_server_is_stored_at_its_end(server, outbox):
 def fail_at_length(env):
     drive(env, 50)
     raise KeyError("x" * 100_000)
+
+
+def test_a_loop_of_several_processes_is_stored_whole(server, outbox, monkeypatch):
+    monkeypatch.setattr("runner.client.outbox.FOLLOW_SECONDS", 0.05)
+    with runner.record(gymnasium.make("FrozenLake-v1"), server.url, name="shards") as rec:
+        drive(rec, 200)
+        time.sleep(1)  # a part of the first process's recording is pushed
+        with runner.record(gymnasium.make("FrozenLake-v1"), join=rec.run, shard="two") as two:
+            drive(two, 100)
+    assert list(outbox.iterdir()) == []
+    with Client(server.url) as client:
+        pulled = client.pull(rec.run.run_id, outbox.parent / "back")
+    with open_recording(pulled.run.recording) as recording:
+        assert [shard.train_steps for shard in recording.shards] == [200, 100]
+        assert recording.result.content_digest == rec.run.summary.content_digest
 
 
 def test_a_long_error_of_a_loop_is_shortened(server, outbox):

@@ -300,7 +300,7 @@ form.addEventListener("submit", (event) => {
   const end = (name) => fields[name].value === "" ? null : Number(fields[name].value);
   go(end("from"), end("to"));
 });
-fields.axis.addEventListener("change", () => { change({ axis: fields.axis.value, from: null, to: null }); draw(); });
+fields.axis.addEventListener("change", () => { change({ axis: fields.axis.value, from: null, to: null }); draw(); document.dispatchEvent(new Event("axischange")); });
 fields.lines.addEventListener("change", () => { change({ lines: fields.lines.checked }); draw(); });
 for (const name of ["logx", "logy"]) fields[name].addEventListener("change", () => { change({ [name]: fields[name].checked }); if (last) show(); });
 fields.smooth.addEventListener("input", () => { change({ smooth: Number(fields.smooth.value) }, false); if (last) show(); });

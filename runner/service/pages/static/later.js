@@ -1,7 +1,8 @@
 // Parts of a page that take long to compute: each is fetched and replaces its placeholder.
 async function fill(place) {
+  const axis = "overAxis" in place.dataset ? new URLSearchParams(location.search).get("axis") : null;
   try {
-    const response = await fetch(place.dataset.later, { headers: { accept: "application/json" } });
+    const response = await fetch(place.dataset.later + (axis ? `?axis=${encodeURIComponent(axis)}` : ""), { headers: { accept: "application/json" } });
     if (!response.ok) throw new Error((await response.json().catch(() => null))?.error.message ?? `The service responded with status ${response.status}.`);
     place.innerHTML = await response.text();  // rendered, and escaped, by the server
   } catch (error) {
@@ -14,3 +15,4 @@ async function fill(place) {
 }
 
 document.querySelectorAll("[data-later]").forEach(fill);
+document.addEventListener("axischange", () => document.querySelectorAll("[data-over-axis]").forEach(fill));

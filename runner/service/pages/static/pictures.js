@@ -10,7 +10,7 @@ export function picturesOf(root, at = 0) {
   const source = root.dataset.pictures;
   if (!source) return null;
   const image = root.querySelector(".frame"), kept = new Map(), messages = new Map();
-  let note = root.querySelector(".frame-note").textContent, wanted = at, show = () => {}, reading = null, waiting = null, retry = null, last = Infinity;
+  let note = root.querySelector(".frame-note").textContent, wanted = at, show = () => {}, reading = null, waiting = null, retry = null, last = Infinity, closed = false;
 
   const known = (k) => kept.has(k) || messages.has(k) || k > last;
 
@@ -60,6 +60,7 @@ export function picturesOf(root, at = 0) {
   // Read the piece of the step shown, then those after it.
   function more() {
     clearTimeout(waiting);
+    if (closed) return;
     if (reading) {
       if (known(wanted) || (wanted >= reading.next && wanted < reading.stop)) return;
       reading.control.abort();
@@ -74,12 +75,20 @@ export function picturesOf(root, at = 0) {
   if (image?.getAttribute("src")) keep(at, image.getAttribute("src"));
   addEventListener("pagehide", () => { reading?.control.abort(); clearTimeout(retry); });
   more();
-  return (k, display) => {
+  const pictures = (k, display) => {
     wanted = k;
     show = display;
     tell();
     more();
   };
+  pictures.close = () => {  // of a replay that is no longer shown
+    closed = true;
+    reading?.control.abort();
+    clearTimeout(retry);
+    clearTimeout(waiting);
+    for (const address of new Set(kept.values())) if (address.startsWith("blob:")) URL.revokeObjectURL(address);
+  };
+  return pictures;
 }
 
 // Call `take` with the bytes and the number of each picture, and `noted` with a note; return the message that ends

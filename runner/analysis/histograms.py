@@ -1,0 +1,268 @@
+"""Histograms over training: returns and lengths of episodes, actions and rewards of steps, as heat maps.
+
+A recording is read twice, a block at a time: for the ranges and the distinct values, then for the counts.
+Memory is bounded, however long the run is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.analysis.axes import EPISODES, Axis, Positions, edges_of, positions
+from runner.environments.naming import numbered_actions, spoken
+from runner.recording.metrics import is_usable
+from runner.recording.reader import Recording
+from runner.recording.schema import RESET_ONLY, TRAIN_EPISODE
+
+Values = NDArray[np.float64]
+
+STRETCHES: Final = 60
+"""The most stretches of training."""
+_FEWEST: Final = 10
+_EPISODES_EACH: Final = 6
+"""Episodes of a stretch on average, so that its shares mean something; at least `_FEWEST` stretches."""
+LEVELS: Final = 30
+"""Ranges of values, where these are not few distinct ones."""
+_MAX_DISTINCT: Final = 20
+_MAX_PARTS: Final = 6
+"""Numbers of an action, or agents, that have a histogram of their own."""
+_BATCH: Final = 4096
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """The counts of a quantity over an axis."""
+
+    quantity: str
+    """`return`, `length`, `action` or `reward`."""
+    line: str
+    """An agent, or a part of an action; empty if there is one."""
+    unit: str
+    axis: Axis
+    edges: list[float]
+    """Positions between the stretches, one more than there are of them."""
+    values: list[float]
+    """The distinct values, ascending, or else the edges of the ranges."""
+    names: list[str]
+    """The names of the distinct values; empty where there are ranges."""
+    counts: list[list[int]]
+    """[stretches][values or ranges]."""
+    left_out: int
+    """Number of values that are infinite, NaN or too large."""
+
+
+@dataclass
+class _Column:
+    """A quantity whose values are being counted."""
+
+    quantity: str
+    line: str
+    unit: str
+    name_of: Callable[[float], str]
+    low: float = np.inf
+    high: float = -np.inf
+    distinct: set[float] = field(default_factory=set)
+    left_out: int = 0
+    counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+    levels: Values = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def is_distinct(self) -> bool:
+        return len(self.distinct) <= _MAX_DISTINCT
+
+    def scan(self, values: Values) -> None:
+        """Extend the range and the distinct values."""
+        usable = values[is_usable(values)]
+        self.left_out += len(values) - len(usable)
+        if len(usable):
+            self.low, self.high = min(self.low, float(usable.min())), max(self.high, float(usable.max()))
+            if self.is_distinct:
+                self.distinct.update(np.unique(usable)[: _MAX_DISTINCT + 1].tolist())
+
+    def begin(self, stretches: int) -> None:
+        """Lay out the counts."""
+        self.levels = (
+            np.array(sorted(self.distinct))
+            if self.is_distinct
+            else np.linspace(self.low, self.high, LEVELS + 1)
+        )
+        self.counts = np.zeros((stretches, len(self.levels) - (not self.is_distinct)), np.int64)
+
+    def count(self, stretch: NDArray[np.intp], values: Values) -> None:
+        """Count the values of a block, each in its stretch."""
+        usable = is_usable(values)
+        side = "left" if self.is_distinct else "right"
+        level = np.searchsorted(self.levels, values[usable], side) - (not self.is_distinct)  # type: ignore[call-overload]
+        width = self.counts.shape[1]
+        flat = stretch[usable] * width + level.clip(0, width - 1)
+        self.counts += np.bincount(flat, minlength=self.counts.size).reshape(self.counts.shape)
+
+    def histogram(self, axis: Axis, edges: Values) -> Histogram:
+        return Histogram(
+            quantity=self.quantity,
+            line=self.line,
+            unit=self.unit,
+            axis=axis,
+            edges=edges.tolist(),
+            values=self.levels.tolist(),
+            names=[self.name_of(value) for value in self.levels.tolist()] if self.is_distinct else [],
+            counts=self.counts.tolist(),
+            left_out=self.left_out,
+        )
+
+
+def histograms(recording: Recording, axis: Axis = EPISODES) -> tuple[list[Histogram], list[str]]:
+    """Return the histograms of a recording's training over an axis, and what is left out, a sentence each.
+
+    Returns and lengths are at the ends of episodes, actions and rewards at their steps.
+
+    Raises:
+        RecordingError: the recording is damaged, or does not have the axis.
+    """
+    places = positions(recording, axis)
+    done = recording.done()
+    last = float(places.at(done["episodes"], done["train_steps"]))
+    found: list[Histogram] = []
+    notes: list[str] = []
+    for read in (_episodes, _steps):
+        few = min(STRETCHES, max(_FEWEST, done["episodes"] // _EPISODES_EACH))
+        edges = edges_of(axis, last, few if read is _episodes else STRETCHES)
+        columns: dict[tuple[str, str], _Column] = {}
+        for _, block in read(recording, places, columns, notes):
+            for key, values in block.items():
+                columns[key].scan(values)
+        known = {key: column for key, column in columns.items() if column.distinct}
+        for column in known.values():
+            column.begin(len(edges) - 1)
+        for at, block in read(recording, places, columns, []):
+            stretch = (np.searchsorted(edges, at) - 1).clip(0, len(edges) - 2)
+            for key, values in block.items():
+                if key in known:
+                    known[key].count(stretch, values)
+        found += [column.histogram(axis, edges) for column in known.values()]
+    for each in found:
+        if each.left_out:
+            whose = f" of {spoken(each.line)}" if each.line else ""
+            notes.append(
+                f"{each.left_out:,} values of {each.quantity}{whose} are left out, as they are infinite, not "
+                "a number or too large."
+            )
+    return found, list(dict.fromkeys(notes))
+
+
+Block = tuple[Values, Mapping[tuple[str, str], Values]]
+"""The positions of a block, and the values of its columns."""
+
+
+def _episodes(
+    recording: Recording, places: Positions, columns: dict[tuple[str, str], _Column], _notes: list[str]
+) -> Iterator[Block]:
+    agents = recording.agents[:_MAX_PARTS]
+    lines = agents if len(recording.agents) > 1 else [""]
+    columns[("length", "")] = columns.get(("length", "")) or _Column("length", "", "steps", _number)
+    for line in lines:
+        columns.setdefault(("return", line), _Column("return", line, "summed reward", _number))
+    for block in recording.blocks(TRAIN_EPISODE):
+        own = {("return", line): block["returns"][:, i].astype(np.float64) for i, line in enumerate(lines)}
+        at = places.at(block["episode"] + 1, block["last_step"] + 1)
+        yield at, {("length", ""): block["length"].astype(np.float64), **own}
+
+
+def _steps(
+    recording: Recording, places: Positions, columns: dict[tuple[str, str], _Column], notes: list[str]
+) -> Iterator[Block]:
+    lines = recording.agents[:_MAX_PARTS] if len(recording.agents) > 1 else [""]
+    if recording.has_messages("/train/step"):
+        for line in lines:
+            columns.setdefault(("reward", line), _Column("reward", line, "reward of a step", _number))
+    else:
+        notes.append("Rewards have no histogram, as no whole steps of training were recorded.")
+    for block in _blocks(recording):
+        taken = block["t"] != RESET_ONLY
+        values: dict[tuple[str, str], Values] = {}
+        for part, own in _parts(recording, block["action"][taken], notes).items():
+            values["action", part] = own.astype(np.float64)
+            if ("action", part) not in columns:
+                columns["action", part] = _Column("action", part, "action", _action_name(recording, part))
+        if "rewards" in (block if isinstance(block, dict) else block.dtype.names or ()):
+            for i, line in enumerate(lines):
+                values["reward", line] = block["rewards"][taken][:, i].astype(np.float64)
+        yield places.at(block["episode"][taken], block["step"][taken] + 1), values
+
+
+def _blocks(recording: Recording) -> Iterator[Any]:
+    """Yield the steps in blocks of arrays by field, also those that vary in size, or their actions alone."""
+    topic = recording.topic("/train/step")
+    if not recording.has_messages(topic.name):
+        if recording.has_actions:
+            yield from recording.actions("train")
+    elif topic in recording.dtypes:
+        yield from recording.blocks(topic)
+    else:
+        steps = recording.transitions("train")
+        while batch := list(itertools.islice(steps, _BATCH)):
+            names = ("t", "episode", "step", "rewards")
+            yield {
+                **{name: np.array([step[name] for step in batch]) for name in names},
+                "action": _uniform([step["action"] for step in batch]),
+            }
+
+
+def _uniform(actions: list[Any]) -> NDArray[Any]:
+    """Return actions as one array; an array of objects where they are no arrays of one shape."""
+    if all(isinstance(each, (np.ndarray, np.generic)) for each in actions):
+        with contextlib.suppress(ValueError):
+            return np.array(actions)
+    return np.array([None] * len(actions))
+
+
+def _parts(recording: Recording, actions: NDArray[Any], notes: list[str]) -> dict[str, NDArray[Any]]:
+    """Return the numbers of actions by part: an agent, a field or an index; empty for a single number."""
+    if recording.is_job:
+        own = recording.mdp.own_actions[actions]
+        agents = recording.mdp.agents
+        return {agent if len(agents) > 1 else "": own[:, i] for i, agent in enumerate(agents)}
+    parts = {part: own for part, own in _numbers("", actions) if own.dtype.kind in "biuf"}
+    if not parts:
+        notes.append("Actions have no histogram, as they are not numbers of one shape.")
+    if len(parts) > _MAX_PARTS:
+        notes.append(f"Of {len(parts):,} parts of an action the first {_MAX_PARTS} have a histogram.")
+    return dict(itertools.islice(parts.items(), _MAX_PARTS))
+
+
+def _numbers(path: str, values: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any]]]:
+    if values.dtype.names is not None:
+        for name in values.dtype.names:
+            yield from _numbers(f"{path}.{name}" if path else name, values[name])
+    elif values.ndim == 1:
+        yield path, values
+    else:
+        flat = values.reshape(len(values), -1)
+        for i in range(flat.shape[1]):
+            yield path if flat.shape[1] == 1 else f"{path}[{i}]", flat[:, i]
+
+
+def _action_name(recording: Recording, part: str) -> Callable[[float], str]:
+    """Return a function that names the discrete actions of a part."""
+    start = 0
+    if recording.is_job:
+        agents = recording.mdp.agents
+        names = tuple(numbered_actions(recording.mdp)[agents.index(part) if part else 0])
+    else:
+        agent = part if part in recording.agents else ""
+        names = recording.action_names("train", agent) if agent or not part else ()
+        space = recording.spaces["action"]
+        start = int(space.get("start", 0)) if recording.kind != "step" else 0
+    known = {float(start + i): spoken(name) for i, name in enumerate(names)}
+    return lambda value: known.get(value, _number(value))
+
+
+def _number(value: float) -> str:
+    return f"{value:,.6g}"

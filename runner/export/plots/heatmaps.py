@@ -1,0 +1,71 @@
+"""Histograms over training as heat maps: the share of the values of each stretch that are in a range."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from runner.analysis.histograms import Histogram
+from runner.drawing import palette
+from runner.environments.naming import spoken
+from runner.export.plots.chart import SMALL, Chart, Scale, labelled, number_on_axis
+from runner.export.plots.curves import HEIGHT, WIDTH, Plot
+
+_TITLES: Final = {
+    "return": "Returns of training episodes",
+    "length": "Lengths of training episodes",
+    "action": "Actions in training",
+    "reward": "Rewards in training",
+}
+_LETTERS: Final = 11
+EXPLANATION: Final = (
+    "In each stretch of training, the share of its values in each range: the lighter, the more; nothing is "
+    "drawn where there is none."
+)
+
+
+def heatmap_plots(histograms: list[Histogram]) -> list[Plot]:
+    """Return the heat maps for a page."""
+    return [Plot(title_of(each), heatmap_chart(each).svg(), False) for each in histograms]
+
+
+def title_of(histogram: Histogram) -> str:
+    """Return the title of a heat map."""
+    return _TITLES[histogram.quantity] + (f": {spoken(histogram.line)}" if histogram.line else "")
+
+
+def heatmap_chart(histogram: Histogram) -> Chart:
+    """Return the heat map of a histogram."""
+    counts = np.array(histogram.counts, np.float64)
+    totals = counts.sum(axis=1, keepdims=True)
+    shares = np.divide(counts, totals, out=np.zeros_like(counts), where=totals > 0)
+    rows = counts.shape[1]
+    left = 74.0 if histogram.names else 56.0
+    x = Scale(0.0, histogram.edges[-1], left, WIDTH - 16)
+    low, high = (0.0, float(rows)) if histogram.names else (histogram.values[0], histogram.values[-1])
+    y = Scale(low, high, HEIGHT - 34, 34.0)
+    title = title_of(histogram)
+    chart = Chart(x, y, WIDTH, HEIGHT, f"{title} over {histogram.axis.title}, {histogram.unit}")
+    edges = np.arange(rows + 1.0) if histogram.names else np.array(histogram.values)
+    lines, columns = y(edges), x(np.array(histogram.edges))
+    levels = np.ceil(shares / (shares.max() or 1.0) * (palette.LEVELS - 1)).astype(int)
+    for level in np.unique(levels[levels > 0]).tolist():
+        k, j = np.nonzero(levels == level)
+        cells = np.column_stack(
+            [columns[k], lines[j + 1], columns[k + 1] - columns[k], lines[j] - lines[j + 1]]
+        )
+        chart.cells(cells, palette.ramp_colour(level))
+    chart.shape([(x.start, y.end), (x.start, y.start), (x.end, y.start)], stroke=palette.INK)
+    ticks = x.ticks if not histogram.axis.whole else [tick for tick in x.ticks if tick == int(tick)]
+    for tick, text in labelled(ticks, short=histogram.edges[-1] >= 10_000):
+        chart.shape([(x.at(tick), y.start), (x.at(tick), y.start + 3)], stroke=palette.INK)
+        chart.text(x.at(tick), y.start + 11.5, text, "middle", size=8)
+    named = [(k + 0.5, name) for k, name in enumerate(histogram.names)]
+    for at, name in named[:: -(-rows // 10)] or [(tick, number_on_axis(tick)) for tick in y.ticks]:
+        short = name if len(name) <= _LETTERS else f"{name[: _LETTERS - 1]}…"
+        chart.text(x.start - 5, y.at(at) + 3, short, "end", size=8)
+    chart.text(x.start, 14.0, title, size=9.5, bold=True)
+    chart.text(x.start, 26.0, f"{histogram.unit}; lightest: {100 * shares.max():.0f} %", size=SMALL)
+    chart.text((x.start + x.end) / 2, HEIGHT - 5, histogram.axis.label, "middle")
+    return chart

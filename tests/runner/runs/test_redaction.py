@@ -1,0 +1,113 @@
+"""Secrets do not get into recordings: by name, by shape, by the values of environment variables."""
+
+from __future__ import annotations
+
+import pytest
+
+from runner.runs.redaction import (
+    REDACTED,
+    SECRET_NAMES,
+    is_secret_name,
+    redacted_arguments,
+    redacted_text,
+)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "shown"),
+    [
+        (["--api-key", "abc", "--lr", "3"], ["--api-key", REDACTED, "--lr", "3"]),
+        (["--api-key=abc", "x"], [f"--api-key={REDACTED}", "x"]),
+        (["-token", "abc"], ["-token", REDACTED]),
+        (["env.PASSWORD=1234"], [f"env.PASSWORD={REDACTED}"]),
+        (["+secrets.hf=abc"], [f"+secrets.hf={REDACTED}"]),
+        (["--password", "1234"], ["--password", REDACTED]),
+        (["--max-tokens", "512", "--tokens=0.5"], ["--max-tokens", "512", "--tokens=0.5"]),
+        (["--use-token", "--lr", "3"], ["--use-token", "--lr", "3"]),
+        (["--tokenizer", "gpt2"], ["--tokenizer", "gpt2"]),
+        (["https://me:pw@example.org/x"], [f"https://{REDACTED}@example.org/x"]),
+        (["https://example.org/x?token=abc&n=1"], [f"https://example.org/x?token={REDACTED}&n=1"]),
+        (['{"api_key": "abcdef"}'], [f'{{"api_key": "{REDACTED}"}}']),
+        (["train.py", "--name", "monday"], ["train.py", "--name", "monday"]),
+    ],
+)
+def test_arguments(arguments, shown):
+    assert redacted_arguments(arguments, {}) == shown
+
+
+@pytest.mark.parametrize("name", SECRET_NAMES)
+def test_names(name):
+    assert is_secret_name(f"MY_{name.upper()}_2")
+    assert redacted_arguments([f"--my-{name}=hello"], {}) == [f"--my-{name}={REDACTED}"]
+
+
+@pytest.mark.parametrize(
+    "secret",
+    [
+        "AKIA" + "A1B2" * 4,
+        "ghp_" + "a1B2" * 9,
+        "github_pat_" + "a1B2" * 10,
+        "glpat-" + "a1B2" * 5,
+        "xoxb-1234567890-abc",
+        "sk-proj-" + "a1B2" * 8,
+        "sk-ant-api03-" + "a1B2" * 8,
+        "hf_" + "aBcD" * 8,
+        "AIza" + "a1B2c" * 7,
+        "npm_" + "a1B2" * 9,
+        "sk_live_" + "a1B2" * 6,
+        "dualtaxi_" + "a1B2" * 10 + "xyz",
+        "eyJhbGciOiJIUzI1NiJ9.eyJzdWIiOiIxMjM0NTY3ODkwIn0.dozjgNryP4J3jVmNHl0w5N_XgL0n3I9P",
+        "-----BEGIN RSA PRIVATE KEY-----\nMIIEowIBAAKCAQEA\nabc=\n-----END RSA PRIVATE KEY-----",
+    ],
+)
+def test_shapes(secret):
+    text = redacted_text(f"x = '{secret}'  # mine\n+call({secret})\n", {})
+    assert text == f"x = '{REDACTED}'  # mine\n+call({REDACTED})\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ('WANDB_API_KEY = "0123abcd"', f'WANDB_API_KEY = "{REDACTED}"'),
+        ("os.environ['HF_TOKEN'] = 'abcd1'", f"os.environ['HF_TOKEN'] = '{REDACTED}'"),
+        ('password: str = "hunter22"', f'password: str = "{REDACTED}"'),
+        (
+            'parser.add_argument("--api-key", default="abcd")',
+            f'parser.add_argument("--api-key", default="{REDACTED}")',
+        ),
+        ('wandb.login(key="' + "0a" * 20 + '")', f'wandb.login(key="{REDACTED}")'),
+        ("export MY_TOKEN=abcdefgh12345678", f"export MY_TOKEN={REDACTED}"),
+        ("  api_key: abcdefgh12345678", f"  api_key: {REDACTED}"),
+        ("Authorization: Bearer abcdefgh12345678", f"Authorization: Bearer {REDACTED}"),
+        ("git clone https://me:pw@example.org/a.git", f"git clone https://{REDACTED}@example.org/a.git"),
+    ],
+)
+def test_sources(text, shown):
+    assert redacted_text(text, {}) == shown
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'runs.sort(key="mean_length")',
+        'tokenizer_name = "gpt2-medium"',
+        "token = get_token()",
+        'TOKEN = "${MY_TOKEN}"',
+        'TOKEN = os.environ["HF_TOKEN"]',
+        '{"max_tokens": "512"}',
+        "key, subkey = jax.random.split(key)",
+        'commit = "047c836d80e0fb2bf26b1ab961230fa137523b25"',
+        "git@example.org:team/project.git",
+        "ssh://git@example.org/team/project.git",
+        'for key in "wasd": pass',
+    ],
+)
+def test_code_without_secrets_stays(text):
+    assert redacted_text(text, {}) == text
+
+
+def test_values_of_environment_variables():
+    variables = {"DB_PASSWORD": "correct horse battery", "MY_KEY": "short", "HOME": "/home/a-long-name"}
+    text = redacted_text("connect('correct horse battery', 'short', '/home/a-long-name')", variables)
+    assert text == f"connect('{REDACTED}', 'short', '/home/a-long-name')"
+    assert redacted_arguments(["correct horse battery"], variables) == [REDACTED]
