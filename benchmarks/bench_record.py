@@ -22,7 +22,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
+from gymnasium import spaces, wrappers
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
@@ -68,6 +68,7 @@ def measure(quick: bool) -> list[Figure]:
         for name, kind, count in (("Blackjack-v1", "short", steps // 20), ("Taxi-v4", "long", steps // 2)):
             figures += _against_minari(name, kind, Path(folder), count, repetitions)
         figures += [_vector(count, Path(folder), steps // 5, repetitions) for count in (1, 4, 16)]
+        figures += _pong(Path(folder), steps // 50, repetitions)
         figures += [_batches(count, Path(folder), steps * 40, repetitions) for count in (16, 1024)]
         figures += _extras(Path(folder), steps, repetitions)
         figures += _short(Path(folder), 100 if quick else 1_000, repetitions)
@@ -109,6 +110,36 @@ def _environment(name: str, folder: Path, steps: int, repetitions: int) -> list[
             detail=f"processor time of the loop's thread; all threads {statistics.median(whole):.2f} us",
         ),
         figure(f"  on disk, {name}", [size], "bytes/step", TARGETS[name], higher_is_better=False),
+    ]
+
+
+def _pong(folder: Path, steps: int, repetitions: int) -> list[Figure]:
+    """Return the overhead and the size of Pong's steps, with the usual stack of four frames."""
+    try:
+        import ale_py
+    except ImportError:
+        print("    Atari's Pong is left out: ale-py is not installed")
+        return []
+    gymnasium.register_envs(ale_py)
+
+    def make() -> Env:
+        frames = wrappers.AtariPreprocessing(gymnasium.make("ALE/Pong-v5", frameskip=1))
+        return wrappers.FrameStackObservation(frames, 4)
+
+    added, whole, size = [], [], 0.0
+    for _ in range(repetitions):
+        with contextlib.closing(make()) as env:
+            alone = _times(lambda env=env: drive(env, steps))  # type: ignore[misc]
+        with runner.record(make(), folder / "recordings") as env:
+            recorded = _times(lambda env=env: drive(env, steps))  # type: ignore[misc]
+        size = env.run.summary["bytes"] / steps
+        added.append((recorded[0] - alone[0]) / steps * 1e6)
+        whole.append((recorded[1] - alone[1]) / steps * 1e6)
+    detail = f"processor time of the loop's thread; all threads {statistics.median(whole):.0f} us; a step "
+    detail += f"of the environment takes {alone[0] / steps * 1e6:.0f} us"
+    return [
+        figure("added per step, Pong", added, "us", (60, 25), higher_is_better=False, detail=detail),
+        figure("  on disk, Pong", [size], "bytes/step", (110, 60), higher_is_better=False),
     ]
 
 

@@ -1,15 +1,29 @@
-"""What follows from the ends of episodes in some steps of a vector environment."""
+"""The ends of episodes and the resets in some steps of a vector environment, and what follows from them."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.recording import schema
+from runner.recording.reset_states import ResetState
 
 Flags = NDArray[np.bool_]
+
+
+class ResetsBetween(NamedTuple):
+    """Resets of environments whose episodes had ended, by the user or within a step (`SAME_STEP`)."""
+
+    row: NDArray[np.intp]
+    """The row of the block that comes after each."""
+    which: NDArray[np.intp]
+    observation: NDArray[Any]
+    seeds: Sequence[int | None]
+    states: Sequence[ResetState | None]
+    """What each depended on, where that is to be recorded."""
 
 
 class EpisodeCounts(NamedTuple):

@@ -8,7 +8,7 @@ episodes, the resets that environments do by themselves) is computed for a block
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from runner.loops.description import Described
 from runner.loops.generators import States
 from runner.loops.rows import MAX_SEED
 from runner.loops.values import require_reset, warn_user
-from runner.loops.vector_counts import EpisodeCounts, Flags, counts_of
+from runner.loops.vector_counts import EpisodeCounts, Flags, ResetsBetween, counts_of
 from runner.recording import schema
 from runner.recording.gym_values import filler, leaves_of, put_chosen
 from runner.recording.recorder import Recorder
@@ -27,18 +27,6 @@ from runner.recording.schema import Topic
 _TRUE: Final = b"\1"
 _MAX_STEPS: Final = 2048
 """The most steps of the vector environment in a block; fewer if the recorder's blocks hold fewer records."""
-
-
-class ResetsBetween(NamedTuple):
-    """Resets of environments whose episodes had ended, by the user or within a step (`SAME_STEP`)."""
-
-    row: NDArray[np.intp]
-    """The row of the block that comes after each."""
-    which: NDArray[np.intp]
-    observation: NDArray[Any]
-    seeds: Sequence[int | None]
-    states: Sequence[ResetState | None]
-    """What each depended on, where that is to be recorded."""
 
 
 class VectorRows:
