@@ -244,7 +244,7 @@ def test_logged_pictures_are_shown_newest_first_with_their_steps(client, recordi
             writer.add_image("<b>", np.full((3, 4, 4), 50 * step, np.uint8), step)
         writer.add_video("film", np.zeros((1, 2, 3, 4, 4), np.uint8), 1_234)
     page = page_of(client, "/runs/pictured/pictures")
-    assert page.count("<img src=") == 3
+    assert page.count("<figure><img src=") == 3
     assert page.index("film, step 1,234") < page.index("&lt;b&gt;, step 2") < page.index("&lt;b&gt;, step 1<")
     assert "data:image/webp;base64," in page
     assert "/pictures" in page_of(client, "/runs/pictured")
