@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.axes import EPISODES, Axis, Positions, edges_of, positions
+from runner.analysis.axes import EPISODES, STEPS, Axis, Positions, edges_of, positions
 from runner.analysis.evaluations import (
     EvaluationRecord,
     TrainingRecord,
@@ -20,7 +20,7 @@ from runner.analysis.evaluations import (
     training_records,
 )
 from runner.environments.naming import event_in_words, spoken
-from runner.errors import RecordingError, RunnerError
+from runner.errors import RunnerError
 from runner.recording import schema
 from runner.recording.metrics import LARGEST, METRIC_OF, METRICS, SHARES, is_usable
 from runner.recording.reader import Recording
@@ -28,6 +28,8 @@ from runner.recording.reader import Recording
 Readings = dict[str, dict[str, float]]
 """Metric -> line (an agent, a reward, or "") -> value."""
 
+FURTHER_NAMES: Final = ""
+"""Among the values left out: those under further names than are read."""
 LOGGED: Final = "training.logged."
 """Prefix of the names under which a loop logged values."""
 _MAX_TITLE: Final = 40
@@ -82,17 +84,23 @@ class RunSeries:
         return not self.is_loop or any("success_percent" in readings for _, readings in self.evaluation)
 
 
-def values_left_out(runs: Iterable[RunSeries]) -> list[str]:
+def values_left_out(runs: Collection[RunSeries]) -> list[str]:
     """Return a sentence for each run whose readings leave values out."""
     return [
         f"Run {run.run_id}: left out, as they are infinite, not a number or beyond {LARGEST:g}: "
         + ", ".join(
             f"{count:,} value{'s' if count > 1 else ''} of “{title_of(metric)[0]}”"
             for metric, count in run.not_finite.items()
+            if metric != FURTHER_NAMES
         )
         + "."
         for run in runs
-        if run.not_finite
+        if run.not_finite.keys() - {FURTHER_NAMES}
+    ] + [
+        f"Run {run.run_id}: left out, as they have other names than the first {_MAX_NAMES} that were logged: "
+        f"{count:,} values."
+        for run in runs
+        if (count := run.not_finite.get(FURTHER_NAMES))
     ]
 
 
@@ -175,6 +183,8 @@ def read_series(recording: Recording, axis: Axis = EPISODES) -> RunSeries:
         RecordingError: the recording is damaged, or does not have the axis.
     """
     not_finite: Counter[str] = Counter()
+    if axis is EPISODES and not recording.is_job and not any(recording.done().values()):
+        axis = STEPS  # values without an environment have the steps that were given with them
     places = positions(recording, axis)
     evaluations = evaluation_records(recording)
     config = recording.config
@@ -278,6 +288,9 @@ def _loop_training(
     """Return the means over stretches of training, by the end of the stretch."""
     done = recording.done()
     last = float(places.at(done["episodes"], done["train_steps"]))
+    if not any(done.values()):
+        times = (time for time, _ in recording.messages(schema.SCALAR_TOPIC))
+        last = max(times, default=0) / schema.STEP_NANOSECONDS
     edges = edges_of(places.axis, last, _MAX_POINTS)
     training = _mean_episodes(recording, places, edges, not_finite)
     for name, values in _mean_scalars(recording, places, edges, not_finite).items():
@@ -333,7 +346,8 @@ def _mean_scalars(
         name = scalar["name"] if scalar["phase"] == "train" else f"{scalar['name']} ({scalar['phase']})"
         if name not in sums:
             if len(sums) == _MAX_NAMES:
-                raise RecordingError(f"{recording.path}: has scalars of more than {_MAX_NAMES} names.")
+                not_finite[FURTHER_NAMES] += 1
+                continue
             sums[name], counts[name] = np.zeros(bins), np.zeros(bins)
         if not abs(scalar["value"]) <= LARGEST:
             not_finite[f"{LOGGED}{name}"] += 1
