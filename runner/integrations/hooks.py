@@ -105,7 +105,7 @@ _step.__name__ = "step"  # by which a pickled environment finds its own
 def _reset(env: Any, original: Callable[..., Any], arguments: Any, named: Mapping[str, Any]) -> Any:
     """Reset an environment; begin to record it if a run waits for one."""
     watched = _watched.get(id(env))
-    if watched is None and open_runs and not any(each.is_inside for each in _watched.values()):
+    if watched is None and not any(each.is_inside for each in _watched.values()):
         _find_run(env)
         watched = _watched.get(id(env))
     if watched is None:
@@ -176,6 +176,8 @@ def _hook(cls: Any) -> None:
 
     @functools.wraps(original)
     def reset(self: Any, *arguments: Any, **named: Any) -> Any:
+        if not open_runs:
+            return original(self, *arguments, **named)
         return _reset(self, original, arguments, named)
 
     cls.reset = reset

@@ -16,6 +16,7 @@ import pytest
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 import runner
+from runner.analysis.series import points_of, read_series, values_left_out
 from runner.errors import ConfigError, RunnerError
 from runner.execution.redo import verify_by_redoing
 from runner.integrations import wandb
@@ -195,6 +196,10 @@ def test_values_without_an_environment_are_a_run_of_their_own():
     assert (run.name, run.status, run.summary["train_steps"]) == ("regression", "finished", 0)
     assert scalars(run)[:3] == [("loss/train", 1.0, 0), ("loss/test", 2.0, 0), ("loss/train", 1 / 11, 10)]
     assert verify_by_redoing(run.recording).reason == "No steps were recorded."
+    with runner.open_recording(run.recording) as recording:
+        series = read_series(recording)
+    assert series.axis.name == "steps"
+    assert points_of(series, "training.logged.loss/train", "", aligned=False)[20] == 1 / 21
 
 
 def test_options_of_recording_can_be_given():
@@ -307,6 +312,10 @@ def test_names_are_bounded():
             writer.add_scalar("one more", 1.0)
         writer.add_scalar("another", 1.0)
     assert len({name for name, *_ in scalars(the_run())}) == MAX_NAMES
+    with runner.open_recording(the_run().recording) as recording:
+        series = read_series(recording)
+    (sentence,) = values_left_out([series])
+    assert "other names than the first 64 that were logged: 9,936 values" in sentence
 
 
 # --- wandb -------------------------------------------------------------------------------------------------
