@@ -22,8 +22,8 @@ from runner.loops.recorded import Recorded
 
 _VECTORS_OF_OTHERS: Final = {
     "stable_baselines3": "runner.integrations.sb3.Recording",
-    "torchrl": "runner.integrations.torchrl",
-    "ray": "runner.integrations.rllib",
+    "torchrl": "runner.integrations.torchrl.record",
+    "ray": "runner.integrations.rllib.Recording",
 }
 """Libraries that step several environments one by one, and what records these."""
 
