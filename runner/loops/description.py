@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Final
 
 from gymnasium import spaces
@@ -46,7 +47,7 @@ class Described:
         """The action space in the dtype in which actions are recorded."""
         return self.action if self.wide_action is None else self.wide_action
 
-    @property
+    @cached_property
     def spaces_json(self) -> str:
         """The descriptions of both spaces."""
         described = {"observation": self.observation, "action": self.recorded_action}
