@@ -19,6 +19,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 import runner
 from runner.errors import ConfigError, RunnerError
 from runner.execution.redo import verify_by_redoing
+from runner.execution.verify import verify
 from runner.loops.folding import fold_if_over
 from runner.recording.reader import open_recording
 from runner.runs.listing import list_runs, run_at
@@ -427,3 +428,36 @@ def test_the_owner_may_end_before_its_shards(tmp_path, monkeypatch):
     two.close()
     run = run_at(rec.run.folder)
     assert (run.status, run.summary.train_steps) == ("finished", 150)
+
+
+def test_games_of_several_agents_share_a_run(tmp_path):
+    from mpe2 import simple_tag_v3
+
+    def step(rec, seed):
+        for episode in range(2):
+            rec.reset(seed=seed + episode)
+            while rec.agents:
+                for agent in rec.agents:
+                    rec.action_space(agent).seed(seed)
+                rec.step({agent: rec.action_space(agent).sample() for agent in rec.agents})
+
+    with runner.record_parallel(simple_tag_v3.parallel_env(max_cycles=30), tmp_path, name="game") as rec:
+        step(rec, 1)
+        with runner.record_parallel(simple_tag_v3.parallel_env(max_cycles=30), join=rec.run) as two:
+            step(two, 5)
+    redone = verify_by_redoing(rec.run.recording)
+    assert (redone.verdict, redone.steps, redone.episodes) == ("reproduced", 120, 4)
+    assert verify(rec.run.recording).sound
+
+
+def test_events_of_a_table_are_counted_over_all_processes(tmp_path):
+    with runner.record(gymnasium.make("Taxi-v4"), tmp_path, name="taxi") as rec:
+        play(rec, 500, 1)
+        with runner.record(gymnasium.make("Taxi-v4"), join=rec.run, shard="two", phase="eval") as two:
+            play(two, 500, 2)
+    with open_recording(rec.run.recording) as recording:
+        assert recording.tabular
+        assert recording.episodes("train")["penalties"].sum() > 0
+        assert recording.result.rewards_off_table == 0
+    assert verify(rec.run.recording).sound
+    assert verify_by_redoing(rec.run.recording).verdict == "reproduced"
