@@ -392,7 +392,8 @@ class _Fold:
                 fields["step"] = self._evaluated_by(key)
             fields["episode"] = max(int(units["new_episode"][at]), 0) if at >= 0 else 0
             yield place, encode(topic.message, fields)
-        elif source is self._main:  # of a process, such as its clock
+        elif source is (self._main if topic == schema.CLOCK_TOPIC else self._sources[0]):
+            # Of a machine or a process, such as what it printed.
             yield place, encode(topic.message, fields)
 
 

@@ -138,8 +138,8 @@ class Loop(Generic[R]):
             sizes=sizes_of(self._facts, str(path)),
             watch=self._watch,
             before=self._describe,
-            system=options.packing.system,
-            console=options.packing.console,
+            system=options.packing.system and not is_shard,
+            console=options.packing.console and not is_shard,
         )
         self._actions = (
             ActionRecorder(self._recorder, described.environments, options.packing.chunk_steps)

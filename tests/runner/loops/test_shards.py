@@ -381,6 +381,10 @@ def test_mistakes_of_joining_are_named(tmp_path, monkeypatch):
         runner.record(env(), join=True)
     with pytest.raises(RunnerError, match="no run 'nothing'"):
         runner.record(env(), tmp_path, join="nothing")
+    actions = runner.record(env(), tmp_path, steps="actions")
+    with pytest.raises(RunnerError, match="is recorded with steps 'actions', expected all"):
+        runner.record(env(), join=actions.run)
+    actions.close()
     rec = runner.record(env(), tmp_path, name="mistakes")
     with pytest.raises(ConfigError, match="expected the spaces and agents of run"):
         runner.record(gymnasium.make("MountainCar-v0"), join=rec.run)
