@@ -121,7 +121,7 @@ class Loop(Generic[R]):
         made_by = {key: self._made_by[key] for key in runs.MADE_BY if key in self._made_by}
         facts = {"provenance": made_by, "spaces": described.common}
         self.run = self._new_run(outbox_folder() if client else None, facts)
-        self._code = CodeCollector(self.run.folder.parent, options.packing.code)
+        self._code = CodeCollector(self.run.folder.parent, options.packing.code and not is_shard)
         path = self.run.folder / RECORDING_FILE
         topics = schema.KINDS[described.kind]
         with unless_empty(self.run):
