@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from runner.loops.batches import record_batches
     from runner.loops.branch import branch
     from runner.loops.env import record
-    from runner.loops.parallel import record_parallel
+    from runner.loops.parallel import record_aec, record_parallel
     from runner.loops.vector import record_vector
     from runner.recording.gym_json import register_space
     from runner.recording.reader import Recording, open_recording
@@ -53,6 +53,7 @@ __all__ = [
     "list_runs",
     "open_recording",
     "record",
+    "record_aec",
     "record_batches",
     "record_parallel",
     "record_vector",
@@ -76,6 +77,7 @@ _HOME = {
     "list_runs": "runner.runs.listing",
     "open_recording": "runner.recording.reader",
     "record": "runner.loops.env",
+    "record_aec": "runner.loops.parallel",
     "record_batches": "runner.loops.batches",
     "record_parallel": "runner.loops.parallel",
     "record_vector": "runner.loops.vector",

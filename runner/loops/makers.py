@@ -30,6 +30,7 @@ from runner.errors import ConfigError
 from runner.loops.actions import action_names
 from runner.loops.vec_env import LIBRARY, VecEnvVector, mode_of
 from runner.recording.maker import FUNCTION_NAME, MAX_SPEC, EnvironmentMaker, VectorMaker
+from runner.replay.turns import Turns
 from runner.util.values import MAX_TEXT
 
 _NAME_MAKE: Final = 'name a function that makes it: make="module:function"'
@@ -183,10 +184,12 @@ def _custom_vector(base: Any) -> EnvironmentMaker:
 def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
     """Return how a PettingZoo parallel environment was made; `make` is the function that the user named.
 
-    By PettingZoo's convention the module of a game has a function `parallel_env`, which also adds the
-    wrappers that belong to the game.
+    By PettingZoo's convention the module of a game has a function `parallel_env`, and `env` for the game in
+    turns, which also adds the wrappers that belong to the game.
     """
-    layers = list(_layers(env))
+    is_in_turns = isinstance(env, Turns)
+    function = "env" if is_in_turns else "parallel_env"
+    layers = list(_layers(env.env if is_in_turns else env))
     base, outer = layers[-1], layers[0]
     module = type(base).__module__
     named = {str(agent): action_names(base, env.action_space(agent)) for agent in env.possible_agents}
@@ -198,10 +201,10 @@ def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
     )
     top, assumed = _top(module), []
     try:
-        has_function = callable(getattr(sys.modules.get(module), "parallel_env", None))
+        has_function = callable(getattr(sys.modules.get(module), function, None))
         foreign = [layer for layer in layers[:-1] if not type(layer).__module__.startswith("pettingzoo.")]
         is_converted = getattr(outer, "env", None) is None and hasattr(outer, "aec_env")
-        if outer is not base and not (has_function and is_converted):
+        if outer is not base and not (has_function and (is_converted or is_in_turns)):
             foreign.append(outer)
         if foreign:
             raise _Unknown(f"the wrapper {_class_name(foreign[0])} does not record its arguments")
@@ -210,7 +213,7 @@ def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
             assumed = _default_arguments(type(base), ())
         elif base._ezpickle_args:
             arguments = inspect.signature(type(base)).bind(*base._ezpickle_args, **arguments).arguments
-        entry_point = f"{module}:parallel_env" if has_function else _entry_point(type(base))
+        entry_point = f"{module}:{function}" if has_function else _entry_point(type(base))
         kwargs = _checked_kwargs(arguments or {}, f"the game {_class_name(base)}")
     except _Unknown as reason:
         return _with_versions(maker, [top], reason)

@@ -20,6 +20,7 @@ from runner.loops.recorded import RecordedAlone, require_pictures
 from runner.loops.single_rows import AgentRows
 from runner.loops.values import check_phase
 from runner.loops.vector import by_field, require_fixed
+from runner.replay.turns import Turns, is_in_turns
 from runner.runs.run import Run
 
 
@@ -85,6 +86,34 @@ class RecordedParallel(RecordedAlone[AgentRows]):
         return by_field(info)
 
 
+class RecordedAec(RecordedParallel):
+    """A PettingZoo game in turns whose every reset and step is recorded; made by `record_aec`.
+
+    Its other attributes are those of the game: `agent_iter`, `last`, `agents`, ...
+    """
+
+    env: Turns
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name == "env":
+            raise AttributeError(name)
+        return getattr(self.env.env, name)
+
+    def step(self, action: Any, extras: Mapping[str, Any] | None = None) -> None:  # type: ignore[override]
+        """Take the step of the selected agent, and record it, with values of your own by name."""
+        agent = self.env.env.agent_selection
+        if action is None:  # it only removes the agent
+            self.env.env.step(None)
+        else:
+            super().step({agent: action}, None if extras is None else {agent: extras})
+
+    def reset(  # type: ignore[override]
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> None:
+        """Reset the game, and record it."""
+        self._recorded_reset(seed, options)
+
+
 def record_parallel(
     env: Any,
     recordings: str | os.PathLike[str] | None = None,
@@ -108,7 +137,7 @@ def record_parallel(
     step records which agents acted and for which it was the last.
 
     Args:
-        env: a `pettingzoo.ParallelEnv`; `pettingzoo.utils.aec_to_parallel` makes one of a game in turns.
+        env: a `pettingzoo.ParallelEnv`.
         recordings: as for `record`.
         name: as for `record`.
         seed: as for `record`.
@@ -128,10 +157,10 @@ def record_parallel(
         ConfigError: an argument cannot be used.
         StorageError: the recordings folder cannot be written.
     """
-    if hasattr(env, "agent_iter") and hasattr(env, "last"):
+    if is_in_turns(env):
         raise ConfigError(
             f"found {type(env).__name__}, a game in turns (AECEnv), expected a PettingZoo ParallelEnv: "
-            "pettingzoo.utils.aec_to_parallel makes one of many games in turns."
+            "record_aec records games in turns."
         )
     if not all(hasattr(env, part) for part in ("possible_agents", "observation_space", "action_space")):
         raise ConfigError(
@@ -156,7 +185,38 @@ def record_parallel(
         on_error=on_error,
     )
     maker = game_maker_of(env, checked_make(make))
-    return RecordedParallel(env, Loop(described, options, maker, AgentRows), phase)
+    kind = RecordedAec if isinstance(env, Turns) and not env.removes else RecordedParallel
+    return kind(env, Loop(described, options, maker, AgentRows), phase)
+
+
+def record_aec(env: Any, recordings: str | os.PathLike[str] | None = None, **options: Any) -> RecordedAec:
+    """Return a PettingZoo game in turns, with everything that a loop does with it recorded.
+
+        with runner.record_aec(tictactoe_v3.env(), name="mine") as env:
+            env.reset(seed=0)
+            for agent in env.agent_iter():
+                observation, reward, terminated, truncated, info = env.last()
+                env.step(None if terminated or truncated else choose(observation))
+
+    A recorded step is that of one agent, with the rewards of all agents for this step alone and what each
+    can observe after it; steps with None, which only remove an agent, are not recorded.
+
+    Args:
+        env: a `pettingzoo.AECEnv`.
+        recordings: as for `record`.
+        options: the other arguments of `record_parallel`.
+
+    Raises:
+        As for `record_parallel`.
+    """
+    if not is_in_turns(env):
+        raise ConfigError(
+            f"found {type(env).__name__}, expected a game in turns, PettingZoo's AECEnv; record_parallel is "
+            "for its parallel games."
+        )
+    recorded = record_parallel(Turns(env, removes=False), recordings, **options)
+    assert isinstance(recorded, RecordedAec)
+    return recorded
 
 
 def _game(env: Any) -> Described:

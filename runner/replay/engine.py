@@ -20,6 +20,7 @@ from runner.replay.recorded import Piece, RecordedReset, pieces
 from runner.replay.redone import Frame, RedoneSteps
 from runner.replay.stepping import EnvironmentStepper, GameStepper, Stepper
 from runner.replay.stepping_vector import VectorStepper
+from runner.replay.turns import Turns, is_in_turns
 
 BLOCK_SECONDS: Final = 0.2
 """Blocks of steps take about this long, so that progress and a hanging environment can be seen."""
@@ -177,7 +178,8 @@ class Replay:
                     autoreset = maker.vector.autoreset
                     stepper: Stepper = VectorStepper(env, self._recording, autoreset, self.drawn)
                 elif maker is not None and maker.kind == "pettingzoo":
-                    stepper = GameStepper(env, self._recording)
+                    game = Turns(env) if is_in_turns(env) else env
+                    stepper = GameStepper(game, self._recording)
                 else:
                     stepper = EnvironmentStepper(env, self._recording)
                     vector = None if maker is None else maker.vector

@@ -26,11 +26,12 @@ from runner.replay.specifications import (
     vector_wrappers,
     why_not_imported,
 )
+from runner.replay.turns import Turns, is_in_turns
 
 _OF_VECTORS: Final = frozenset({"num_envs", "vectorization_mode", "vector_kwargs", "max_episode_steps"})
 """Arguments of `make_vec` in the specification of a vector, which its environments do not take."""
-_PARALLEL: Final = "parallel_env"
-"""The name of the function that makes a PettingZoo environment, in every package of them."""
+_GAMES: Final = ("parallel_env", "env")
+"""The names of the functions that make a PettingZoo environment, parallel or in turns, in every module."""
 
 
 def why_not_made(maker: EnvironmentMaker | None, trust: bool) -> str:
@@ -69,10 +70,12 @@ def make_environment(maker: EnvironmentMaker, trust: bool, render: bool = False)
         _without_display()
     try:
         if maker.make and trust:
-            return _made_by_function(maker.make, render)
-        if maker.kind == "pettingzoo":
-            return _made_game(maker, trust, render)
-        return _made(maker, trust, render)
+            env = _made_by_function(maker.make, render)
+        elif maker.kind == "pettingzoo":
+            env = _made_game(maker, trust, render)
+        else:
+            env = _made(maker, trust, render)
+        return Turns(env) if maker.kind == "pettingzoo" and is_in_turns(env) else env
     except CannotRedo:
         raise
     except MemoryError:
@@ -223,11 +226,11 @@ def _registered(maker: EnvironmentMaker, trust: bool) -> tuple[EnvironmentSpec, 
 
 
 def _made_game(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
-    """Return a PettingZoo parallel environment."""
+    """Return a PettingZoo environment."""
     module, function, kwargs = parse_game(maker.spec)
     if not trust:
         check_plain("keyword argument", kwargs, {})
-        if function != _PARALLEL:
+        if function not in _GAMES:
             raise CannotRedo(f"The environment is made by {module}:{function}. {TRUST}")
     make = _attribute(f"{module}:{function}")
     kwargs = {key: value for key, value in kwargs.items() if key != "render_mode"}

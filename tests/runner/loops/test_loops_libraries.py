@@ -172,7 +172,7 @@ def test_a_game_in_turns_is_refused(tmp_path):
 
         def last(self) -> None: ...
 
-    with pytest.raises(ConfigError, match="aec_to_parallel"):
+    with pytest.raises(ConfigError, match="record_aec"):
         runner.record_parallel(Turns(), tmp_path)
     assert list(tmp_path.iterdir()) == []
 

@@ -1,0 +1,85 @@
+"""Games in turns (PettingZoo's `AECEnv`) with the interface of its parallel games: one agent acts a step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+
+def is_in_turns(env: Any) -> bool:
+    """Return whether an environment has the interface of an `AECEnv`."""
+    return all(hasattr(env, part) for part in ("agent_iter", "last", "observe"))
+
+
+class Turns:
+    """A game in turns as a parallel game: a step is that of the selected agent, with what all agents got.
+
+    The steps by which PettingZoo removes an agent that is terminated or truncated are not steps of it.
+
+    Args:
+        env: the game.
+        removes: whether agents that are over are removed after each step; else the caller does it.
+    """
+
+    def __init__(self, env: Any, removes: bool = True) -> None:
+        self.env = env
+        self.removes = removes
+        self.possible_agents = env.possible_agents
+        self.metadata = getattr(env, "metadata", None)
+        self.render_mode = getattr(env, "render_mode", None)
+        self.unwrapped = env.unwrapped
+
+    def observation_space(self, agent: Any) -> Any:
+        """Return the space of an agent's observations."""
+        return self.env.observation_space(agent)
+
+    def action_space(self, agent: Any) -> Any:
+        """Return the space of an agent's actions."""
+        return self.env.action_space(agent)
+
+    @property
+    def agents(self) -> list[Any]:
+        """The agent that acts next; none if the game is over."""
+        return [] if all(map(self._is_over, self.env.agents)) else [self.env.agent_selection]
+
+    def reset(self, **arguments: Any) -> tuple[dict[Any, Any], dict[Any, Any]]:
+        """Begin a game; return the observations and infos of all agents."""
+        self.env.reset(**arguments)
+        return self._observations(), dict(self.env.infos)
+
+    def step(self, actions: Mapping[Any, Any]) -> tuple[Any, Any, Any, Any, Any]:
+        """Take the step of the selected agent; return what a parallel game returns, of all agents.
+
+        Raises:
+            ValueError: the actions are not of the agent whose turn it is.
+        """
+        env = self.env
+        if list(actions) != [env.agent_selection]:
+            raise ValueError(
+                f"found actions of {', '.join(map(str, actions))}: it is the turn of {env.agent_selection}"
+            )
+        env.step(actions[env.agent_selection])
+        result = (
+            self._observations(),
+            dict(env.rewards),
+            dict(env.terminations),
+            dict(env.truncations),
+            dict(env.infos),
+        )
+        while self.removes and env.agents and self._is_over(env.agent_selection):
+            env.step(None)
+        return result
+
+    def render(self) -> Any:
+        """Return a picture of the game."""
+        return self.env.render()
+
+    def close(self) -> None:
+        """Close the game."""
+        self.env.close()
+
+    def _observations(self) -> dict[Any, Any]:
+        return {agent: self.env.observe(agent) for agent in self.env.agents}
+
+    def _is_over(self, agent: Any) -> bool:
+        return bool(self.env.terminations.get(agent) or self.env.truncations.get(agent))
