@@ -23,7 +23,7 @@ from runner.cli import cli
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
-from tests.runner.loops.making import Leaving, make
+from tests.runner.loops.making import make
 
 
 class Pool(gymnasium.Env[Any, Any]):
@@ -164,17 +164,6 @@ def test_a_graph_is_recorded_as_json(tmp_path):
     with open_recording(rec.run.recording) as recording:
         (reset,) = recording.resets("train")
     assert json.loads(reset["observation"]).keys() == {"nodes", "edges", "edge_links"}
-
-
-def test_a_game_in_turns_is_refused(tmp_path):
-    class Turns(Leaving):
-        def agent_iter(self) -> None: ...
-
-        def last(self) -> None: ...
-
-    with pytest.raises(ConfigError, match="record_aec"):
-        runner.record_parallel(Turns(), tmp_path)
-    assert list(tmp_path.iterdir()) == []
 
 
 @dataclass

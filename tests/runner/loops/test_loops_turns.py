@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from functools import partial
 from typing import Any
 
@@ -105,7 +106,8 @@ def test_pages_films_and_diffs_show_games_in_turns(tmp_path):
         assert [picture.action.partition(" ")[0] for picture in shown][1:3] == ["player_1", "player_2"]
         found = diff(a, b).divergence
         assert (found.episode, found.t, found.field) == (0, 0, "action.player_1")
-    assert "player_1" in dualtaxi(tmp_path, "play", "game1", "--fps", "0").stdout
+    played = dualtaxi(tmp_path, "play", "game1", "--json").stdout.splitlines()
+    assert [json.loads(line)["acted"] for line in played[:2]] == [["player_1"], ["player_2"]]
     dualtaxi(tmp_path, "report", "game1", "-o", str(tmp_path / "page.html"))
     assert "player_2" in (tmp_path / "page.html").read_text()
 
