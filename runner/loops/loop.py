@@ -363,8 +363,12 @@ class Loop(Generic[R]):
 
         It is called where the error is handled. The run then has the status `failed`, with the reason.
         """
+        try:
+            self._recorder.raise_failure()  # of another thread, from which this error may follow
+        except Exception as first:
+            error = first
         if self.options.on_error == "raise":
-            raise  # noqa: PLE0704 - what the caller handles
+            raise error
         with self.lock:
             if self.is_foreign:
                 return
@@ -446,6 +450,7 @@ class Loop(Generic[R]):
             self.run = self.run.update(status="failed", summary={"error": reason})
 
     def _finish(self, status: str, error: str) -> dict[str, Any]:
+        self._recorder.raise_failure()
         self._commit()
         self.extras.finish()
         result = self._recorder.totals(self._recorder.drain()) | self._outcomes.summary()

@@ -161,6 +161,14 @@ class Recorder:
         """
         self._pipeline.release()
 
+    def raise_failure(self) -> None:
+        """Raise the error that stopped the writing, if there was one.
+
+        Raises:
+            StorageError: the disk is full or failing.
+        """
+        self._pipeline.raise_failure()
+
     def blank(self, topic: Topic, n: int) -> NDArray[np.void]:
         """Return n new records of a fixed-width topic, with every constant byte set."""
         return blank_records(topic, self._lanes[topic].sizes, n)
