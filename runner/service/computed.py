@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Sequence
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,9 @@ from runner.analysis import diff as differences
 from runner.analysis.axes import AXES, EPISODES, Axis, axes_of, axis_of
 from runner.analysis.compare import compare
 from runner.analysis.compare.moments import moment_of
+from runner.analysis.compare.score_table import MIN_MAX, parse_table
 from runner.analysis.compare.statistics import require_scipy
+from runner.analysis.compare.tasks import compare_tasks, metric_of_tasks
 from runner.analysis.evaluations import evaluation_records, training_records
 from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.analysis.groups import grouped, groups_of, metrics_of, require_two
@@ -41,6 +43,8 @@ from runner.service.errors import Refused
 from runner.util.extras import require
 from runner.util.values import finite
 
+TABLE_NAME: Final = "scores.csv"
+"""Stands for a table of scores in messages."""
 RecordKind = Literal["evaluations", "training", "optimality"]
 
 
@@ -85,7 +89,11 @@ def curves(
             "axis": axis,
             "axes": [{"name": each.name, "title": each.title, "label": each.label} for each in common],
             "groups": [
-                {"runs": [run.run_id for run in group.runs], "left_out": list(group.left_out)}
+                {
+                    "label": group.label,
+                    "runs": [run.run_id for run in group.runs],
+                    "left_out": list(group.left_out),
+                }
                 for group in groups
             ],
             "curves": shown,
@@ -257,8 +265,18 @@ def comparison(
     moment: str,
     target: str | None,
     axis: str = EPISODES.name,
+    normalise: str | None = None,
 ) -> bytes:
     """Return a comparison of groups of runs, as `dualtaxi compare --json` prints it.
+
+    Args:
+        paths: their recordings.
+        by: a setting to group by.
+        metrics: metrics; the usual ones if there are none.
+        moment: at which they are read.
+        target: a metric and its level instead.
+        axis: the name of the axis.
+        normalise: compare over environments: `minmax`, or a table of scores as CSV.
 
     Raises:
         MissingExtra: SciPy is not installed.
@@ -267,7 +285,11 @@ def comparison(
     require_scipy()
     over = axis_of(axis)
     chosen, names = moment_of(moment, parse_target(target) if target else None, metrics, over)
-    groups, notes = grouped(_series(paths, over), by)
+    groups, notes = grouped(_series(paths, over), by, across_tasks=normalise is not None)
+    if normalise is not None:
+        table = None if normalise == MIN_MAX else parse_table(normalise, TABLE_NAME)
+        tasks = compare_tasks(groups, metric_of_tasks(groups, names), chosen, table, notes)
+        return as_json(dataclasses.asdict(tasks))
     require_two(groups, by)
     return as_json(dataclasses.asdict(compare(groups, metrics_of(groups, names), chosen, notes)))
 

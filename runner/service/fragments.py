@@ -10,7 +10,7 @@ import os
 import sys
 import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,23 +19,32 @@ from typing import Any, Final
 from markupsafe import Markup
 
 from runner.analysis.axes import axis_of
+from runner.analysis.compare.moments import Moment
+from runner.analysis.compare.score_table import parse_table
+from runner.analysis.compare.task_sections import EXPLANATION as TASKS_EXPLANATION
+from runner.analysis.compare.task_sections import task_sections
+from runner.analysis.compare.tasks import compare_tasks, metric_of_tasks
 from runner.analysis.diff import diff, with_seconds, without_ignored
+from runner.analysis.groups import grouped
 from runner.analysis.histograms import histograms
 from runner.analysis.sections import Grid, Section
+from runner.analysis.series import read_series
 from runner.analysis.step_reference import StepRef
 from runner.analysis.summary import random_policy_sentence
 from runner.drawing import svg
 from runner.errors import RecordingError, RunnerError
 from runner.export.encoded import picture_note
 from runner.export.episodes import last_episode, last_whole_evaluation, typical_trial
-from runner.export.plots.curves import footnote, panel_plots
+from runner.export.plots.comparisons import letter
+from runner.export.plots.curves import Plot, footnote, panel_plots
 from runner.export.plots.heatmaps import EXPLANATION, heatmap_plots
 from runner.export.plots.machine import machine_facts, machine_plots
+from runner.export.plots.tasks import task_charts
 from runner.export.reports.diff import ShownDivergence, difference_view
 from runner.export.reports.episode import trial
 from runner.export.reports.maps import maps_of, stages_of
 from runner.export.reports.playback import playback_of
-from runner.export.reports.rendering import Link, partials
+from runner.export.reports.rendering import LegendEntry, Link, partials
 from runner.export.rerun.location import locate
 from runner.export.rerun.selection import Request
 from runner.recording import schema
@@ -45,6 +54,7 @@ from runner.recording.host import read_host
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.addresses import link, places_in
+from runner.service.computed import TABLE_NAME
 from runner.service.settings import without_folders
 from runner.sweep.charts import learning, picture_of, picture_plots
 from runner.sweep.page import sweep_legend
@@ -126,6 +136,33 @@ def distributions(path: Path, axis: str) -> bytes:
         return b""
     text = " ".join([EXPLANATION, *notes])
     return str(partials().charts("distributions", "Distributions", text, heatmap_plots(found))).encode()
+
+
+def tasks(paths: Sequence[Path], axis: str, scores: str) -> bytes:
+    """Return the comparison of runs over environments as HTML; `scores` is a table as CSV, or empty.
+
+    Raises:
+        MissingExtra: SciPy is not installed.
+        RunnerError: there is nothing to compare, or the table is invalid.
+    """
+    series = []
+    for path in paths:
+        with open_recording(path) as recording:
+            series.append(read_series(recording, axis_of(axis)))
+    groups, notes = grouped(series, across_tasks=True)
+    table = parse_table(scores, TABLE_NAME) if scores.strip() else None
+    found = compare_tasks(groups, metric_of_tasks(groups, ()), Moment("last"), table, notes)
+    shown = partials()
+    plots = [Plot(chart.title, chart.svg(), False) for chart in task_charts(found)]
+    legend = [
+        LegendEntry(letter(i), f"{own.label}: {sum(own.seeds.values())} runs")
+        for i, own in enumerate(found.algorithms)
+    ]
+    html = [shown.charts("tasks", "Normalised scores", TASKS_EXPLANATION, plots, legend)]
+    html += [
+        shown.section(f"tasks-{i}", each.title, each) for i, each in enumerate(task_sections(found)[:-1])
+    ]
+    return "".join(html).encode()
 
 
 def _typical_start(recording: Recording) -> int:

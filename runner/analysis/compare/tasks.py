@@ -119,7 +119,7 @@ def compare_tasks(
     """
     statistics.require_scipy()
     if moment.level is not None:
-        raise RunnerError("--normalise: found --target as well, expected a moment: a level has no score.")
+        raise RunnerError("normalise: found a target as well, expected a moment: a level has no score.")
     own_notes: list[str] = []
     found = {group.label: dict(_values(group, metric, moment, groups, own_notes)) for group in groups}
     tasks = _common_tasks(found, own_notes)
@@ -178,7 +178,7 @@ def _common_tasks(found: Mapping[str, Mapping[str, Values]], notes: list[str]) -
     if not tasks:
         listing = "; ".join(f"{label}: {listed(list(own)) or 'none'}" for label, own in found.items())
         raise RunnerError(
-            f"--normalise: found no environment that all have a value in ({listing}), expected one at least; "
+            f"normalise: found no environment that all have a value in ({listing}), expected one at least; "
             "--by PATH groups the runs otherwise, such as by name."
         )
     if left_out := [task for task in every if task not in tasks]:
@@ -196,7 +196,7 @@ def _bounds(
     if table is not None:
         if lacking := [task for task in tasks if task not in table]:
             raise RunnerError(
-                f"--normalise: the table has no row for {listed(lacking)}; it has {listed(list(table))}."
+                f"normalise: the table has no row for {listed(lacking)}; it has {listed(list(table))}."
             )
         return {task: table[task] for task in tasks}
     bounds = {}
@@ -205,7 +205,7 @@ def _bounds(
         low, high = float(values.min()), float(values.max())
         if low == high:
             raise RunnerError(
-                f"--normalise {MIN_MAX}: {task}: found the value {low:g} in every run, expected different "
+                f"normalise: {MIN_MAX}: {task}: found the value {low:g} in every run, expected different "
                 "ones; a table of scores can normalise them."
             )
         bounds[task] = Bounds(high, low) if lower_is_better else Bounds(low, high)

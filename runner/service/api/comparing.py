@@ -35,6 +35,8 @@ router = APIRouter(
     ),
 )
 MAX_RUNS: Final = 1000
+MAX_SCORES: Final = 10_000
+"""Characters of a table of scores."""
 Runs = Annotated[list[str], Query(min_length=1, max_length=MAX_RUNS, description="A run; may be repeated.")]
 Name = Annotated[str, Query(max_length=200, description="A run: its id, the beginning of it, its name, ...")]
 
@@ -97,11 +99,18 @@ async def compare(
     target: Annotated[
         str | None, Query(max_length=200, description="METRIC=LEVEL, instead of `moment`.")
     ] = None,
+    normalise: Annotated[
+        str | None,
+        Query(
+            max_length=MAX_SCORES,
+            description="Over environments: `minmax`, or CSV with the columns task, random and expert.",
+        ),
+    ] = None,
 ) -> dict[str, Any]:
     """Return what `dualtaxi compare --json` prints; a run's name stands for all runs of that name."""
     runs = await found_runs(catalogue, run, several=True)
     key = ("compare", *map(recording_state, runs), request.url.query)
-    options = ([found.recording for found in runs], by, metric or [], moment, target, axis)
+    options = ([found.recording for found in runs], by, metric or [], moment, target, axis, normalise)
     body = await cache.get_or_await(key, lambda: processes(computed.comparison, *options), ALWAYS)
     return Response(body, media_type="application/json")  # type: ignore[return-value]
 

@@ -86,6 +86,7 @@ class AxisInfo(BaseModel):
 class CurveGroup(BaseModel):
     """Runs that differ in nothing but the seed."""
 
+    label: str
     runs: list[str]
     left_out: list[str]
     """Runs that repeat one of these."""

@@ -8,22 +8,32 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final
 
 from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import HTMLResponse
 from starlette.concurrency import run_in_threadpool
 
+from runner.analysis.axes import EPISODES
 from runner.analysis.diff.sections import made_sections
 from runner.analysis.groups import flat_config
 from runner.analysis.sections import Section
 from runner.analysis.step_reference import StepRef
 from runner.errors import RunnerError
+from runner.export.plots.comparisons import letter
 from runner.export.reports.rendering import View
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.addresses import link, places_in
-from runner.service.api.comparing import found_runs
+from runner.service.api.comparing import MAX_SCORES, found_runs
+from runner.service.api.reading import AxisName
 from runner.service.api.replay import LONG
-from runner.service.dependencies import CacheOf, CatalogueOf, ProcessesOf, timed_recording_state
+from runner.service.dependencies import (
+    CacheOf,
+    CatalogueOf,
+    ProcessesOf,
+    recording_state,
+    timed_recording_state,
+)
 from runner.service.pages.frame import RunHead, has_tables, head_of, last_evaluation
 from runner.service.pages.panels import Panel, panel_of
 from runner.service.pages.rendering import page
@@ -40,9 +50,10 @@ TABS: Final = (
 )
 MAX_LATEST: Final = 4
 """Runs whose latest episodes a page replays."""
-MAX_RUNS: Final = 12
+MAX_RUNS: Final = 60
 """Runs that a page compares."""
 Names = Annotated[list[str] | None, Query(max_length=100)]
+Scores = Annotated[str, Query(max_length=MAX_SCORES)]
 Rows = list[tuple[str, list[str]]]
 """Rows of a table: a name, and the value of each run."""
 
@@ -98,6 +109,10 @@ class _OverviewView(CompareView):
     """Whether the content of all runs is the same."""
     running: list[ComparedRun]
     """The runs whose latest episodes replay by themselves."""
+    scores: str
+    """A table of scores as CSV; empty without one."""
+    tasks: str
+    """Address of the comparison over environments; empty where there is one environment."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +151,9 @@ class _ReplaysView(CompareView):
 
 
 @router.get("")
-async def overview(request: Request, catalogue: CatalogueOf, run: Names = None) -> Response:
+async def overview(
+    request: Request, catalogue: CatalogueOf, run: Names = None, scores: Scores = ""
+) -> Response:
     """Show the differences of runs, and their curves in common plots."""
     runs = await _chosen(catalogue, run)
 
@@ -154,10 +171,35 @@ async def overview(request: Request, catalogue: CatalogueOf, run: Names = None) 
             results=_results(runs),
             same=len(digests) == 1 and None not in digests,
             running=[each for each in compared.runs if each.head.status == "running"][:MAX_LATEST],
+            scores=scores,
+            tasks=_tasks_address(runs, scores),
         )
         return page(request, view)
 
     return await run_in_threadpool(show)
+
+
+def _tasks_address(runs: list[Run], scores: str) -> str:
+    environments = {json.dumps(run.file.config.get("env"), sort_keys=True) for run in runs}
+    query: dict[str, Any] = {"run": [run.run_id for run in runs]} | ({"scores": scores} if scores else {})
+    return link("/compare/tasks", query) if len(environments) > 1 else ""
+
+
+@router.get("/tasks")
+async def tasks(
+    catalogue: CatalogueOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
+    run: Names = None,
+    scores: Scores = "",
+    axis: AxisName = EPISODES.name,
+) -> Response:
+    """Return the comparison over environments by normalised scores, as a part of the page."""
+    runs = await _chosen(catalogue, run)
+    key = ("tasks", *map(recording_state, runs), scores, axis)
+    paths = [each.recording for each in runs]
+    body = await cache.get_or_await(key, lambda: processes(fragments.tasks, paths, axis, scores), LONG)
+    return HTMLResponse(body)
 
 
 @router.get("/divergence")
@@ -266,7 +308,7 @@ async def _difference(runs: list[Run], cache: CacheOf, processes: ProcessesOf) -
 def _compared(runs: list[Run], here: str) -> Compared:
     names = [each.run_id for each in runs]
     tabs = [(tab, title, link(f"/compare{tab}", {"run": names})) for tab, title in TABS]
-    letters = [chr(ord("A") + i) for i in range(len(runs))]
+    letters = [letter(i) for i in range(len(runs))]
     compared = [
         ComparedRun(head_of(each), each.recording, letter, f"{letter}: {each.name}", i % 7)
         for i, (each, letter) in enumerate(zip(runs, letters, strict=True))

@@ -181,7 +181,7 @@ def test_what_cannot_be_normalised_is_refused(table, expected):
 
 
 def test_a_level_cannot_be_normalised():
-    with pytest.raises(RunnerError, match="found --target as well"):
+    with pytest.raises(RunnerError, match="found a target as well"):
         compared(runs_of(VALUES), moment=Moment("crossing", level=5))
 
 
@@ -276,7 +276,7 @@ def test_the_command_prints_text_and_json_and_writes_a_page_and_a_figure(folder,
     ("words", "expected"),
     [
         (["--normalise", "nothing.csv"], "nothing.csv: cannot be read"),
-        (["--normalise", "minmax", "--target", "training.mean_return=3"], "found --target as well"),
+        (["--normalise", "minmax", "--target", "training.mean_return=3"], "found a target as well"),
         (["--normalise", "minmax", "--metric", "nothing"], "--metric: found 'nothing'"),
         (
             ["--normalise", "minmax", "--metric", "training.mean_return", "--metric", "training.mean_length"],

@@ -173,7 +173,7 @@ MISSING = [
     ("/runs/first/replay/train/60", 404, "there are 60, from 0"),
     ("/runs/first/replay/eval/7/0", 404, "the nearest after 10"),
     ("/runs/first/rerun?at=1:x", 400, "expected EPISODE:T"),
-    ("/compare?run=first", 400, "expected 2 to 12"),
+    ("/compare?run=first", 400, "expected 2 to 60"),
     ("/compare/replay?run=first&run=second&at=eval", 400, "expected EPISODE:T"),
     ("/sweeps/nothing", 404, "no sweep"),
     ("/queue/9", 404, "no job 9"),

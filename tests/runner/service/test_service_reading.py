@@ -137,13 +137,47 @@ def test_runs_that_differ_in_the_seed_are_one_curve_with_a_band(recordings, clie
     runs = list(runner.run_all(config | {"name": "seeds", "seeds": [0, 1, 2, 3, 4]}, recordings=recordings))
     params = {"run": [run.run_id for run in runs], "metric": "mean_length", "lines": True}
     found = client.get("/api/v1/curves", params=params).json()
-    assert found["groups"] == [{"runs": params["run"], "left_out": []}]
+    assert found["groups"] == [{"label": "seeds", "runs": params["run"], "left_out": []}]
     (curve,) = found["curves"]
     for k, values in enumerate(zip(*curve["runs"], strict=True)):
         assert curve["values"][k] == pytest.approx(np.mean(sorted(values)[1:-1]))
         assert min(values) <= curve["low"][k] <= curve["values"][k] <= curve["high"][k] <= max(values)
     alone = client.get("/api/v1/curves", params={"run": params["run"][:1], "metric": "mean_length"}).json()
     assert (alone["curves"][0]["low"], alone["curves"][0]["runs"]) == (None, [])
+
+
+def test_histograms_count_every_step(client, recording):
+    found = client.get(f"{RUN}/histograms", params={"axis": "steps"}).json()
+    rewards = [each for each in found["histograms"] if each["quantity"] == "reward"]
+    steps = recording.count(recording.topic("/train/step"))
+    assert [sum(map(sum, each["counts"])) for each in rewards] == [steps] * len(rewards)
+    assert client.get(f"{RUN}/histograms", params={"axis": "none"}).status_code == 400
+
+
+def test_runs_are_compared_over_environments(recordings, client):
+    runs = []
+    for name, discount in (("near", 0.5), ("far", 0.9)):
+        for env_id in ("FrozenLake-v1", "FrozenLake8x8-v1"):
+            config = {"name": name, "discount": discount, "env": {"id": env_id}, "seeds": [0, 1]}
+            config |= {"episodes": 20, "evaluation": {"every": 10, "trials": 5}}
+            runs += runner.run_all(config, recordings=recordings)
+    ids = [run.run_id for run in runs]
+    table = "task,random,expert\nFrozenLake-v1,-1,1\nFrozenLake8x8-v1,-1,1\n"
+    params = {"run": ids, "normalise": table, "metric": "mean_return"}
+    found = client.get("/api/v1/compare", params=params).json()
+    assert set(found["tasks"]) == {"FrozenLake-v1", "FrozenLake8x8-v1"}
+    assert [sum(own["seeds"].values()) for own in found["algorithms"]] == [4, 4]
+    part = client.get("/compare/tasks", params={"run": ids, "scores": table})
+    assert part.text.count("<svg") == 3
+    assert 'data-later="/compare/tasks?' in client.get("/compare", params={"run": ids}).text
+    assert "data-later" not in client.get("/compare", params={"run": ids[:2]}).text
+    refused = client.get(
+        "/compare/tasks",
+        params={"run": ids, "scores": "task,random\n"},
+        headers={"accept": "application/json"},
+    )
+    assert refused.status_code == 400
+    assert "expected task, random, expert" in refused.json()["error"]["message"]
 
 
 def test_plots_are_pictures(client):

@@ -95,10 +95,10 @@ function rank(metric) {
 const named = (id) => runs.find((run) => run.id === id)?.label ?? id;
 
 function groupName(number) {
-  const own = last.groups[number].runs.map(named);
-  if (own.length === 1) return own[0];
-  const [first] = own, at = first.indexOf(": ");
-  return at < 0 ? `${own.length} runs` : `${own.map((label) => label.slice(0, label.indexOf(": "))).join(" ")}: ${first.slice(at + 2)}`;
+  const { label, runs: own } = last.groups[number];
+  if (own.length === 1) return named(own[0]);
+  const letters = own.map((id) => named(id).split(": ")[0]).join(" ");
+  return own.length <= 5 ? `${letters}: ${label}` : `${label}, ${own.length} runs`;
 }
 
 // An exponential mean whose memory is a share of the visible axis, so that it does not depend on how many points
