@@ -10,11 +10,11 @@ import functools
 import inspect
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 
-from runner.errors import ConfigError, RunnerError
+from runner.errors import ConfigError, EnvironmentNotUsable, RunnerError
 from runner.integrations.libraries import require_tested
 from runner.loops.options import options_of
 from runner.loops.recorded import ending_of
@@ -27,9 +27,9 @@ from runner.util.values import is_whole
 require_tested("stable_baselines3", "sb3", ("2.9", "2.9"))
 
 from stable_baselines3.common.base_class import BaseAlgorithm  # noqa: E402
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList  # noqa: E402
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback  # noqa: E402
 from stable_baselines3.common.logger import KVWriter  # noqa: E402
-from stable_baselines3.common.vec_env import DummyVecEnv  # noqa: E402
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv  # noqa: E402
 
 from runner.loops.recorded_vec_env import RecordedVecEnv  # noqa: E402
 
@@ -64,6 +64,7 @@ class Recording(BaseCallback):  # type: ignore[misc]
         make: a function that makes one of the environments, where it cannot be made from what is recorded.
         checkpoint_every: keep the policy's parameters as the checkpoint `policy` after this many steps of
             environments, and at the end; 0 for none.
+        on_error: as for `runner.record`.
         packing: as for `runner.record`.
 
     Raises:
@@ -83,20 +84,25 @@ class Recording(BaseCallback):  # type: ignore[misc]
         frames_of: int | Sequence[int] | None = None,
         make: str | Callable[[], Any] | None = None,
         checkpoint_every: int = 0,
+        on_error: Literal["raise", "warn"] = "raise",
         **packing: Any,
     ) -> None:
         super().__init__()
-        options_of(recordings, name, seed, config, info, packing, frames_every, frame_format)  # are valid
+        valid = recordings, name, seed, config, info, packing, frames_every, frame_format
+        options_of(*valid, on_error=on_error)
         if not is_whole(checkpoint_every, 0, 2**62):
             raise ConfigError(f"checkpoint_every: found {checkpoint_every!r}, expected a whole number from 0")
         self._options = {"recordings": recordings, "name": name, "info": info, "make": make, **packing}
         self._options |= {"frames_every": frames_every, "frame_format": frame_format, "frames_of": frames_of}
+        self._options["on_error"] = on_error
         self._seed, self._config, self._checkpoint_every = seed, config, checkpoint_every
         self._has_options = bool(config or frames_every or packing or info)
         self._has_options |= any(one is not None for one in (recordings, name, seed, frames_of, make))
         self._envs: RecordedVecEnv | None = None
         self._is_own = False
         """Whether this callback recorded the environments, and not `runner.record` before it."""
+        self._evaluations: list[RecordedVecEnv] = []
+        """The environments of `EvalCallback`s, recorded into the run too."""
         self._stays_open = False
         self._next_checkpoint = 0
 
@@ -126,6 +132,10 @@ class Recording(BaseCallback):  # type: ignore[misc]
 
     def _end(self, error: BaseException | None = None) -> None:
         """End the run, unless `runner.record` began it."""
+        while self._evaluations:
+            own = self._evaluations.pop()
+            own.restore_methods()
+            own.recorded._loop.close(*ending_of(error))
         if self._is_own and self._envs is not None:
             self._envs.restore_methods()
             self.recorded._loop.close(*ending_of(error))
@@ -151,8 +161,8 @@ class Recording(BaseCallback):  # type: ignore[misc]
                 )
             self._envs, self._is_own = base, False
             return
-        earlier = getattr(vars(base).get("step_wait"), "__self__", None)
-        if isinstance(earlier, RecordedVecEnv):
+        earlier = RecordedVecEnv.replacing(base)
+        if earlier is not None:
             if earlier is self._envs and self._stays_open:
                 return
             earlier.restore_methods()  # an error ended the `learn` before
@@ -194,6 +204,27 @@ class Recording(BaseCallback):  # type: ignore[misc]
             self._checkpoint()
         if not self._stays_open:
             self._end()
+
+    def record_evaluations(self, envs: VecEnv) -> None:
+        """Record the environments of an `EvalCallback` as the evaluation phase of the run.
+
+        They become a shard of it, because they may be another number than those of training.
+        """
+        base = envs.unwrapped
+        earlier = RecordedVecEnv.replacing(base)
+        if isinstance(base, RecordedVecEnv) or (earlier and earlier in (self._envs, *self._evaluations)):
+            return
+        if earlier is not None:
+            earlier.restore_methods()
+            earlier.recorded._loop.close("interrupted")
+        try:
+            own = RecordedVecEnv(base, {"join": self.run, "phase": "eval", "shard": "evaluation"})
+        except (ConfigError, EnvironmentNotUsable) as error:
+            warn_user(f"The evaluations of EvalCallback are not recorded: {error}")
+            return
+        own.training_steps = lambda: self.recorded._rows.place[0]
+        own.replace_methods()
+        self._evaluations.append(own)
 
     def _checkpoint(self) -> None:
         self.recorded.checkpoint("policy", self.model.policy.state_dict())
@@ -276,13 +307,16 @@ def _observations_in_progress(model: BaseAlgorithm, base: Any) -> Any:
     )
 
 
-def _recordings_in(callback: Any) -> Iterator[Recording]:
-    """Yield the callbacks of this module in what `learn` takes."""
-    if isinstance(callback, Recording):
+def _callbacks_in(callback: Any) -> Iterator[BaseCallback]:
+    """Yield the single callbacks in what `learn` takes."""
+    if isinstance(callback, CallbackList):
+        callback = callback.callbacks
+    if isinstance(callback, list | tuple):
+        for part in callback:
+            yield from _callbacks_in(part)
+    elif isinstance(callback, BaseCallback):
         yield callback
-    elif isinstance(callback, list | tuple | CallbackList):
-        for part in callback.callbacks if isinstance(callback, CallbackList) else callback:
-            yield from _recordings_in(part)
+        yield from _callbacks_in(getattr(callback, "callback", None))  # of an EventCallback
 
 
 def _announce(setup_learn: Callable[..., Any]) -> Callable[..., Any]:
@@ -297,11 +331,14 @@ def _announce(setup_learn: Callable[..., Any]) -> Callable[..., Any]:
         *arguments: Any,
         **named: Any,
     ) -> Any:
-        recordings = list(_recordings_in(callback))
+        callbacks = list(_callbacks_in(callback))
+        recordings = [one for one in callbacks if isinstance(one, Recording)]
         if len(recordings) > 1:
             raise ConfigError(f"found {len(recordings)} callbacks Recording, expected one")
         for recording in recordings:
             recording.begin(model, is_continued=not reset_num_timesteps and model._last_obs is not None)
+            for evaluation in (one for one in callbacks if isinstance(one, EvalCallback)):
+                recording.record_evaluations(evaluation.eval_env)
         return setup_learn(model, total_timesteps, callback, reset_num_timesteps, *arguments, **named)
 
     return setup

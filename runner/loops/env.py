@@ -147,12 +147,13 @@ def record(
         StorageError: the recordings folder cannot be written.
     """
     if _is_vec_env(env):
-        if into is not None or phase != "train":
-            raise ConfigError("into, phase: found one of them with a VecEnv, expected none")
+        if into is not None:
+            raise ConfigError("into: found it with a VecEnv, expected join=RUN")
         from runner.loops.recorded_vec_env import record_vec_env  # imports Stable-Baselines3
 
         given = {"recordings": recordings, "name": name, "seed": seed, "config": config, "info": info}
-        given |= {"frames_every": frames_every, "frame_format": frame_format, "make": make}
+        given |= {"frames_every": frames_every, "frame_format": frame_format, "phase": phase, "make": make}
+        given |= {"join": join, "shard": shard, "on_error": on_error}
         recorded: RecordedEnv = record_vec_env(env, given | packing)  # a VecEnv, whose type is not known here
         return recorded
     if not isinstance(env, gymnasium.Env) or issubclass(type(env), VectorEnv):  # EnvPool's are both

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
@@ -39,6 +39,8 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         super().__init__(base.num_envs, base.observation_space, base.action_space)
         self.metadata = base.metadata
         self._actions: Any = None
+        self.training_steps: Callable[[], int] | None = None
+        """Returns after how many training steps the environments evaluate; called at their resets."""
 
     def __getattr__(self, name: str) -> Any:
         if name in ("base", "recorded"):  # not made yet
@@ -56,8 +58,16 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
             vars(self.base).pop(name, None)
         self._vector.release()
 
+    @staticmethod
+    def replacing(base: VecEnv) -> RecordedVecEnv | None:
+        """Return what has replaced the methods of a `VecEnv`, if anything."""
+        found = getattr(vars(base).get("step_wait"), "__self__", None)
+        return found if isinstance(found, RecordedVecEnv) else None
+
     def reset(self) -> Any:
         """Reset all environments, and record it."""
+        if self.training_steps is not None:
+            self.recorded.at_step(self.training_steps())
         seeds, options = self.base._seeds, self.base._options
         if any(own != options[0] for own in options):
             warn_user("The options of resets are not recorded where they differ between environments.")

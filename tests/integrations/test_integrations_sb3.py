@@ -244,14 +244,37 @@ def test_an_error_in_a_callback_leaves_environments_that_can_be_recorded_again(r
     assert runs["second"].summary["train_steps"] == 64
 
 
-def test_an_evaluation_next_to_it_is_not_disturbed(recordings):
-    envs = VecNormalize(make_vec_env("CartPole-v1", n_envs=2))
-    evaluation = EvalCallback(VecNormalize(make_vec_env("CartPole-v1")), eval_freq=64, n_eval_episodes=2)
+@pytest.mark.parametrize("number", [1, 3])
+def test_evaluations_are_the_evaluation_phase_of_the_run(recordings, number):
+    def trained(*callbacks):
+        envs = VecNormalize(make_vec_env("CartPole-v1", n_envs=2, seed=1))
+        evaluated = VecNormalize(make_vec_env("CartPole-v1", n_envs=number, seed=9))
+        evaluation = EvalCallback(evaluated, eval_freq=64, n_eval_episodes=4, verbose=0)
+        model = PPO("MlpPolicy", envs, seed=1, **SMALL)
+        model.learn(256, callback=[evaluation, *callbacks])
+        return evaluation, weights(model)
+
     callback = Recording()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        PPO("MlpPolicy", envs, **SMALL).learn(256, callback=[evaluation, callback])
-    assert {"eval/mean_reward"} <= set(dict(logged(callback.run)))
+        evaluation, recorded = trained(callback)
+    assert_equal_weights(recorded, trained()[1])
+    assert dict(logged(callback.run))["eval/mean_reward"] == pytest.approx(evaluation.last_mean_reward)
+    assert callback.run.summary["train_steps"] == 256
+    with runner.open_recording(callback.run.recording) as recording:
+        episodes = recording.episodes("eval")["returns"][:, 0]
+    assert len(episodes) >= 2 * 4
+    if number == 1:
+        assert episodes[-4:].mean() == pytest.approx(evaluation.last_mean_reward)
+    assert "reproduced" in verified(callback.run)
+
+
+def test_an_evaluation_in_an_environment_of_other_spaces_is_left_out_with_a_warning(recordings):
+    evaluation = EvalCallback(make_vec_env("Acrobot-v1"), eval_freq=10_000)
+    with pytest.warns(RuntimeWarning, match="evaluations of EvalCallback are not recorded"):
+        PPO("MlpPolicy", "CartPole-v1", **SMALL).learn(64, callback=[evaluation, Recording()])
+    (run,) = runner.list_runs(recordings)
+    assert (run.facts["status"], run.summary["train_steps"]) == ("finished", 64)
 
 
 def test_record_returns_a_vec_env(recordings):
