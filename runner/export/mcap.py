@@ -13,6 +13,7 @@ from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD
 from runner.recording.labels import Labels, as_json
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import rewrite
+from runner.recording.schema import CONSOLE_TOPIC
 from runner.runs.importing import EXPORT_RECORD
 from runner.runs.run import Run
 
@@ -35,7 +36,7 @@ def export_mcap(run: Run, target: Path, anonymous: bool = False, force: bool = F
     Args:
         run: a run that is not running; an interrupted one stays interrupted.
         target: the file to write.
-        anonymous: leave out host, user, command line, folder and code, and the text of an error.
+        anonymous: leave out host, user, command line, folder, code and output, and the text of an error.
         force: replace an existing file.
 
     Raises:
@@ -56,7 +57,7 @@ def export_mcap(run: Run, target: Path, anonymous: bool = False, force: bool = F
             return None
         return _without_names(name, entries, run.recording) if anonymous else entries
 
-    left_out = (CODE_ATTACHMENT,) if anonymous else ()
+    left_out = (CODE_ATTACHMENT, CONSOLE_TOPIC.name) if anonymous else ()
     write_new(
         target,
         force,

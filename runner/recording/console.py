@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import re
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -59,25 +60,44 @@ class Tee:
         self._writes: deque[tuple[float, int, str]] = deque()
         self._waiting = self._left_out = 0
         self._is_on = False
-        self._patched: list[tuple[Any, Any, Any]] = []
+        self._streams: list[tuple[int, Any]] = []
+        self._patched: deque[tuple[Any, Any, Any]] = deque(maxlen=64)
         """Streams, the method that each had as its own attribute (None if it had not), and the one it has."""
+        self._local = threading.local()
+        self._shell: Any = None
 
     def start(self) -> None:
         """Keep what is written from now on."""
         self._is_on = True
-        streams = [sys.stdout, sys.stderr]
-        for number, stream in enumerate(streams[: 1 + (streams[1] is not streams[0])], start=1):
-            if stream is not None:
-                with contextlib.suppress(Exception):  # a stream of somebody's own may forbid it
-                    own, write = vars(stream).get("write"), self._writer(number, stream.write)
-                    stream.write = write  # type: ignore[method-assign]
+        both = sys.stderr is not sys.stdout
+        self._streams = [(1, sys.stdout), *([(2, sys.stderr)] if both else [])]
+        self.patch()
+        with contextlib.suppress(Exception):  # IPython replaces the methods as well, in each cell
+            self._shell = sys.modules["IPython"].get_ipython()
+            self._shell.events.register("pre_execute", self.patch)
+
+    def patch(self) -> None:
+        """Replace the methods, also of streams whose methods somebody has replaced since."""
+        for number, stream in self._streams if self._is_on else ():
+            with contextlib.suppress(Exception):  # None, or a stream of somebody's own that forbids it
+                own = vars(stream).get("write")
+                if getattr(own, "tee", None) is not self:
+                    write = self._writer(number, stream.write)
+                    stream.write = write
                     self._patched.append((stream, own, write))
 
-    def _writer(self, number: int, original: Callable[[str], Any]) -> Callable[[str], Any]:
+    def _writer(self, number: int, original: Callable[..., Any]) -> Callable[..., Any]:
         """Return a method `write` that calls the original one, and keeps the text."""
+        local = self._local
 
-        def write(text: str) -> Any:
-            written = original(text)
+        def write(text: str, *more: Any, **options: Any) -> Any:
+            if getattr(local, "is_writing", False):  # another such method calls this one
+                return original(text, *more, **options)
+            local.is_writing = True
+            try:
+                written = original(text, *more, **options)
+            finally:
+                local.is_writing = False
             if self._is_on and isinstance(text, str):
                 size = len(text) + _LINE_BYTES * text.count("\n")
                 if self._waiting + size > _MAX_WAITING:
@@ -87,12 +107,16 @@ class Tee:
                     self._writes.append((time.monotonic(), number, text))
             return written
 
+        write.tee = self  # type: ignore[attr-defined]
         return write
 
     def stop(self) -> None:
         """Keep nothing more; give the streams their methods back, unless somebody has replaced them since."""
         self._is_on = False
-        for stream, own, write in self._patched:
+        if self._shell is not None:
+            with contextlib.suppress(Exception):
+                self._shell.events.unregister("pre_execute", self.patch)
+        for stream, own, write in reversed(self._patched):
             with contextlib.suppress(Exception):
                 if vars(stream).get("write") is not write:
                     continue

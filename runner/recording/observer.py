@@ -153,6 +153,8 @@ class _Thread:
                 for observer in due:
                     observer.see_host(sample)
             with self._lock:
+                if self._tee is not None:
+                    self._tee.patch()
                 self._distribute()
                 for observer in self._observers:
                     observer.see_console(time.monotonic())

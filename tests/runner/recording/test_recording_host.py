@@ -7,20 +7,25 @@ import os
 import sys
 import threading
 import time
+from functools import partial
 from types import SimpleNamespace
 
+import nbformat
 import numpy as np
 import pytest
+from nbclient import NotebookClient
 
 import runner
 from runner.errors import RecordingError
 from runner.execution.verify import verify
+from runner.export.mcap import export_mcap
 from runner.recording import clock, console, observer, schema
 from runner.recording.clock import Clock, read_clock
 from runner.recording.console import MAX_CONSOLE_BYTES, Screen, read_console
 from runner.recording.host import HostMetrics, HostSampler, read_host
 from runner.recording.messages import encode
 from runner.recording.reader import open_recording
+from runner.runs.listing import list_runs
 from tests.runner.altering import altered
 from tests.runner.loops.making import make, play
 from tests.runner.recording.making import TAXIS, make_run
@@ -272,6 +277,45 @@ def test_who_replaces_the_method_later_keeps_theirs(tmp_path, monkeypatch):
     stream.flush()
     assert stream.buffer.getvalue() == b"both\ntheirs\n"
     assert lines_of(env.run) == [("stdout", "both")]
+
+
+def test_a_method_that_is_replaced_and_restored_by_somebody_is_replaced_again(tmp_path, monkeypatch, often):
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
+    monkeypatch.setattr(sys, "stdout", stream)
+    original = stream.write
+    with runner.record(make("CartPole-v1"), tmp_path) as env:
+        stream.write = original
+        time.sleep(0.6)  # the observer begins after half a second
+        until(lambda write: write is not original, lambda: stream.write)
+        stream.write = theirs = partial(stream.write)
+        until(lambda write: write is not theirs, lambda: stream.write)
+        print("once")
+    assert lines_of(env.run) == [("stdout", "once")]
+
+
+def test_a_notebook_has_the_output_of_its_cells_recorded_and_shown(tmp_path):
+    record = f"env = runner.record(gymnasium.make('CartPole-v1'), recordings={str(tmp_path)!r})"
+    cells = [
+        f"import gymnasium, runner, sys\n{record}\nprint('first')",
+        "print('second', file=sys.stderr)",
+        "print('third'); env.close()",
+        "print('after')",
+    ]
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(text) for text in cells])
+    NotebookClient(notebook, timeout=120, kernel_name="python3").execute()
+    shown = ["".join(output["text"] for output in cell.outputs) for cell in notebook.cells]
+    assert shown == ["first\n", "second\n", "third\n", "after\n"]
+    (run,) = list_runs(tmp_path)
+    assert lines_of(run) == [("stdout", "first"), ("stderr", "second"), ("stdout", "third")]
+
+
+def test_an_anonymous_file_has_no_output(tmp_path):
+    with runner.record(make("CartPole-v1"), tmp_path) as env:
+        print("/home/somebody")
+    export_mcap(env.run, tmp_path / "anonymous.mcap", anonymous=True)
+    with open_recording(tmp_path / "anonymous.mcap") as recording:
+        assert read_console(recording, None) == []
+        assert read_clock(recording) is not None
 
 
 def test_threads_print_whole_texts(tmp_path):
