@@ -30,6 +30,7 @@ from runner.errors import ConfigError
 from runner.loops.actions import action_names
 from runner.loops.vec_env import LIBRARY, VecEnvVector, mode_of
 from runner.recording.maker import FUNCTION_NAME, MAX_SPEC, EnvironmentMaker, VectorMaker
+from runner.replay.stepping_vector import spaces_of_one
 from runner.replay.turns import Turns
 from runner.util.values import MAX_TEXT
 
@@ -138,7 +139,7 @@ def vector_maker_of(
         reason = reason or f"{unknown}; {_NAME_MAKE}"
     names = tuple(_class_name(layer) for layer in layers[:-1])
     has_others = any(isinstance(layer, VectorActionWrapper) for layer in layers)
-    space = getattr(envs, "single_action_space", envs.action_space)  # SuperSuit's have the latter only
+    space = spaces_of_one(envs)[1]
     return replace(
         maker,
         kind="vector",

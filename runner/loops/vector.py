@@ -23,6 +23,7 @@ from runner.loops.options import options_of
 from runner.loops.recorded import Recorded, given, require_pictures
 from runner.loops.values import check_phase, frozen_options
 from runner.loops.vector_rows import VectorRows
+from runner.replay.stepping_vector import final_observations, spaces_of_one
 from runner.runs.run import Run
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
             states: what resets within the step depended on.
         """
         observations, rewards, terminated, truncated, infos = result
-        final = _final_observations(infos) if self._mode == AutoresetMode.SAME_STEP else None
+        final = final_observations(infos) if self._mode == AutoresetMode.SAME_STEP else None
         with self._loop.lock:
             if self._loop.active is not self._rows:
                 self._loop.activate(self._rows)
@@ -287,14 +288,9 @@ def autoreset_mode_of(
 
 
 def described_vector(envs: VectorEnv[Any, Any, Any], first: Any) -> Described:
-    """Return the description of a vector environment; `first` is its first environment.
-
-    Older ones have no `single_` spaces: their spaces are those of one environment.
-    """
-    observation = getattr(envs, "single_observation_space", None) or envs.observation_space
-    action = getattr(envs, "single_action_space", None) or envs.action_space
+    """Return the description of a vector environment; `first` is its first environment."""
     registered = first if getattr(envs, "spec", None) is None else envs
-    described = describe(registered, observation, action)
+    described = describe(registered, *spaces_of_one(envs))
     return replace(described, environments=envs.num_envs, mdp=None, agents=("agent",))
 
 
@@ -318,14 +314,6 @@ def first_of(envs: VectorEnv[Any, Any, Any]) -> Iterator[Any]:
             np.random.set_state(states[1])
     else:
         yield envs
-
-
-def _final_observations(infos: Any) -> Any:
-    """Return the last observations of the episodes that ended in a step, by environment."""
-    if isinstance(infos, Mapping):
-        return infos.get("final_obs")
-    last = [info.get("terminal_observation") for info in infos]
-    return last if any(value is not None for value in last) else None
 
 
 def _by_environment(infos: Any) -> Mapping[str, Any]:

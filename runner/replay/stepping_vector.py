@@ -46,7 +46,7 @@ class VectorStepper(Stepper):
         self._put = filler(self._leaves, self._last[np.newaxis], (self._n,))
 
     def _spaces(self) -> tuple[Space, Space]:
-        return self.env.single_observation_space, self.env.single_action_space
+        return spaces_of_one(self.env)
 
     def run(self, rows: NDArray[np.void], resets: Sequence[tuple[int, RecordedReset]]) -> Results:
         """Do recorded steps again, until the environment raises an error.
@@ -142,8 +142,8 @@ class VectorStepper(Stepper):
         rows = slice(time * self._n, (time + 1) * self._n)
         after = self._last.copy()
         self._over = np.asarray(terminated) | np.asarray(truncated)
-        final = infos.get("final_obs") if isinstance(infos, Mapping) else None
-        if self._autoreset == "SameStep" and final is not None and self._over.any():
+        final = final_observations(infos) if self._autoreset == "SameStep" else None
+        if final is not None and self._over.any():
             put_chosen(self._leaves, final, after, np.flatnonzero(self._over))
         if self._recording.kind == "step":
             after = after - int(self.observation_space.start)  # type: ignore[attr-defined]
@@ -160,6 +160,23 @@ class VectorStepper(Stepper):
         if hasattr(base, "envs"):
             base = base.envs[reset.environment].unwrapped
         return self._restore(reset.state, base)
+
+
+def spaces_of_one(envs: Any) -> tuple[Space, Space]:
+    """Return the spaces of observation and action of one environment of a vector.
+
+    Older vectors, such as SuperSuit's, have no `single_` spaces: their spaces are those of one environment.
+    """
+    observation = getattr(envs, "single_observation_space", None) or envs.observation_space
+    return observation, getattr(envs, "single_action_space", None) or envs.action_space
+
+
+def final_observations(infos: Any) -> Any:
+    """Return the last observations of the episodes that ended in a step, by environment; None if none did."""
+    if isinstance(infos, Mapping):
+        return infos.get("final_obs")
+    last = [info.get("terminal_observation") for info in infos]  # as SuperSuit's vectors return them
+    return last if any(value is not None for value in last) else None
 
 
 def _calls(resets: Sequence[_Numbered]) -> Iterator[list[_Numbered]]:
