@@ -113,6 +113,7 @@ def record(
 
     Args:
         env: a Gymnasium environment, wrapped or not; its arguments and results at this level are recorded.
+            Or a `VecEnv` of Stable-Baselines3: another is returned, whose environments are recorded.
         recordings: the recordings folder, by default $DUALTAXI_RECORDINGS or ./recordings; or the address of
             a server (`http://localhost:8000`), to which the run is pushed while it is recorded.
         name: the name of the run; the environment's name unless given.
