@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from runner.archive.places import at_hand
 from runner.cli.output import draw, facts, print_json, say
 from runner.cli.progress import progress_line, steps_line
-from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
+from runner.errors import RecordingError, RunnerError, RunNotFound
 from runner.runs.resolve import find_run, find_runs
 from runner.runs.run import RECORDING_FILE, RUN_FILE, SHARDS_FOLDER, recordings_folder
 from runner.util.humanize import UNKNOWN, duration, size
@@ -60,7 +60,7 @@ def folded(run: Run) -> Run:
     try:
         with steps_line(f"adding {what} to {run.run_id}") as report:
             run = fold_if_over(run, report=lambda done, _: report(done))
-    except StorageError as error:
+    except RunnerError as error:
         say(f"Run {run.run_id} is shown without {what}: {error}")
         return run
     say(f"Added {what} to run {run.run_id}, whose processes had been killed.")

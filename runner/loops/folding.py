@@ -28,7 +28,7 @@ from runner.loops.options import PACKING
 from runner.loops.outcomes import Outcomes
 from runner.loops.shard_sources import PHASES, Source
 from runner.recording import schema
-from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAMES, ExtraLayout
+from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAME_LENGTH, MAX_NAMES, ExtraLayout
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.messages import decode, encode, encode_image, encode_log, frame_id, frame_place
 from runner.recording.metadata import sizes_of, write_result
@@ -406,15 +406,16 @@ class _CopiedExtras:
             (source.number, phase): source.recording.extras(phase) for source in sources for phase in PHASES
         }
         dtypes: dict[str, np.dtype[Any]] = {}
-        for own in self._own.values():
+        self._names: dict[tuple[int, str], str] = {}
+        """The names in the run, by number of the process and its own name."""
+        for (number, _), own in self._own.items():
             for name, dtype in own.items():
-                before = dtypes.get(name, dtype)
-                if before.shape != dtype.shape:
-                    raise ConfigError(
-                        f"extras: found {name!r} of shape {dtype.shape} and {before.shape} in the shards of "
-                        "one run, expected the same shape in all"
-                    )
-                dtypes[name] = np.dtype((np.promote_types(before.base, dtype.base), dtype.shape))
+                new = name
+                if dtypes.get(name, dtype).shape != dtype.shape:
+                    new = f"{name} ({sources[number].name})"[:MAX_NAME_LENGTH]
+                before = dtypes.get(new, dtype)
+                dtypes[new] = np.dtype((np.promote_types(before.base, dtype.base), dtype.shape))
+                self._names[number, name] = new
         self._layout = ExtraLayout(0, np.dtype(list(dtypes.items())))
         if len(dtypes) > MAX_NAMES or self._layout.values.itemsize > MAX_EXTRA_BYTES:
             raise ConfigError(
@@ -438,7 +439,7 @@ class _CopiedExtras:
         own = self._own[source.number, phase]
         if not own:
             return
-        values = own.at(numbers)
+        values = {self._names[source.number, name]: each for name, each in own.at(numbers).items()}
         given = {
             name: ~np.ma.getmaskarray(each).reshape(len(numbers), -1)[:, 0] for name, each in values.items()
         }

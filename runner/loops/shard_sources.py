@@ -56,7 +56,7 @@ class Source:
         self.name, self.recording, self.number, self.environment = name, recording, number, environment
         self.is_placed = is_placed
         self.n = recording.environments
-        self.stops = {phase: recording.whole_steps(phase) for phase in PHASES}
+        self.stops = {phase: self._stop(phase) for phase in PHASES}
         """Steps of each phase."""
         self.only_resets = {phase: self._only_resets(phase) for phase in PHASES}
         """The numbers of those at which an environment was only reset."""
@@ -72,6 +72,12 @@ class Source:
     @property
     def _is_fixed(self) -> bool:
         return self.recording.kind != "variable"
+
+    def _stop(self, phase: str) -> int:
+        """Return the steps of a phase, up to the first that a repair could not save."""
+        lost = self.recording.lost.get(f"/{phase}/step")
+        stop = self.recording.whole_steps(phase)
+        return min(stop, lost[0][0] // self.n * self.n) if lost else stop
 
     def _only_resets(self, phase: str) -> NDArray[np.int64]:
         if self.n == 1:

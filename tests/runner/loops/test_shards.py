@@ -171,7 +171,8 @@ def test_the_widest_actions_and_all_extras_are_kept(tmp_path):
         for own, kind, name in ((rec, np.float32, "a"), (other, np.float64, "b")):
             own.reset(seed=0)
             for k in range(30):
-                if any(own.step(np.array([k / 7], kind), {name: k})[2:4]):
+                shaped = np.zeros(1 + (own is rec))  # of another shape in each process
+                if any(own.step(np.array([k / 7], kind), {name: k, "shaped": shaped})[2:4]):
                     own.reset()
         other.close()
     with open_recording(rec.run.recording) as recording:
@@ -184,6 +185,7 @@ def test_the_widest_actions_and_all_extras_are_kept(tmp_path):
     assert sorted(actions.ravel()) == sorted(map(float, expected))
     assert extras["a"].count() == extras["b"].count() == 30
     assert (extras["a"].mask != extras["b"].mask).all()
+    assert (extras["shaped"].shape, extras["shaped (other)"].shape) == ((60, 2), (60, 1))
 
 
 def test_texts_infos_options_frames_and_checkpoints_come_along(tmp_path):

@@ -376,6 +376,18 @@ def test_a_loop_of_several_processes_is_stored_whole(server, outbox, monkeypatch
         assert recording.result.content_digest == rec.run.summary.content_digest
 
 
+def test_the_page_of_a_run_names_the_processes_that_record_it_too(tmp_path):
+    with Served(tmp_path / "runs") as server:
+        rec = runner.record(gymnasium.make("FrozenLake-v1"), tmp_path / "runs", name="shards")
+        two = runner.record(gymnasium.make("FrozenLake-v1"), join=rec.run, shard="two")
+        drive(two, 100)
+        page = httpx2.get(f"{server.url}/runs/{rec.run.run_id}").text
+        assert "Other processes" in page
+        assert "1 shard (" in page
+        two.close()
+        rec.close()
+
+
 def test_a_long_error_of_a_loop_is_shortened(server, outbox):
     rec = runner.record(gymnasium.make("FrozenLake-v1"), server.url, name="long")
     with pytest.raises(KeyError, match="xxx"), rec:
