@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -81,18 +82,26 @@ def iqm_band(values: Values) -> tuple[Values, Values, Values]:
     known = ~np.isnan(values)
     result = np.empty((3, values.shape[1]))
     for n in np.unique(known.sum(axis=0)).tolist():
-        chosen = known.sum(axis=0) == n
+        chosen = np.flatnonzero(known.sum(axis=0) == n)
         ordered = np.sort(values[:, chosen], axis=0)[:n]  # NaN is sorted last
         if n < FEWEST_FOR_IQM:
             result[:, chosen] = ordered.mean(axis=0), ordered[0], ordered[-1]
             continue
-        cut = n // 4
-        drawn = np.random.default_rng(_SEED).integers(n, size=(_BAND_RESAMPLES, n))
-        kept = np.sort(drawn, axis=1)[:, cut : n - cut]
-        weights = np.array([np.bincount(row, minlength=n) for row in kept]) / (n - 2 * cut)
-        low, high = np.quantile(weights @ ordered, _TAILS, axis=0)
-        result[:, chosen] = ordered[cut : n - cut].mean(axis=0), low, high
+        cut, weights = n // 4, _weights(n)
+        result[0, chosen] = ordered[cut : n - cut].mean(axis=0)
+        for start in range(0, len(chosen), _BATCH // _BAND_RESAMPLES):
+            batch = slice(start, start + _BATCH // _BAND_RESAMPLES)
+            result[1:, chosen[batch]] = np.quantile(weights @ ordered[:, batch], _TAILS, axis=0)
     return result[0], result[1], result[2]
+
+
+@lru_cache(maxsize=64)
+def _weights(n: int) -> Values:
+    """Return the weight of each of n sorted values in the IQM of each resample, [resamples, n]."""
+    drawn = np.random.default_rng(_SEED).integers(n, size=(_BAND_RESAMPLES, n))
+    kept = np.sort(drawn, axis=1)[:, n // 4 : n - n // 4]
+    counts = np.array([np.bincount(row, minlength=n) for row in kept], np.float64)
+    return np.asarray(counts / kept.shape[1])
 
 
 def stratified(

@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from runner.analysis.axes import EPISODES
 from runner.export.plots.chart import Scale
 from runner.export.plots.curves import panel_chart
 from runner.export.plots.metrics import Curve, Panel
@@ -16,7 +17,8 @@ from runner.recording.metrics import SHARES
 
 def curve(values, group=0, line="", spread=0.0):
     values = np.array(values, np.float64)
-    return Curve(group, line, np.arange(len(values)) * 1.0, values, values - spread, values + spread)
+    low, high = values - spread, values + spread
+    return Curve(group, line, np.arange(len(values)) * 1.0, values, low, high, values[np.newaxis])
 
 
 def numbers(path):
@@ -41,7 +43,7 @@ def lines_of(svg):
     ids=["one point", "zero", "tiny", "huge", "markup"],
 )
 def test_a_chart_is_well_formed_and_its_lines_are_inside(curves):
-    panel = Panel("mean_length", "A <title> & more", "steps", tuple(curves))
+    panel = Panel("mean_length", "A <title> & more", "steps", tuple(curves), EPISODES)
     svg = panel_chart(panel, 1 + max(each.group for each in curves)).svg()
     assert "nan" not in svg
     drawn = lines_of(svg)
@@ -54,7 +56,9 @@ def test_a_long_line_keeps_every_spike():
     values = np.sin(np.arange(20_000) / 3_000)
     values[7_777] = 9.0
     values[12_345] = -9.0
-    (points,) = lines_of(panel_chart(Panel("mean_return", "Return", "reward", (curve(values),)), 1).svg())
+    (points,) = lines_of(
+        panel_chart(Panel("mean_return", "Return", "reward", (curve(values),), EPISODES), 1).svg()
+    )
     assert len(points) < 4_000
     assert points[:, 1].min() == pytest.approx(32.0 + 114 / 22, abs=0.2)
     assert points[:, 1].max() == pytest.approx(146.0 - 114 / 22, abs=0.2)
@@ -63,7 +67,7 @@ def test_a_long_line_keeps_every_spike():
 
 def test_shares_are_stacked_up_to_the_top():
     panel = Panel(
-        SHARES, "Shares", "percent", (curve([40.0, 10.0], line="-1"), curve([60.0, 90.0], line="5"))
+        SHARES, "Shares", "percent", (curve([40.0, 10.0], line="-1"), curve([60.0, 90.0], line="5")), EPISODES
     )
     root = ElementTree.fromstring(panel_chart(panel, 1).svg())
     bands = [numbers(path.get("d")) for path in root.iter("path") if path.get("stroke") == "#ffffff"]
