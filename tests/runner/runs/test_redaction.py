@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from runner.runs.provenance import VARIABLES
 from runner.runs.redaction import (
     REDACTED,
     SECRET_NAMES,
@@ -111,3 +114,13 @@ def test_values_of_environment_variables():
     text = redacted_text("connect('correct horse battery', 'short', '/home/a-long-name')", variables)
     assert text == f"connect('{REDACTED}', 'short', '/home/a-long-name')"
     assert redacted_arguments(["correct horse battery"], variables) == [REDACTED]
+
+
+def test_the_lists_are_documented():
+    docs = Path(__file__).parents[3] / "docs"
+    record, form = ((docs / name).read_text() for name in ("record-your-own.md", "recording-format.md"))
+    for name in SECRET_NAMES:
+        assert f"`{name}`" in record, name
+    for pattern in VARIABLES:
+        name = "SLURM_" if pattern.startswith("SLURM_") else pattern.rstrip("*")
+        assert f"`{name}`" in form, pattern
