@@ -39,6 +39,7 @@ from runner.recording.writer import create_recording
 from runner.runs import run as runs
 from runner.runs.code import CodeCollector
 from runner.runs.provenance import provenance
+from runner.runs.redaction import redacted_line
 from runner.runs.run import RECORDING_FILE, Run, new_run, recordings_folder, unless_empty
 from runner.runs.shards import RUN_VARIABLE, new_shard
 from runner.util.values import is_whole
@@ -139,7 +140,7 @@ class Loop(Generic[R]):
             watch=self._watch,
             before=self._describe,
             system=options.packing.system and not is_shard,
-            console=options.packing.console and not is_shard,
+            console=redacted_line if options.packing.console and not is_shard else None,
         )
         self._actions = (
             ActionRecorder(self._recorder, described.environments, options.packing.chunk_steps)

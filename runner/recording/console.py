@@ -220,9 +220,10 @@ class Screen:
 
 
 class ConsoleLog:
-    """What of the output goes into one recording."""
+    """What of the output goes into one recording; `redact` returns a line without secrets."""
 
-    def __init__(self) -> None:
+    def __init__(self, redact: Callable[[str], str]) -> None:
+        self._redact = redact
         self._screens = {number: Screen() for number in range(len(STREAMS))}
         self._bytes = 0
         self.is_full = False
@@ -237,7 +238,7 @@ class ConsoleLog:
         """Yield when they were begun, and the fields `stream`, `line` and `text` of the lines to record."""
         for stream, screen in () if self.is_full else self._screens.items():
             for begun, line, text in screen.take(now, is_last):
-                encoded = text.encode(errors="replace")  # no surrogates
+                encoded = self._redact(text).encode(errors="replace")  # no surrogates
                 self._bytes += len(encoded) + _LINE_BYTES
                 yield begun, {"stream": stream, "line": line, "text": encoded.decode()}
                 if self._bytes > MAX_CONSOLE_BYTES:

@@ -13,6 +13,7 @@ import threading
 import time
 import weakref
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -34,15 +35,17 @@ class Observer:
         folder: the folder of the run.
         stopwatch: the run's; nothing is seen before it runs.
         host: whether the machine is watched.
-        console: whether the output is.
+        console: returns a line of the output as it is to be recorded; None for no output.
     """
 
-    def __init__(self, folder: Path, stopwatch: Stopwatch, host: bool, console: bool) -> None:
+    def __init__(
+        self, folder: Path, stopwatch: Stopwatch, host: bool, console: Callable[[str], str] | None
+    ) -> None:
         self._folder = folder
         self._stopwatch = stopwatch
         self.host = host
         self._next_host = 0.0
-        self.console = ConsoleLog() if console else None
+        self.console = None if console is None else ConsoleLog(console)
         self._seen: deque[tuple[Topic, bytes]] = deque()
         _thread.add(self)
 

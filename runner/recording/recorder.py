@@ -84,7 +84,8 @@ class Recorder:
             written only when some have gathered, or by `release`, so that a short recording costs little.
         clock: whether to record the time that passes.
         system: whether to record what the process uses of its machine; only with the clock.
-        console: whether to record the process's output; only with the clock.
+        console: returns a line of the process's output as it is to be recorded, without secrets; None
+            records no output. Only with the clock.
     """
 
     def __init__(
@@ -102,7 +103,7 @@ class Recorder:
         before: Callable[[], None] | None = None,
         clock: bool = True,
         system: bool = False,
-        console: bool = False,
+        console: Callable[[str], str] | None = None,
     ) -> None:
         packing = packing or Packing()
         self._file = file
@@ -127,7 +128,7 @@ class Recorder:
         if clock and file is not None and schema.CLOCK_TOPIC in file.topics:
             self._stopwatch = Stopwatch()
             self._record_machine()
-            if (system or console) and schema.HOST_TOPIC in file.topics:
+            if (system or console is not None) and schema.HOST_TOPIC in file.topics:
                 self._observer = Observer(file.path.parent, self._stopwatch, system, console)
 
     def _lane(self, topic: Topic, sizes: Sizes, write: bool) -> _Lane:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Final
 
 REDACTED: Final = "[redacted]"
@@ -52,6 +53,12 @@ SHAPES: Final = (
     ("bearer tokens", r"(?<=Bearer )[\w.~+/-]{16,500}=*"),
 )
 """Tokens known by their shape: what they are for, and a regular expression."""
+_HINTS: Final = (
+    *("token", "secret", "pass", "key", "credential", "cookie", "auth", "bearer ", "://", "akia", "asia"),
+    *("gho_", "ghp_", "ghu_", "ghs_", "ghr_", "github_pat_", "glpat-", "xox", "sk-", "hf_", "aiza", "ya29."),
+    *("npm_", "pypi-", "k_live_", "k_test_", "sg.", "r8_", "dualtaxi_", "eyj"),
+)
+"""Each secret that is known by its name or shape has one of these around it, in any case."""
 _SHAPES: Final = re.compile("|".join(shape for _, shape in SHAPES))
 _ADDRESS: Final = re.compile(r"(?<=://)(?!git@)[^\s/@\"'<>]{1,500}(?=@)")
 _PARAMETER: Final = re.compile(
@@ -121,6 +128,22 @@ def redacted_text(text: str, variables: Mapping[str, str] = os.environ) -> str:
     text = _QUOTED.sub(_without_value, text)
     text = _LONG_KEY.sub(rf"\g<1>\g<2>{REDACTED}\g<2>", text)
     return _BARE.sub(rf"\g<1>{REDACTED}", text)
+
+
+def redacted_line(text: str) -> str:
+    """Return a line of output as `redacted_text` does, quickly where nothing in it hints at a secret."""
+    lowered = text.lower()
+    if any(hint in lowered for hint in _HINTS) or any(value in text for value in _secret_values()):
+        return redacted_text(text)
+    return text
+
+
+@cache
+def _secret_values() -> tuple[str, ...]:
+    """Return the values of the environment variables with the names of secrets, as this process began."""
+    return tuple(
+        value for name, value in os.environ.items() if len(value) >= _MIN_VARIABLE and is_secret_name(name)
+    )
 
 
 def _without_value(match: re.Match[str]) -> str:

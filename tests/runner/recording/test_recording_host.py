@@ -309,6 +309,17 @@ def test_a_notebook_has_the_output_of_its_cells_recorded_and_shown(tmp_path):
     assert lines_of(run) == [("stdout", "first"), ("stderr", "second"), ("stdout", "third")]
 
 
+def test_secrets_in_the_output_are_shown_but_not_recorded(tmp_path, capsys):
+    with runner.record(make("CartPole-v1"), tmp_path) as env:
+        print("logged in with hf_" + "aBcD" * 8)
+        print("WANDB_API_KEY=" + "0a" * 20)
+    assert [text for _, text in lines_of(env.run)] == [
+        "logged in with [redacted]",
+        "WANDB_API_KEY=[redacted]",
+    ]
+    assert "hf_aBcD" in capsys.readouterr().out
+
+
 def test_an_anonymous_file_has_no_output(tmp_path):
     with runner.record(make("CartPole-v1"), tmp_path) as env:
         print("/home/somebody")

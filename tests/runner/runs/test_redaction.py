@@ -12,6 +12,7 @@ from runner.runs.redaction import (
     SECRET_NAMES,
     is_secret_name,
     redacted_arguments,
+    redacted_line,
     redacted_text,
 )
 
@@ -66,6 +67,8 @@ def test_names(name):
 def test_shapes(secret):
     text = redacted_text(f"x = '{secret}'  # mine\n+call({secret})\n", {})
     assert text == f"x = '{REDACTED}'  # mine\n+call({REDACTED})\n"
+    if "\n" not in secret:
+        assert redacted_line(f"using {secret}") == f"using {REDACTED}"
 
 
 @pytest.mark.parametrize(
@@ -87,6 +90,7 @@ def test_shapes(secret):
 )
 def test_sources(text, shown):
     assert redacted_text(text, {}) == shown
+    assert redacted_line(text) == shown
 
 
 @pytest.mark.parametrize(
