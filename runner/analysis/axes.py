@@ -146,10 +146,11 @@ def _times(recording: Recording) -> tuple[Values, Values]:
     episodes, so that an evaluation is at the time at which it began.
     """
     clock = read_clock(recording)
-    if clock is None:
-        raise RecordingError(
-            f"{recording.path}: has no axis of wall time: no clock was recorded, as by earlier versions."
-        )
+    if clock is None or recording.shards:
+        reason = "no clock was recorded, as by earlier versions"
+        if recording.shards:
+            reason = "several processes took its steps at the same time, and the clock is that of one"
+        raise RecordingError(f"{recording.path}: has no axis of wall time: {reason}.")
     done = recording.done()
     if not done["eval_steps"]:
         return clock.positions.astype(np.float64), clock.seconds

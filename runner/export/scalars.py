@@ -112,11 +112,13 @@ def episodes(recording: Recording, phase: str) -> Iterator[Measures]:
 def wall_clock(recording: Recording) -> Callable[[int], float] | None:
     """Return a function that returns the seconds that had passed at a position; None without a clock.
 
+    The clock of a run that several processes recorded is that of one of them: it does not count.
+
     Raises:
         RecordingError: the clock is damaged.
     """
     clock = read_clock(recording)
-    if clock is None:
+    if clock is None or recording.shards:
         return None
     return lambda position: float(np.interp(position, clock.positions, clock.seconds))
 

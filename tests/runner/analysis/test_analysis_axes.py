@@ -164,6 +164,20 @@ def test_an_evaluation_is_at_the_time_at_which_it_began(taxis):
     assert [place for place, _ in over_time.evaluation] == pytest.approx(times.tolist(), abs=1e-3)
 
 
+def test_a_run_of_several_processes_has_no_wall_time(tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), recordings=tmp_path, name="several", seed=1) as env:
+        other = runner.record(gymnasium.make("CartPole-v1"), join=env.run, shard="other")
+        for each in (env, other):
+            each.reset(seed=1)
+            each.step(0)
+        other.close()
+    (run,) = runner.list_runs(tmp_path)
+    with open_recording(run.recording) as recording:
+        assert read_series(recording, STEPS).axis is STEPS
+        with pytest.raises(RecordingError, match="several processes took its steps at the same time"):
+            read_series(recording, TIME)
+
+
 def test_updates_that_go_back_or_are_no_numbers_are_no_axis(tmp_path):
     for name, values in (("back", [3, 2]), ("nan", [float("nan")]), ("endless", [float("inf")])):
         env = runner.record(gymnasium.make("CartPole-v1"), recordings=tmp_path, name=name, seed=0)
