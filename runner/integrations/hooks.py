@@ -169,9 +169,10 @@ def _hook_subclasses(base: Any) -> None:
 
 
 def _hook(cls: Any) -> None:
-    original = vars(cls).get("reset")
-    if cls in _hooked or not callable(original):
+    owner = next((each for each in cls.__mro__ if "reset" in vars(each)), None)
+    if owner is None or owner in _hooked:
         return
+    original = vars(owner)["reset"]  # of EnvPool's classes that of one that is none of Gymnasium's
     _hooked.add(cls)
 
     @functools.wraps(original)

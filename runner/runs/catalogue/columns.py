@@ -76,12 +76,14 @@ def moment(row: RowValues) -> datetime:
 
 
 def _logged_text(values: Mapping[str, float | None]) -> str:
-    """Return logged values on one line: `loss 0.0123, entropy 1.5`."""
-    return ", ".join(
-        f"{name} {'not finite' if value is None else f'{value:,.4g}'}" for name, value in values.items()
-    )
+    """Return logged values on one line: `loss 0.0123, entropy 1.5, 3 more`."""
+    texts = [f"{name} {'not finite' if value is None else f'{value:,.4g}'}" for name, value in values.items()]
+    more = len(texts) - _MAX_LOGGED
+    return ", ".join(texts if more <= 0 else [*texts[:_MAX_LOGGED], f"{more} more"])
 
 
+_MAX_LOGGED: Final = 4
+"""Logged values in a line of a listing."""
 _METRIC_HEADINGS: Final = {"success_percent": "success %", "mean_return": "return"}
 
 COLUMNS: Final = {
