@@ -23,7 +23,8 @@ from runner.errors import ConfigError, RunnerError
 from runner.integrations.hooks import WatchedEnvironment, hook_environments, open_runs
 from runner.loops.description import Described
 from runner.loops.env import record
-from runner.loops.loop import Loop, open_loops
+from runner.loops.flushing import open_loops
+from runner.loops.loop import Loop
 from runner.loops.options import PACKING, options_of
 from runner.loops.pictures import Picture
 from runner.loops.recorded import ending_of

@@ -20,7 +20,7 @@ import runner
 from runner.config import load
 from runner.config.job import Job
 from runner.execution import session
-from runner.loops import loop
+from runner.loops import loop_run
 from runner.recording.reader import open_recording
 from runner.replay.steps import last_step
 from runner.replay.tables import tables_at
@@ -88,7 +88,7 @@ def make(name: str) -> None:
 
 def make_loop(name: str) -> None:
     """Make the recording of a loop that acts at random, with all that a loop can record but frames."""
-    loop.provenance = made_by
+    loop_run.provenance = made_by
     with tempfile.TemporaryDirectory() as folder:
         env = make_env(LOOPS[name])
         with runner.record(env, folder, name=name, seed=5, info=["luck"], config={"kept": True}) as rec:
@@ -105,7 +105,7 @@ def make_loop(name: str) -> None:
 
 def make_together(name: str) -> None:
     """Make the recording of a loop over environments side by side, or of a game of several agents."""
-    loop.provenance = made_by
+    loop_run.provenance = made_by
     with tempfile.TemporaryDirectory() as folder:
         if name == "vector":
             envs = SyncVectorEnv([lambda: make_env("CartPole-v1")] * 3)

@@ -419,7 +419,7 @@ def test_a_job_cannot_be_joined(tmp_path):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
 def test_the_owner_may_end_before_its_shards(tmp_path, monkeypatch):
-    monkeypatch.setattr("runner.loops.loop.OWNER_WAITS", 0.1)
+    monkeypatch.setattr("runner.loops.loop_run.OWNER_WAITS", 0.1)
     rec = runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="early")
     two = runner.record(gymnasium.make("CartPole-v1"), join=rec.run, shard="late")
     play(two, 50, 1)

@@ -1,0 +1,83 @@
+"""One thread for all open loops of this process, which flushes them twice a second; and what a fork ends."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+import weakref
+from typing import Any, Protocol
+
+from runner.recording.recorder import FLUSH_SECONDS
+
+
+class Flushable(Protocol):
+    """An open loop."""
+
+    started: float
+    closed: bool
+    is_foreign: bool
+
+    def flush(self) -> bool:
+        """Write what is half a second old; return whether to call it again."""
+
+    def disown(self) -> None:
+        """Leave the recording to the process that this one was just forked from."""
+
+
+class Flusher:
+    """The open loops of this process, and one thread that flushes them twice a second."""
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all loops and the thread, and replace the lock."""
+        self.loops: weakref.WeakSet[Flushable] = weakref.WeakSet()
+        self._to_flush: weakref.WeakSet[Flushable] = weakref.WeakSet()
+        self._thread: threading.Thread | None = None
+        self._lock = threading.Lock()
+
+    def add(self, loop: Flushable) -> None:
+        """Flush a loop from now on, as long as its `flush` returns True."""
+        with self._lock:
+            self.loops.add(loop)
+            self._to_flush.add(loop)
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._flush_all, name="recording-flush", daemon=True)
+                self._thread.start()
+
+    def _flush_all(self) -> None:
+        while True:
+            time.sleep(FLUSH_SECONDS)
+            with self._lock:
+                loops = list(self._to_flush)
+                if not loops:
+                    self._thread = None
+                    return
+            for loop in loops:
+                if not loop.flush():
+                    with self._lock:
+                        self._to_flush.discard(loop)
+            del loop, loops  # nothing is kept alive while the thread sleeps
+
+
+FLUSHER = Flusher()
+
+
+def open_loops() -> list[Any]:
+    """Return the loops that this process records, each a `Loop`, the oldest first."""
+    loops = [loop for loop in FLUSHER.loops if not loop.closed and not loop.is_foreign]
+    return sorted(loops, key=lambda loop: loop.started)
+
+
+def _after_fork() -> None:
+    """In a forked process: it has no such thread, and the recordings belong to the other process."""
+    loops = list(FLUSHER.loops)
+    FLUSHER.clear()
+    for loop in loops:
+        loop.disown()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)

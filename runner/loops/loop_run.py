@@ -1,0 +1,234 @@
+"""The run of a loop, with its file and its recorder: how it is opened, described, completed and folded."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from blake3 import blake3
+from numpy.typing import NDArray
+
+from runner.client.outbox import Follower, connect, is_server, outbox_folder
+from runner.config.job import NOT_CONTENT
+from runner.errors import ConfigError, StorageError, truncated_message
+from runner.loops.description import Described
+from runner.loops.folding import OWNER_WAITS, fold_if_over
+from runner.loops.options import Options
+from runner.loops.outcomes import Outcomes
+from runner.recording import schema
+from runner.recording.action_recorder import ActionRecorder
+from runner.recording.gym_spaces import can_widen, widened
+from runner.recording.maker import EnvironmentMaker
+from runner.recording.metadata import run_metadata, sizes_of, write_description, write_result
+from runner.recording.recorder import Recorder
+from runner.recording.schema import Topic
+from runner.recording.writer import create_recording
+from runner.runs import run as runs
+from runner.runs.code import CodeCollector
+from runner.runs.provenance import provenance
+from runner.runs.redaction import redacted_line
+from runner.runs.run import RECORDING_FILE, Run, new_run, recordings_folder, unless_empty
+from runner.runs.shards import RUN_VARIABLE, new_shard
+
+
+class LoopRun:
+    """The run of a loop that is being recorded. Not thread-safe: the loop holds its lock.
+
+    Args:
+        described: the environment and its spaces.
+        options: how to record it.
+        maker: how it was made.
+
+    Raises:
+        ConfigError: the steps of this environment, or of a shard, cannot be left out; or its spaces are
+            others than those of the run that is joined.
+        RunnerError: the run that is joined is over.
+        StorageError: the recordings folder cannot be written.
+    """
+
+    def __init__(self, described: Described, options: Options, maker: EnvironmentMaker) -> None:
+        is_shard = options.join is not None
+        client = connect(str(options.recordings)) if is_server(options.recordings) and not is_shard else None
+        self.started = time.monotonic()
+        self.described, self._options, self._maker = described, options, maker
+        self.own_makers: dict[str, EnvironmentMaker] = {}
+        """How the environments of phases were made, where another one is recorded into the run."""
+        self._config = options.config(described)
+        self._is_described = False
+        self.is_settled = not can_widen(described.action)
+        """Whether the dtypes of all values are known."""
+        self._made_by = provenance(with_command=options.packing.code)
+        made_by = {key: self._made_by[key] for key in runs.MADE_BY if key in self._made_by}
+        facts = {"provenance": made_by, "spaces": described.common}
+        self.run = self._new_run(outbox_folder() if client else None, facts)
+        self._code = CodeCollector(self.run.folder.parent, options.packing.code and not is_shard)
+        path = self.run.folder / RECORDING_FILE
+        with unless_empty(self.run):
+            self._file = create_recording(path, schema.KINDS[described.kind])
+        self._facts = self._run_facts()
+        self.outcomes = Outcomes(described.mdp)
+        self.recorder = Recorder(
+            self._file,
+            learners=len(described.agents),
+            events=int(self._facts["events"]),
+            packing=options.packing.packing,
+            record_steps=options.steps == "all",
+            beat=self._code.beat(self.run, self._file),
+            sizes=sizes_of(self._facts, str(path)),
+            watch=self._watch,
+            before=self.describe,
+            system=options.packing.system and not is_shard,
+            console=redacted_line if options.packing.console and not is_shard else None,
+        )
+        self._actions = (
+            ActionRecorder(self.recorder, described.environments, options.packing.chunk_steps)
+            if options.steps == "actions"
+            else None
+        )
+        if self.is_settled:
+            try:
+                self.describe()
+            except BaseException as error:
+                self._file.close()
+                self._mark_failed(truncated_message(error))
+                raise
+        self._follower = Follower(client, self.run, lambda: self._file.size) if client else None
+        if not is_shard:
+            os.environ[RUN_VARIABLE] = os.path.abspath(self.run.folder)  # noqa: PTH100 - links stay what they are
+
+    def _new_run(self, folder: Path | None, facts: Mapping[str, Any]) -> Run:
+        """Create the folder of the run, or of the shard of the run that is joined.
+
+        Raises:
+            ConfigError: the spaces are others than those of the run that is joined.
+            RunnerError: that run is over.
+        """
+        options, config = self._options, self._config
+        if options.join is None:
+            folder = folder or recordings_folder(options.recordings)
+            return new_run(folder, config, options.seed, config["name"], options.run_id, **facts)
+        expected = options.join.facts.get("spaces")
+        if facts["spaces"] != expected:
+            raise ConfigError(
+                f"join: found an environment with {facts['spaces'][:500]}, expected the spaces and agents of "
+                f"run {options.join.run_id}: {str(expected)[:500]}"
+            )
+        return new_shard(options.join, options.shard, config, options.seed, **facts)
+
+    def _watch(self, topic: Topic, records: NDArray[np.void]) -> None:
+        self.outcomes.take_records(topic, records)
+        if self._actions is not None:
+            self._actions.take_records(topic, records)
+
+    def _run_facts(self) -> dict[str, str]:
+        described, mdp, run = self.described, self.described.mdp, self.run
+        content = {key: value for key, value in self._config.items() if key not in NOT_CONTENT}
+        job = json.dumps(content | {"seed": self._options.seed}, sort_keys=True)
+        return run_metadata(
+            run.run_id,
+            str(run.facts["name"]),
+            self._options.seed,
+            job=blake3(job.encode()).hexdigest()[:32],
+            created=run.created_text,
+            agents=described.agents,
+            events=len(mdp.event_names) if mdp else 0,
+        ) | {
+            "kind": described.kind,
+            "spaces": described.spaces_json,
+            "environments": str(described.environments),
+        }
+
+    def describe(self) -> None:
+        """Write what makes the recording self-contained, once; from then on dtypes are fixed."""
+        if not self._is_described:
+            self._is_described = self.is_settled = True
+            environment = self.described.attachments(), self._maker
+            write_description(self._file, self._facts, self._config, self._made_by, *environment)
+
+    def settle(self, action: Any) -> bool:
+        """Fix the dtype of all actions by the first one; return whether it is not the space's own."""
+        if self.is_settled:
+            return False
+        self.is_settled = True
+        wide = widened(self.described.action, action)
+        if wide is self.described.action:
+            return False
+        self.described = replace(self.described, wide_action=wide)
+        self._facts = self._run_facts()
+        self.recorder.resize(sizes_of(self._facts, str(self.run.recording)))
+        return True
+
+    def commit(self) -> None:
+        """Hand the actions to the recorder, where they are recorded alone."""
+        if self._actions is not None:
+            self._actions.commit()
+
+    def finish(self, status: str, error: str, rewards_off_table: int) -> dict[str, Any]:
+        """Write everything and the result; return the summary.
+
+        Raises:
+            StorageError: the disk is full or failing.
+        """
+        result = self.recorder.totals(self.recorder.drain()) | self.outcomes.summary()
+        result |= {
+            "episodes": self.recorder.counts["/train/episode"],
+            "steps_recorded": self._options.steps == "all",
+        }
+        if self.described.mdp is not None:
+            result["rewards_off_table"] = rewards_off_table
+        if error:
+            result["error"] = truncated_message(error)
+        self._code.write(self._file, wait=True)
+        write_result(self._file, status, result, self.own_makers)
+        seconds = round(time.monotonic() - self.started, 3)
+        return result | {"seconds": seconds, "bytes": self._file.size}
+
+    def close_file(self) -> None:
+        """Close the file, finished or not."""
+        self._file.close()
+
+    def write_status(self, status: str, summary: Mapping[str, Any]) -> None:
+        """Write how the run ended next to its recording.
+
+        Raises:
+            StorageError: the disk is full or failing.
+        """
+        self.run = self.run.update(status=status, summary=summary, provenance=self._code.made_by(self.run))
+
+    def fold(self) -> None:
+        """Put together what several processes recorded, if this was the last one.
+
+        Raises:
+            RunnerError: it cannot be put together.
+        """
+        if os.environ.get(RUN_VARIABLE) == os.path.abspath(self.run.folder):  # noqa: PTH100
+            del os.environ[RUN_VARIABLE]
+        joined = self._options.join
+        whole = fold_if_over(joined or self.run, 0 if joined else OWNER_WAITS)
+        self.run = self.run if joined else whole
+
+    def finish_following(self) -> None:
+        """Send the rest to the server, if the run is sent to one."""
+        if self._follower:
+            self._follower.finish(self.run)
+
+    def abandon(self, reason: str) -> None:
+        """Close what could not be finished, with as much as can be written."""
+        with contextlib.suppress(Exception):  # the first error is the one that matters
+            self.recorder.abandon()
+        with contextlib.suppress(StorageError):
+            write_result(self._file, "failed", {"error": reason})
+        self._mark_failed(reason)
+        if self._follower:
+            self._follower.stop()
+
+    def _mark_failed(self, reason: str) -> None:
+        with contextlib.suppress(StorageError):
+            self.run = self.run.update(status="failed", summary={"error": reason})
