@@ -164,20 +164,20 @@ def _with_reset(values: NDArray[Any]) -> NDArray[Any]:
 def _description(recording: Recording, phase: str) -> dict[str, str]:
     digest = recording.result.content_digest or f"none ({recording.status})"
     meaning = (
-        "Observations are states, actions joint actions." if recording.is_job else "Recorded from a loop."
+        "Recorded from a loop." if recording.has_spaces else "Observations are states, actions joint actions."
     )
     text = (
         f"The {phase} episodes of the dualtaxi run {recording.run_id} ({recording.title}), "
         f"content digest {digest}. {meaning}"
     )
-    algorithm = {"algorithm_name": str(recording.config["algorithm"])} if recording.is_job else {}
+    algorithm = {"algorithm_name": str(recording.config["algorithm"])} if recording.can_train_again else {}
     return {"description": text, **algorithm}
 
 
 def _spaces(recording: Recording) -> tuple[Any, Any]:
     from gymnasium.spaces import Discrete
 
-    if recording.is_job:
+    if not recording.has_spaces:
         return Discrete(recording.mdp.states), Discrete(recording.mdp.joint_actions)
     try:
         return restore_space(recording.spaces["observation"]), restore_space(recording.spaces["action"])

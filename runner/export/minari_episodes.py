@@ -54,7 +54,7 @@ def episodes_in(recording: Recording, phase: str, ranges: Ranges) -> Iterator[Ep
     Raises:
         RecordingError: one is too large, or the recording is damaged.
     """
-    if recording.is_job:
+    if not recording.has_spaces:
         yield from _job_episodes(recording, phase, ranges)
         return
     lengths: dict[int, int] = {}

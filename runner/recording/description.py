@@ -177,6 +177,11 @@ class RunDescription(ABC):
         return self.kind == "job"
 
     @property
+    def has_spaces(self) -> bool:
+        """Whether the spaces of the environment are described; else it has states and joint actions alone."""
+        return self.kind != "job"
+
+    @property
     def can_train_again(self) -> bool:
         """Whether training the configuration again gives the same content."""
         return self.kind == "job"

@@ -156,7 +156,7 @@ def read_checkpoints(recording: Recording, recordings: Path) -> list[Checkpoint]
     Raises:
         RecordingError: one is invalid.
     """
-    if recording.is_job:
+    if schema.CHECKPOINT_TOPIC not in recording.topics:
         return []
     store = Store(recordings)
     found: list[Checkpoint] = []

@@ -122,7 +122,7 @@ def diff(
         targets: metric to a level, whose first crossing is reported.
         first: compare only settings, and where and in what training first diverges, not the tables.
     """
-    jobs = a.is_job and b.is_job
+    jobs = a.has_tables and b.has_tables
     digests = [recording.result.content_digest for recording in (a, b)]
     same = digests[0] is not None and digests[0] == digests[1]
     changes, alike = _values_by_path(a, b, ("config",) if first and jobs else _BY_PATH)
@@ -281,7 +281,7 @@ def _values_by_path(
     a: Recording, b: Recording, names: Sequence[str]
 ) -> tuple[dict[str, list[Change]], dict[str, dict[str, Any]]]:
     """Return what differs in these fields of a `RunDiff`, nothing for the others, and what is alike."""
-    jobs = a.is_job and b.is_job
+    jobs = a.has_tables and b.has_tables
     values = {
         "config": [
             {key: value for key, value in one.config.items() if key != "seeds"} | {"seed": one.seed}

@@ -118,8 +118,8 @@ class RunView:
         return kind(origin=f"{self.root}/", contents=contents, name=name, **options)
 
 
-def blueprint(runs: Sequence[RunView], entities: set[str] | None) -> rrb.Blueprint:
-    """Return the blueprint of one run, or of several side by side; it opens at the last step.
+def runs_view(runs: Sequence[RunView], entities: set[str] | None) -> rrb.Container:
+    """Return the arrangement of one run with tables, or of several side by side.
 
     Args:
         runs: the runs.
@@ -152,17 +152,15 @@ def blueprint(runs: Sequence[RunView], entities: set[str] | None) -> rrb.Bluepri
         body = rrb.Tabs(*(row for row in rows if row.contents))
         if halves:
             body = rrb.Vertical(rrb.Horizontal(*halves), body, row_shares=[7, 3])
-    return _with_panels(body, "following")
+    return body
 
 
-def loop_blueprint(views: Sequence[rrb.View]) -> rrb.Blueprint:
-    """Return the blueprint of loops, given the view of each."""
-    return _with_panels(views[0] if len(views) == 1 else rrb.Vertical(*views), "paused")
-
-
-def _with_panels(body: rrb.View | rrb.Container, play_state: Literal["following", "paused"]) -> rrb.Blueprint:
+def arranged(
+    views: Sequence[rrb.View | rrb.Container], play_state: Literal["following", "paused"]
+) -> rrb.Blueprint:
+    """Return the blueprint of these views, one above the other, with the panels around them."""
     return rrb.Blueprint(
-        body,
+        views[0] if len(views) == 1 else rrb.Vertical(*views),
         rrb.TimePanel(state="collapsed", timeline="step", fps=FRAMES_PER_SECOND, play_state=play_state),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from runner.environments.mdp import Mdp
 from runner.export.rerun.columns import Batch, new_stream
 from runner.export.rerun.labels import Labels
-from runner.export.rerun.layout import RunView, blueprint
+from runner.export.rerun.layout import RunView, arranged, runs_view
 from runner.export.rerun.metrics import MetricWriter
 from runner.export.rerun.scene import scene_of
 from runner.export.rerun.steps import StepWriter
@@ -35,7 +35,7 @@ class LiveStream:
     def __init__(self, title: str, run_id: str, mdp: Mdp, learners: tuple[str, ...], url: str) -> None:
         view = RunView("", title, mdp, scene_of(mdp), learners)
         stream = self._stream = new_stream(run_id)
-        stream.connect_grpc(url, default_blueprint=blueprint([view], None))
+        stream.connect_grpc(url, default_blueprint=arranged([runs_view([view], None)], "following"))
         stream.send_recording_name(title)
         labels = Labels(mdp, view.scene, learners)
         labels.log(stream, "")

@@ -20,12 +20,12 @@ from runner.export.rerun.labels import Labels
 from runner.export.rerun.layout import draw_scene, grid_bounds, whole_axis
 from runner.export.rerun.members import Member, entity_name, members_of, numbers_in
 from runner.export.rerun.metrics import line_colours, phase_colours, series_lines
+from runner.export.rerun.runs import Source
 from runner.export.rerun.scene import scene_of
 from runner.export.rerun.selection import MAX_MEMBERS, Selection, Span
 from runner.export.rerun.steps import StepWriter
 from runner.export.values import FEW
 from runner.recording import schema
-from runner.recording.reader import Recording
 from runner.replay.steps import check_steps
 
 MAX_BARS: Final = 16
@@ -40,11 +40,12 @@ _OVERVIEW: Final = "Overview"
 class LoopExporter:
     """Sends one loop to a stream."""
 
-    def __init__(self, stream: rr.RecordingStream, recording: Recording, selection: Selection, root: str):
+    def __init__(self, stream: rr.RecordingStream, source: Source, selection: Selection) -> None:
+        recording, root = source.recording, source.root
         self._stream = stream
         self._recording = recording
         self._selection = selection
-        self._root = root
+        self._root, self._title = root, source.title
         self._scene = scene_of(recording.mdp) if recording.tabular else None
         self._is_game = len(recording.agents) > 1
         self._members = members_of(recording, self._scene is not None)
@@ -63,9 +64,9 @@ class LoopExporter:
         self._last = 0
         """The last step for which anything was sent."""
 
-    def blueprint(self, title: str) -> Any:
+    def view(self) -> Any:
         """Return the arrangement of what `export` has sent."""
-        root = self._root
+        root, title = self._root, self._title
         left: list[tuple[Any, int]] = []  # views and their shares of the height
         if self._scene is not None:
             contents = [f"{root}/scene/**", *(f"{root}/{phase}/grid/**" for phase in schema.PHASES)]

@@ -108,7 +108,7 @@ def select(recording: Recording, request: Request) -> Selection:
         RecordingError: an episode or evaluation does not exist, or steps are requested and not recorded.
     """
     selection = Selection(warnings=shortcomings(recording))
-    if not recording.is_job:
+    if not recording.has_tables:
         return _select_loop(recording, request, selection)
     if request.frames:
         selection.warnings.append("--frames draws loops only: the run was trained here.")

@@ -12,9 +12,8 @@ from pathlib import Path
 import rerun as rr
 
 from runner.drawing import palette
-from runner.errors import RecordingError
 from runner.export.rerun.columns import new_stream
-from runner.export.rerun.layout import blueprint, loop_blueprint
+from runner.export.rerun.layout import arranged, runs_view
 from runner.export.rerun.loops import LoopExporter
 from runner.export.rerun.runs import RunExporter, Source
 from runner.export.rerun.selection import Request, Selection, select
@@ -39,32 +38,25 @@ def export(
         StorageError: the file cannot be written.
     """
     selections = [select(source.recording, request) for source in sources]
-    are_jobs = [source.recording.is_job for source in sources]
-    if len(set(are_jobs)) > 1:
-        where = sources[are_jobs.index(True)].recording.path
-        raise RecordingError(
-            f"{where}: was trained here, the other was recorded from a loop; view them separately."
-        )
     stream = new_stream("-".join(source.recording.run_id for source in sources))
     with _saved(stream, path):
         stream.send_recording_name(" and ".join(source.title for source in sources))
-        if are_jobs[0]:
-            runs = [RunExporter(stream, *pair) for pair in zip(sources, selections, strict=True)]
-            entities = {entity for run in runs for entity in run.send_metrics()}
-            stream.send_blueprint(blueprint([run.view for run in runs], entities), make_active=False)
-            for run in runs:
-                run.send_steps()
-        else:
-            loops = [
-                LoopExporter(stream, source.recording, selection, source.root)
-                for source, selection in zip(sources, selections, strict=True)
-            ]
-            for loop in loops:
-                loop.export()
-                if request.frames:
-                    loop.draw_frames(request.trust, stage)
-            views = [loop.blueprint(source.title) for loop, source in zip(loops, sources, strict=True)]
-            stream.send_blueprint(loop_blueprint(views))
+        exported = list(zip(sources, selections, strict=True))
+        with_tables = [RunExporter(stream, *one) for one in exported if one[0].recording.has_tables]
+        others = [LoopExporter(stream, *one) for one in exported if not one[0].recording.has_tables]
+        entities = {entity for run in with_tables for entity in run.send_metrics()}
+        views = [runs_view([run.view for run in with_tables], entities)] if with_tables else []
+        if not others:  # a viewer shows the metrics while the steps come
+            stream.send_blueprint(arranged(views, "following"), make_active=False)
+        for run in with_tables:
+            run.send_steps()
+        for loop in others:
+            loop.export()
+            if request.frames:
+                loop.draw_frames(request.trust, stage)
+            views.append(loop.view())
+        if others:
+            stream.send_blueprint(arranged(views, "paused"))
     return selections
 
 

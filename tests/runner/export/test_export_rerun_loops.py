@@ -21,7 +21,7 @@ from runner.export.pictures import pictures
 from runner.export.rerun.location import locate
 from runner.export.rerun.runs import Source
 from runner.export.rerun.selection import Request, select
-from runner.export.rerun.writing import export
+from runner.export.rerun.writing import export, export_runs
 from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import schema
 from runner.recording.reader import open_recording
@@ -239,3 +239,17 @@ def test_logged_pictures_are_shown_by_name_and_of_films_the_first_frame(tmp_path
     assert (np.asarray(Image.open(io.BytesIO(bytes(shown)))) == pixels[0]).all()
     ((step, shown),) = picture_rows(exported, "/picture/film")
     assert (step, Image.open(io.BytesIO(bytes(shown))).size) == (5, (8, 6))
+
+
+def test_a_run_with_tables_and_a_loop_are_shown_together(pictured, tmp_path):
+    with runner.record(gymnasium.make("FrozenLake-v1"), tmp_path / "runs", name="own") as env:
+        list(play(env, 50))
+    runs = [pictured("lake"), env.run]
+    path = tmp_path / "both.rrd"
+    with contextlib.ExitStack() as stack:
+        opened = [stack.enter_context(open_recording(run.recording)) for run in runs]
+        export_runs(runs, opened, Request(), path)
+    chunks = RrdReader(str(path)).store().stream().to_chunks()
+    entities = {str(chunk.entity_path) for chunk in chunks}
+    for run in runs:
+        assert any(entity.startswith(f"/{run.run_id}/train/grid") for entity in entities), run
