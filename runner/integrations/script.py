@@ -122,6 +122,8 @@ class ScriptRun:
         self._loop: Loop[Any] | None = None
         self._is_own = False
         """Whether this run made the loop, and closes it."""
+        self._has_joined = False
+        """Whether values went into a loop that is closed."""
         self._values: ValueRows | None = None
         self._watched: WatchedEnvironment | None = None
         self._names: set[str] = set()
@@ -166,6 +168,9 @@ class ScriptRun:
         if self._is_foreign:
             self.warn_once(f"run {self.run_id} belongs to the process that this one was forked from.")
             return
+        if self._loop is not None and self._loop.closed and not self._is_own:
+            self._loop = self._step = None  # what the script recorded is over; there may be more
+            self._has_joined, self._since, self._waiting_bytes = True, 0.0, 0
         if self._loop is None:
             self._waiting.append((method, arguments, step))
             self._since = self._since or time.monotonic()
@@ -292,7 +297,7 @@ class ScriptRun:
             return self.run
         try:
             if self.is_waiting:
-                if not self._waiting and not self.settings:
+                if not self._waiting and (self._has_joined or not self.settings):
                     return None  # there is nothing to record
                 if not self._join_loop():
                     self._begin_values()

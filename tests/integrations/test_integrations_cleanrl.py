@@ -7,10 +7,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import runner
 from runner.execution.redo import verify_by_redoing
+from runner.integrations import wandb
+from runner.integrations.tensorboard import SummaryWriter
 from runner.recording.schema import SCALAR_TOPIC
 
 SCRIPTS = Path(__file__).parent / "cleanrl"
@@ -97,3 +100,52 @@ def test_dqn_is_recorded_whole(recordings):
     assert own == [500.0, 600.0, 700.0, 800.0, 900.0]
     assert steps == [step + 1 for step in own]
     assert verify_by_redoing(run.recording).verdict == "reproduced"
+
+
+def test_tensors_are_logged_and_pictures_of_them_recorded(recordings):
+    import torch
+
+    with SummaryWriter(monitor_gym=False) as writer:
+        weight = torch.nn.Linear(2, 2).weight
+        writer.add_scalar("loss", weight.sum() * 0 + 2, torch.tensor(7))
+        writer.add_scalar("half", torch.tensor(1.5, dtype=torch.bfloat16), 7)
+        writer.add_histogram("weight", weight, 7)
+        writer.add_image("picture", torch.rand(3, 4, 4), 7)
+    (run,) = runner.list_runs()
+    assert run.summary["logged"] == {"loss": 2.0, "half": 1.5}
+    assert run.summary["messages"]["/image"] == 1
+    assert series(run, "loss")[0] == [7]
+
+
+def test_a_vector_of_envpool_is_recorded(recordings):
+    import envpool
+
+    envs = envpool.make_gymnasium("CartPole-v1", num_envs=2, seed=1)
+    with SummaryWriter() as writer:
+        envs.reset()
+        for step in range(50):
+            envs.step(np.zeros(2, np.int64))
+            writer.add_scalar("step", step, 2 * step)
+    (run,) = runner.list_runs()
+    assert run.summary["train_steps"] == 100
+
+
+def test_values_go_into_the_run_of_an_adapter(recordings):
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    wandb.init(project="sb3", sync_tensorboard=True, config={"lr": 1.0})
+    model = PPO("MlpPolicy", "CartPole-v1", n_steps=64, device="cpu")
+
+    class Logging(BaseCallback):
+        def _on_step(self):
+            wandb.log({"double": 2.0 * self.num_timesteps})
+            return True
+
+    model.learn(128, callback=[runner.integrations.sb3.Recording(name="adapted"), Logging()])
+    wandb.log({"after": 1.0})
+    wandb.finish()
+    runs = {run.name: run.summary for run in runner.list_runs()}
+    assert (runs["adapted"]["train_steps"], runs["adapted"]["logged"]["double"]) == (128, 256.0)
+    assert (runs["sb3"]["train_steps"], runs["sb3"]["logged"]) == (0, {"after": 1.0})
+    assert len(runs) == 2

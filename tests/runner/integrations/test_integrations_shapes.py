@@ -188,6 +188,19 @@ def test_values_go_into_the_loop_that_the_script_records_itself():
     assert run.summary["logged"] == {"before": 1.0, "global_step": 1.0, "loss": 0.5}
 
 
+def test_values_after_the_end_of_a_loop_go_into_the_next_one():
+    with SummaryWriter("runs/rest") as writer:
+        for name in ("first", "second"):
+            with runner.record(make(), name=name) as env:
+                env.reset(seed=1)
+                env.step(0)
+                writer.add_scalar("loss", 0.5, 1)
+    assert {run.name: run.summary["logged"] for run in runner.list_runs()} == {
+        "first": {"global_step": 1.0, "loss": 0.5},
+        "second": {"global_step": 1.0, "loss": 0.5},
+    }
+
+
 def test_values_without_an_environment_are_a_run_of_their_own():
     with SummaryWriter("runs/regression") as writer:
         for step in range(0, 100, 10):
