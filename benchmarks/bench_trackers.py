@@ -27,8 +27,10 @@ from benchmarks.processes import ROOT
 
 Log = Callable[[float], object]
 Run = Callable[[], contextlib.AbstractContextManager[Log]]
-Track = Callable[[Path], contextlib.AbstractContextManager[Run]]
-"""Given a folder, a context in which runs can be made; its end is when everything is on disk."""
+Track = Callable[[Path, int], contextlib.AbstractContextManager[Run]]
+"""Given a folder and the number of values in a run, a context in which runs can be made.
+
+Its end is when everything is on disk."""
 NAMES = {
     "dualtaxi": "runner",
     "MLtraq": "mltraq",
@@ -97,7 +99,7 @@ def _times(name: str, runs: int, values: int, repetitions: int) -> list[float]:
         return seconds
 
 
-def _dualtaxi(folder: Path) -> Any:
+def _dualtaxi(folder: Path, _values: int) -> Any:
     import gymnasium
 
     import runner
@@ -111,7 +113,7 @@ def _dualtaxi(folder: Path) -> Any:
 
 
 @contextlib.contextmanager
-def _mltraq(folder: Path) -> Iterator[Any]:
+def _mltraq(folder: Path, values: int) -> Iterator[Any]:
     import mltraq
 
     experiment = mltraq.create_session(f"sqlite:///{folder}/mltraq.db").create_experiment("runs")
@@ -119,14 +121,17 @@ def _mltraq(folder: Path) -> Iterator[Any]:
     @contextlib.contextmanager
     def run() -> Iterator[Log]:
         with experiment.run() as own:
-            own.fields.metric = mltraq.Sequence()
-            yield lambda value: own.fields.metric.append(value=value)
+            if values == 1:
+                yield lambda value: setattr(own.fields, "metric", value)
+            else:
+                own.fields.metric = mltraq.Sequence()
+                yield lambda value: own.fields.metric.append(value=value)
 
     yield run
     experiment.persist()
 
 
-def _tensorboardx(folder: Path) -> Any:
+def _tensorboardx(folder: Path, _values: int) -> Any:
     from tensorboardX import SummaryWriter
 
     @contextlib.contextmanager
@@ -137,7 +142,7 @@ def _tensorboardx(folder: Path) -> Any:
     return contextlib.nullcontext(run)
 
 
-def _trackio(folder: Path) -> Any:  # noqa: ARG001 - it reads $TRACKIO_DIR
+def _trackio(_folder: Path, _values: int) -> Any:  # it reads $TRACKIO_DIR
     import trackio
 
     @contextlib.contextmanager
@@ -149,7 +154,7 @@ def _trackio(folder: Path) -> Any:  # noqa: ARG001 - it reads $TRACKIO_DIR
     return contextlib.nullcontext(run)
 
 
-def _wandb(folder: Path) -> Any:
+def _wandb(folder: Path, _values: int) -> Any:
     import wandb
 
     @contextlib.contextmanager
@@ -160,7 +165,7 @@ def _wandb(folder: Path) -> Any:
     return contextlib.nullcontext(run)
 
 
-def _mlflow(folder: Path) -> Any:
+def _mlflow(folder: Path, _values: int) -> Any:
     import mlflow
 
     mlflow.set_tracking_uri(folder.as_uri())
@@ -190,7 +195,7 @@ def _main(name: str, runs: int, values: int, repetitions: int, folder: Path) -> 
     for number, count in [(1, 1), *[(runs, values)] * repetitions]:
         own = Path(tempfile.mkdtemp(dir=folder))
         begin = time.perf_counter()
-        with TRACKERS[name](own) as run:
+        with TRACKERS[name](own, count) as run:
             for _ in range(number):
                 with run() as log:
                     for k in range(count):
