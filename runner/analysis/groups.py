@@ -116,7 +116,7 @@ def require_two(groups: Sequence[Group], by: str | None = None) -> None:
         raise RunnerError(f"found {count} runs, all with {group.label}, expected two values at least.")
     raise RunnerError(
         f"found {count} runs of one configuration, {group.label}, expected two configurations at "
-        "least; `dualtaxi plot` draws their median, `dualtaxi ls` lists what there is."
+        "least; `dualtaxi plot` draws them as one line, `dualtaxi ls` lists what there is."
     )
 
 
