@@ -37,10 +37,15 @@ from runner.util.values import MAX_TEXT
 _NAME_MAKE: Final = 'name a function that makes it: make="module:function"'
 _SHOWS_ONLY: Final = (RecordVideo, HumanRendering, VectorRecordVideo, VectorHumanRendering)
 """Wrappers that only show or store pictures: left out when the environment is made again."""
+_SB3_ATARI: Final = "stable_baselines3.common.atari_wrappers"
 _OBSERVERS: Final = frozenset(
-    {"sb3_contrib.common.wrappers.action_masker:ActionMasker", "stable_baselines3.common.monitor:Monitor"}
+    {
+        "sb3_contrib.common.wrappers.action_masker:ActionMasker",
+        "stable_baselines3.common.monitor:Monitor",
+        f"{_SB3_ATARI}:AtariWrapper",  # puts the other ones together
+    }
 )
-"""Wrappers of Stable-Baselines3 that change no observation, reward or end: left out, too."""
+"""Wrappers of Stable-Baselines3 that themselves change no observation, reward or end: left out, too."""
 _SIMULATORS: Final = ("Box2D", "ale_py", "mujoco", "pettingzoo", "supersuit")
 """Modules whose versions are recorded if they are loaded."""
 _DISTRIBUTIONS: Final = {"Box2D": ("box2d", "box2d-py")}
@@ -273,6 +278,9 @@ def _wrapper_spec(wrapper: Any, assumed: list[str]) -> dict[str, Any]:
     parameters = inspect.signature(kind).parameters
     kwargs = getattr(wrapper, "_saved_kwargs", None) if isinstance(wrapper, RecordConstructorArgs) else None
     kwargs = None if kwargs is None else {key: value for key, value in kwargs.items() if key != "env"}
+    if kind.__module__ == _SB3_ATARI:  # they keep their arguments under their names
+        kept = {key: getattr(wrapper, key, getattr(wrapper, f"_{key}", None)) for key in parameters}
+        kwargs = {key: value for key, value in kept.items() if key != "env" and value is not None}
     # A class that inherits from one that records its arguments may have others.
     if kwargs is None or not kwargs.keys() <= parameters.keys():
         kwargs = {}

@@ -1,9 +1,10 @@
 """The specification of a recorded environment, parsed with checks; nothing is imported or made here.
 
 A recording is hostile input. Without trust, only packages of environments that are installed here are
-imported: those of `PACKAGES`, and those that register themselves with Gymnasium as plug-ins. The recorded
-entry point is compared with the registered one, and never called itself. The recording's own are the keyword
-arguments (plain JSON of bounded size without file names), the step limit, and wrappers of those packages.
+imported: those of `PACKAGES` and `MODULES`, and those that register themselves with Gymnasium as plug-ins.
+The recorded entry point is compared with the registered one, and never called itself. The recording's own are
+the keyword arguments (plain JSON of bounded size without file names), the step limit, and wrappers of those
+packages.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ PACKAGES: Final = (
     *("minigrid", "miniworld", "mo_gymnasium", "mpe2", "pettingzoo"),
 )
 """Packages of environments that are imported without trust, if they are installed."""
+MODULES: Final = ("stable_baselines3.common.atari_wrappers",)
+"""Modules of wrappers that are imported without trust, if they are installed: they touch no files."""
 _MAX_SPEC: Final = 1 << 16
 """The most characters of a specification that is not trusted."""
 _MAX_STEPS: Final = 2**62
@@ -166,13 +169,14 @@ def vector_wrappers(vector: VectorMaker) -> list[Wrapper]:
 
 def why_not_imported(module: str, trust: bool) -> str:
     """Return why a module may not or cannot be imported; empty if it can be tried."""
-    root = module.partition(":")[0].partition(".")[0]
+    path = module.partition(":")[0]
+    root = path.partition(".")[0]
     if root == "__main__":
         return (
             "The environment was defined in the script that recorded it, which cannot be imported: move it "
             "to a module, and name the function that makes it: make='module:function'."
         )
-    if not trust and root not in {*PACKAGES, *_plug_ins()}:
+    if not trust and root not in {*PACKAGES, *_plug_ins()} and path not in MODULES:
         return f"The environment needs {module}, which is not a known package of environments. {TRUST}"
     try:
         found = root in sys.modules or importlib.util.find_spec(root) is not None

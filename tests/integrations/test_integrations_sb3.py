@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 
+import ale_py
 import gymnasium
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import torch
 from click.testing import CliRunner
 from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
-from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.env_util import make_atari_env, make_vec_env
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     SubprocVecEnv,
@@ -204,6 +205,17 @@ def test_frames_are_stacked_outside_of_what_is_recorded(recordings):
     PPO("MlpPolicy", envs, **SMALL).learn(128, callback=callback)
     with runner.open_recording(callback.run.recording) as recording:
         assert recording.spaces["observation"]["shape"] == [4]
+    assert "reproduced" in verified(callback.run)
+
+
+@pytest.mark.parametrize("seed", [None, 1])
+def test_atari_with_the_usual_wrappers_is_reproduced(recordings, seed):
+    gymnasium.register_envs(ale_py)
+    wrapped = make_atari_env("ALE/Pong-v5", n_envs=2, seed=seed, wrapper_kwargs={"frame_skip": 3})
+    callback = Recording()
+    A2C("CnnPolicy", VecFrameStack(wrapped, 4), device="cpu").learn(300, callback=callback)
+    with runner.open_recording(callback.run.recording) as recording:
+        assert recording.spaces["observation"]["shape"] == [84, 84, 1]
     assert "reproduced" in verified(callback.run)
 
 
