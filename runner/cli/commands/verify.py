@@ -220,6 +220,9 @@ _MESSAGES: Final = {
     "/clock": "samples of the clock",
     "/host": "samples of the machine",
     "/console": "lines of output",
+    "/image": "pictures",
+    "/train/actions": "blocks of actions",
+    "/eval/actions": "blocks of evaluation actions",
 }
 
 

@@ -13,10 +13,12 @@ from types import SimpleNamespace
 import gymnasium
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 import runner
 from runner.analysis.series import points_of, read_series, values_left_out
+from runner.cli import cli
 from runner.errors import ConfigError, RunnerError
 from runner.execution.redo import verify_by_redoing
 from runner.integrations import wandb
@@ -557,3 +559,14 @@ def test_a_forked_process_logs_nothing(folder):
     assert "belongs to the process that this one was forked from" in done.stderr
     assert [value for _, value, _ in scalars(the_run())] == [0.5, 2.0]
     assert the_run().summary["train_steps"] == 1
+
+
+def test_a_run_with_pictures_and_actions_alone_is_repaired():
+    with SummaryWriter("runs/pictured", steps="actions") as writer:
+        learn(make(), lambda step, value: writer.add_image("view", np.zeros((3, 4, 4), np.uint8), step))
+    path = the_run().recording
+    os.truncate(path, path.stat().st_size - 1000)
+    done = CliRunner().invoke(cli, ["repair", "pictured"])
+    assert done.exit_code == 0, done.output
+    assert "5 pictures" in done.output
+    assert "actions" in done.output
