@@ -68,7 +68,7 @@ def measure(quick: bool) -> list[Figure]:
         for name, kind, count in (("Blackjack-v1", "short", steps // 20), ("Taxi-v4", "long", steps // 2)):
             figures += _against_minari(name, kind, Path(folder), count, repetitions)
         figures += [_vector(count, Path(folder), steps // 5, repetitions) for count in (1, 4, 16)]
-        figures += _pong(Path(folder), steps // 50, repetitions)
+        figures += _pong(Path(folder), steps // 10, repetitions)
         figures += [_batches(count, Path(folder), steps * 40, repetitions) for count in (16, 1024)]
         figures += _extras(Path(folder), steps, repetitions)
         figures += _short(Path(folder), 100 if quick else 1_000, repetitions)
