@@ -26,7 +26,7 @@ from runner.recording import schema
 from runner.recording.action_recorder import ActionRecorder
 from runner.recording.gym_spaces import can_widen, widened
 from runner.recording.maker import EnvironmentMaker
-from runner.recording.metadata import run_metadata, sizes_of, write_description, write_result
+from runner.recording.metadata import run_metadata, sizes_of, write_description, write_maker, write_result
 from runner.recording.recorder import Recorder
 from runner.recording.schema import Topic
 from runner.recording.writer import create_recording
@@ -59,7 +59,8 @@ class LoopRun:
         self.started = time.monotonic()
         self.described, self._options, self._maker = described, options, maker
         self.own_makers: dict[str, EnvironmentMaker] = {}
-        """How the environments of phases were made, where another one is recorded into the run."""
+        """How the environments of phases were made, where another one is recorded into the run: those that
+        are not written yet."""
         self._config = options.config(described)
         self._is_described = False
         self.is_settled = not can_widen(described.action)
@@ -72,6 +73,7 @@ class LoopRun:
         path = self.run.folder / RECORDING_FILE
         with unless_empty(self.run):
             self._file = create_recording(path, schema.KINDS[described.kind])
+        self._beat_code = self._code.beat(self.run, self._file)
         self._facts = self._run_facts()
         self.outcomes = Outcomes(described.mdp)
         self.recorder = Recorder(
@@ -80,7 +82,7 @@ class LoopRun:
             events=int(self._facts["events"]),
             packing=options.packing.packing,
             record_steps=options.steps == "all",
-            beat=self._code.beat(self.run, self._file),
+            beat=self._beat,
             sizes=sizes_of(self._facts, str(path)),
             watch=self._watch,
             before=self.describe,
@@ -121,6 +123,17 @@ class LoopRun:
                 f"run {options.join.run_id}: {str(expected)[:500]}"
             )
         return new_shard(options.join, options.shard, config, options.seed, **facts)
+
+    def _beat(self) -> None:
+        """Write what came since the last call; called now and then while nothing else writes to the file."""
+        self._beat_code()
+        with contextlib.suppress(StorageError):  # tried again at the end
+            self._write_makers()
+
+    def _write_makers(self) -> None:
+        for phase, maker in list(self.own_makers.items()):
+            write_maker(self._file, phase, maker)
+            del self.own_makers[phase]
 
     def _watch(self, topic: Topic, records: NDArray[np.void]) -> None:
         self.outcomes.take_records(topic, records)
@@ -186,7 +199,8 @@ class LoopRun:
         if error:
             result["error"] = truncated_message(error)
         self._code.write(self._file, wait=True)
-        write_result(self._file, status, result, self.own_makers)
+        self._write_makers()
+        write_result(self._file, status, result)
         seconds = round(time.monotonic() - self.started, 3)
         return result | {"seconds": seconds, "bytes": self._file.size}
 

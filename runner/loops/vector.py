@@ -327,8 +327,8 @@ def require_fixed(described: Described) -> None:
     """Refuse spaces whose values vary in size, before a run is created."""
     if described.kind == "variable":
         raise EnvironmentNotUsable(
-            "found a Text space, whose values vary in size; of several environments or agents at once "
-            "only spaces of fixed size can be recorded."
+            "found a space whose values vary in size, such as Text or Sequence; of several environments or "
+            "agents at once only spaces of fixed size can be recorded."
         )
 
 

@@ -287,26 +287,25 @@ def write_description(
         raise storage_error(file, error) from error
 
 
-def write_result(
-    file: RecordingFile,
-    status: str,
-    result: Mapping[str, Any],
-    makers: Mapping[str, EnvironmentMaker] | None = None,
-) -> None:
-    """Write how the run ended, the index and the summary.
+def write_maker(file: RecordingFile, phase: str, maker: EnvironmentMaker) -> None:
+    """Write how the environment of a phase was made, if it has one of its own.
 
-    Args:
-        file: the recording.
-        status: the status.
-        result: the totals.
-        makers: by phase, how environments of their own were made.
+    Raises:
+        StorageError: the disk is full or failing.
+    """
+    try:
+        file.add_metadata(f"{MAKER_RECORD}/{phase}", maker.to_metadata())
+    except OSError as error:
+        raise storage_error(file, error) from error
+
+
+def write_result(file: RecordingFile, status: str, result: Mapping[str, Any]) -> None:
+    """Write how the run ended, the index and the summary.
 
     Raises:
         StorageError: the disk is full or failing; nothing of the result is written then.
     """
     try:
-        for phase, maker in (makers or {}).items():
-            file.add_metadata(f"{MAKER_RECORD}/{phase}", maker.to_metadata())
         file.finish("result", _json_entry({"status": status, **result}))
     except OSError as error:
         raise storage_error(file, error) from error

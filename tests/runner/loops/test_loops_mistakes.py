@@ -61,7 +61,7 @@ class Named(Rooms):
         (lambda there: runner.record(pole(), there, name=3), "name: found 3, expected text"),
         (lambda there: runner.record(pole(), into=pole(), phase="eval"), "found TimeLimit, expected what"),
         (lambda there: runner.record(pole(), there, into=pole()), "found more arguments than phase"),
-        (lambda there: runner.record_vector(texts(), there), "found a Text space"),
+        (lambda there: runner.record_vector(texts(), there), "found a space whose values vary in size"),
         (lambda there: runner.record(Named(), there), r"found a part called 'a\\nb'"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import time
@@ -16,6 +17,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import NormalizeObservation as NormalizeVector
 
 import runner
+from runner.errors import RecordingError
 from runner.execution.redo import verify_by_redoing
 from runner.export.pictures import Source, source_of
 from runner.recording.reader import open_recording
@@ -262,24 +264,29 @@ def test_a_child_process_draws_the_pictures_of_an_episode(tmp_path):
 
 
 def test_a_run_that_was_killed_comes_out_again_with_both_of_its_environments(tmp_path):
+    def counted(path):
+        with open_recording(path) as recording:
+            return [recording.count(recording.topic(f"/{phase}/step")) for phase in ("train", "eval")]
+
     with runner.record(gymnasium.make("CartPole-v1"), tmp_path) as env:
         other = runner.record(gymnasium.make("CartPole-v1"), into=env, phase="eval")
         other.reset(seed=3)
         env.reset(seed=1)
+        tested, killed = 0, tmp_path / "killed.mcap"
         for step in range(600):
             if env.step(step % 2)[2]:
                 env.reset()
             if step % 100 == 53:
                 other.reset()
-                while not other.step(1)[2]:
-                    pass
-        size = 0
-        while size != (size := env.run.recording.stat().st_size) or not size:
-            time.sleep(1.1)  # the loop is flushed twice a second
-        killed = tmp_path / "killed.mcap"
-        shutil.copy(env.run.recording, killed)
-    with open_recording(killed) as recording:
-        recorded = [recording.count(recording.topic(f"/{phase}/step")) for phase in ("train", "eval")]
+                over = False
+                while not over:
+                    over, tested = other.step(1)[2], tested + 1
+        recorded, has_maker = [0, 0], False
+        while recorded != [600, tested] or not has_maker:
+            time.sleep(0.5)  # the loop is flushed twice a second
+            shutil.copy(env.run.recording, killed)
+            with contextlib.suppress(RecordingError), open_recording(killed) as recording:
+                recorded, has_maker = counted(killed), recording.has_own_maker("eval")
     steps, difference = redone(killed)
     assert difference is None
     assert sum(recorded) - 60 < steps <= sum(recorded)
