@@ -80,7 +80,8 @@ class Source:
         return min(stop, lost[0][0] // self.n * self.n) if lost else stop
 
     def _only_resets(self, phase: str) -> NDArray[np.int64]:
-        if self.n == 1:
+        maker = self.recording.maker
+        if self.n == 1 and (maker is None or maker.kind != "vector"):
             return np.empty(0, np.int64)
         blocks = self.recording.blocks(self._topic(phase, "step"), 0, self.stops[phase])
         found = [block["step"][block["t"] == schema.RESET_ONLY] for block in blocks]

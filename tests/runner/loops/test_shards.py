@@ -130,6 +130,8 @@ def test_vectors_and_single_environments_share_a_run(tmp_path, mode):
     with runner.record_vector(envs(3), tmp_path, name="vectors") as rec:
         with runner.record_vector(envs(2), join=rec.run, shard="two") as two:
             step(two, 90, 5)
+        with runner.record_vector(envs(1), join=rec.run, shard="vector-of-one") as alone:
+            step(alone, 80, 8)
         work(rec.run, "one", 100, 6, phase="eval")
         step(rec, 120, 1)
     assert rec.run.status == "finished"
@@ -138,9 +140,11 @@ def test_vectors_and_single_environments_share_a_run(tmp_path, mode):
             ("", 3),
             ("one", 1),
             ("two", 2),
+            ("vector-of-one", 1),
         ]
         steps = recording.done()["train_steps"]
-        assert steps == 120 * 3 + 90 * 2 if mode != AutoresetMode.NEXT_STEP else steps < 120 * 3 + 90 * 2
+        taken = 120 * 3 + 90 * 2 + 80
+        assert steps < taken if mode == AutoresetMode.NEXT_STEP else steps == taken
     redone = verify_by_redoing(rec.run.recording)
     assert (redone.verdict, redone.steps, redone.left_out) == ("reproduced", steps + 100, 0)
 
