@@ -323,3 +323,25 @@ def test_mistakes(recordings):
         Recording().run  # noqa: B018
     with pytest.raises(ConfigError, match="recorded already"):
         runner.record(runner.record(make_vec_env("CartPole-v1")))
+
+
+class StopLater(BaseCallback):
+    """Requests after a hundred steps that a recorded training stops."""
+
+    def __init__(self, recording: Recording) -> None:
+        super().__init__()
+        self.recording = recording
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == 100:
+            self.recording.run.request_stop()
+        return True
+
+
+def test_a_training_that_is_requested_to_stop_ends_and_is_finished(recordings):
+    model = PPO("MlpPolicy", "CartPole-v1", seed=0, **SMALL)
+    recording = Recording(name="stopped")
+    model.learn(1_000_000, callback=[recording, StopLater(recording)])
+    assert 100 < model.num_timesteps < 1_000_000
+    assert recording.run.status == "finished"
+    assert recording.run.summary["train_steps"] == model.num_timesteps
