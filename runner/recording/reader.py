@@ -215,6 +215,10 @@ class Recording(TopicReader):
         elif episode == ended and stride == 1:
             last = self.episodes(phase, ended - 1, ended)
             start, stop = int(last[0]["last_step"]) + 1 if len(last) else 0, total
+            steps = self.topic(f"/{phase}/step")
+            for first in self.blocks(steps, start, start + 1) if steps in self.dtypes else ():
+                # A vector of one environment may have only reset it at first.
+                start += int(np.count_nonzero(first["t"] == schema.RESET_ONLY))
         if not 0 <= start < stop <= total:
             raise RecordingError(
                 f"{self.path}: has no {phase_name} episode {episode}; there are {ended}, from 0."

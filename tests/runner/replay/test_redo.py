@@ -95,6 +95,19 @@ def test_a_vector_that_cannot_be_taken_apart_comes_out_again(make, seeding, tmp_
     check_vector(make(), seeding, tmp_path)
 
 
+def test_the_unfinished_episode_of_a_vector_of_one_begins_with_its_first_step(tmp_path):
+    envs = SyncVectorEnv([partial(gymnasium.make, "CartPole-v1")], autoreset_mode=AutoresetMode.NEXT_STEP)
+    with runner.record_vector(envs, tmp_path) as recorded:
+        recorded.reset(seed=0)
+        while not any(recorded.step(np.zeros(1, int))[2]):
+            continue
+        for _ in range(4):  # of which the first only resets the environment
+            recorded.step(np.zeros(1, int))
+    with open_recording(recorded.run.recording) as recording:
+        assert recording.episode_steps("train", 1)["t"].tolist() == [0, 1, 2]
+    assert redone(recorded.run.recording, "train", [1]) == (3, None)
+
+
 def check_vector(envs, seeding, folder):
     """Record 250 steps of each environment, and check that all steps and single episodes come out again."""
     with runner.record_vector(envs, folder) as recorded:
