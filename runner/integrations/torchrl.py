@@ -18,7 +18,6 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
 from runner.errors import ConfigError
-from runner.integrations.hooks import open_runs
 from runner.integrations.libraries import require_tested
 from runner.integrations.tensorboard import SummaryWriter
 from runner.loops.batches import RecordedBatches, record_batches
@@ -69,6 +68,8 @@ def record(env: Any, recordings: str | os.PathLike[str] | None = None, **options
     return env
 
 
+_loggers: weakref.WeakSet[Any] = weakref.WeakSet()
+"""Those that are not closed."""
 _to_close: list[Loop[Any]] = []
 """The recordings of closed environments, which end with the logger."""
 
@@ -79,7 +80,7 @@ def _close(made: Recorded[Any], **arguments: Any) -> None:
     A collector closes its environment before it yields the last batch, whose losses are logged after that.
     """
     made.env.close(**arguments)
-    if open_runs:
+    if _loggers:
         _to_close.append(made._loop)
         weakref.finalize(made, made._loop.close)
     else:
@@ -226,6 +227,7 @@ class Logger(_Logger):  # type: ignore[misc]
 
     def __init__(self, exp_name: str, log_dir: str | os.PathLike[str] | None = None) -> None:
         super().__init__(exp_name=exp_name, log_dir=log_dir)
+        _loggers.add(self)
 
     def _create_experiment(self) -> SummaryWriter:
         writer = SummaryWriter(recordings=self.log_dir)
@@ -255,6 +257,7 @@ class Logger(_Logger):  # type: ignore[misc]
     def shutdown(self, timeout: float | None = None) -> None:
         """Close the logger, and the recordings of environments that are closed."""
         super().shutdown(timeout)
+        _loggers.discard(self)
         while _to_close:
             _to_close.pop().close()
 
