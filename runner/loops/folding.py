@@ -31,7 +31,7 @@ from runner.recording import schema
 from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAME_LENGTH, MAX_NAMES, ExtraLayout
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.messages import decode, encode, encode_image, encode_log, frame_id, frame_place
-from runner.recording.metadata import sizes_of, write_result
+from runner.recording.metadata import json_object, sizes_of, write_result
 from runner.recording.reader import open_recording
 from runner.recording.recorder import Recorder
 from runner.recording.salvage import DamagedFile
@@ -87,12 +87,16 @@ def _fold(run: Run, report: Report) -> Run:
         is_folded = bool(sources) and bool(sources[0].recording.shards)
         if sources and not is_folded:
             summary = _Fold(run, sources, report).write(fresh)
+        elif is_folded:  # by a process that was killed before it said so
+            text = sources[0].recording.metadata("result").get("json")
+            summary = json_object(text, f"{run.recording}: the result")
     if summary is not None:
-        fresh.replace(run.folder / RECORDING_FILE)
+        if not is_folded:
+            fresh.replace(run.folder / RECORDING_FILE)
         forget_upload(run)
         facts = {key: value for key, value in run.facts.items() if key != ENDS_AS}
         run = Run(run.folder, facts).update(status=_status(run), summary={**run.file.summary, **summary})
-    if summary is not None or is_folded:
+    if summary is not None:
         shutil.rmtree(run.folder / SHARDS_FOLDER)
     return run
 
@@ -235,7 +239,7 @@ class _Fold:
 
     # --- the order ------------------------------------------------------------------------------------
 
-    def _ordered(self) -> tuple[NDArray[np.void], NDArray[np.void]]:
+    def _ordered(self) -> tuple[NDArray[np.void], tuple[NDArray[Any], NDArray[Any]]]:
         """Return the units of all processes in the order of the run, and those of evaluations among them."""
         for source in self._sources:
             for phase, units in source.units.items():
@@ -249,7 +253,8 @@ class _Fold:
         names = ("reset", "phase", "steps", "position", "source", "key")
         columns = [every[name] if name != "steps" else every["steps"] > 0 for name in names]
         every = every[np.lexsort(columns)]
-        return every, every[every["phase"] == PHASES.index("eval")]
+        own = every[every["phase"] == PHASES.index("eval")]
+        return every, (own["key"].copy(), np.concatenate([[0], np.cumsum(own["steps"])]))
 
     def _alongside(self, times: NDArray[Any]) -> NDArray[np.float64]:
         """Return the training steps of the run when every process had stepped its environments so often."""
@@ -272,8 +277,8 @@ class _Fold:
 
     def _evaluated_by(self, key: float) -> int:
         """Return the evaluation steps of the run in units up to a key."""
-        count = int(np.searchsorted(self._evaluated["key"], key, side="right"))
-        return int(self._evaluated["steps"][:count].sum())
+        keys, steps = self._evaluated
+        return int(steps[np.searchsorted(keys, key, side="right")])
 
     # --- steps ----------------------------------------------------------------------------------------
 
@@ -309,7 +314,10 @@ class _Fold:
                     (self._units["source"] == source.number) & (self._units["phase"] == PHASES.index(phase))
                 ]
                 source.units[phase] = placed[np.lexsort((placed["reset"], placed["environment"]))]
-        self._evaluated = self._units[self._units["phase"] == PHASES.index("eval")]
+        self._begun = {}
+        for number, phase in enumerate(PHASES):
+            own = self._units[self._units["phase"] == number]
+            self._begun[phase] = own["key"].copy(), own["new_episode"].copy()
         return sum(each.off_table for each in rows.values())
 
     # --- messages -------------------------------------------------------------------------------------
@@ -385,12 +393,12 @@ class _Fold:
             seconds = place * STEP_NANOSECONDS / 1e9
             yield place, encode_log(fields["message"], seconds, level, fields["name"])
         elif {"phase", "step", "episode"} <= fields.keys():
-            units = self._units[self._units["phase"] == PHASES.index(fields["phase"])]
-            at = int(np.searchsorted(units["key"], key, side="right")) - 1
+            keys, episodes = self._begun[fields["phase"]]
+            at = int(np.searchsorted(keys, key, side="right")) - 1
             fields["step"] = place - self._evaluated_by(key)
             if fields["phase"] == "eval":
                 fields["step"] = self._evaluated_by(key)
-            fields["episode"] = max(int(units["new_episode"][at]), 0) if at >= 0 else 0
+            fields["episode"] = max(int(episodes[at]), 0) if at >= 0 else 0
             yield place, encode(topic.message, fields)
         elif source is (self._main if topic == schema.CLOCK_TOPIC else self._sources[0]):
             # Of a machine or a process, such as what it printed.

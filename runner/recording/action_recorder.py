@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from runner.recording import schema
 from runner.recording.actions import ACTION_TOPICS, COLUMNS, MARK, NUMBERS, EpisodeDigests, Rows, kept_dtype
 from runner.recording.messages import encode
-from runner.recording.recorder import Recorder
+from runner.recording.recorder import BLOCK_BYTES, Recorder
 from runner.recording.schema import RESET_ONLY, Topic
 
 
@@ -40,16 +40,18 @@ class ActionRecorder:
         for name in rows.dtype.names or ():
             if name != "digest":
                 rows[name] = records[name]
-        for environment in range(self._n):
-            own = np.flatnonzero(rows["step"] % self._n == environment) if self._n > 1 else slice(None)
-            at, found = np.arange(len(rows))[own], records[own]
+        places = np.arange(len(rows))
+        for environment in range(self._n if len(rows) else 0):
+            own = slice((environment - int(rows["step"][0])) % self._n, None, self._n)
+            at, found = places[own], records[own]
             taken = found["t"] != RESET_ONLY
             if not taken.all():
                 at, found = at[taken], found[taken]
             for row, digest in self._digests[topic.phase].add(environment, *_outcomes(found)):
                 rows["digest"][at[row]] = np.void(digest)
         self._rows.append(rows)
-        if sum(map(len, self._rows)) >= self._block_steps:
+        is_large = sum(each.nbytes for each in self._rows) >= BLOCK_BYTES
+        if is_large or sum(map(len, self._rows)) >= self._block_steps:
             self.commit()
 
     def commit(self) -> None:
@@ -83,8 +85,10 @@ def _packed(rows: Rows, n: int) -> dict[str, Any]:
             columns.append(values.view(np.uint8).reshape(len(rows), -1).T.tobytes())
     last = np.zeros(len(rows), np.bool_)  # of an episode, in the block
     digests = rows["digest"].copy().view(np.uint8).reshape(len(rows), -1)
-    for environment in range(n):
-        own = np.flatnonzero((rows["step"] % n == environment) & digests.any(axis=1))
+    marked = np.asarray(digests.any(axis=1))
+    for first in range(min(n, len(rows))):  # an environment
+        own = np.arange(first, len(rows), n)
+        own = own[marked[own]]
         if len(own):
             episode = rows["episode"][own]
             last[own] = np.append(episode[1:] != episode[:-1], True)

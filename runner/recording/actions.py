@@ -29,6 +29,7 @@ NUMBERS: Final = ("episode", "t", "log_time")
 """Those that are stored as differences."""
 MARK: Final = np.dtype([("row", "<u4"), ("digest", f"V{DIGEST_BYTES}")])
 _MAX_BLOCK_BYTES: Final = 64 << 20
+_MAX_STEP: Final = 1 << 62
 
 Rows = NDArray[np.void]
 
@@ -97,7 +98,8 @@ def unpacked(fields: Mapping[str, Any], dtype: np.dtype[np.void], n: int, where:
     count, data = fields["count"], fields["data"]
     names = [name for name in dtype.names or () if name in COLUMNS]
     width = sum(dtype[name].itemsize for name in names)
-    if count * dtype.itemsize > _MAX_BLOCK_BYTES or len(data) != count * width or not count:
+    is_whole = 0 < count * dtype.itemsize <= _MAX_BLOCK_BYTES and len(data) == count * width
+    if not (is_whole and 0 <= fields["step"] < _MAX_STEP):
         raise RecordingError(f"{where}: found {len(data):,} bytes for {count:,} steps of {width} bytes")
     if len(fields["digests"]) % MARK.itemsize:
         raise RecordingError(f"{where}: found digests of {len(fields['digests']):,} bytes")
@@ -121,6 +123,7 @@ def unpacked(fields: Mapping[str, Any], dtype: np.dtype[np.void], n: int, where:
 
 def _summed(values: NDArray[Any], n: int) -> NDArray[Any]:
     """Return the numbers whose differences from n rows before these are."""
+    n = min(n, len(values))
     padded = np.zeros(-(-len(values) // n) * n, values.dtype)
     padded[: len(values)] = values
     return padded.reshape(-1, n).cumsum(axis=0, dtype=values.dtype).reshape(-1)[: len(values)]

@@ -28,8 +28,8 @@ STREAMS: Final = ("", "stdout", "stderr")
 """The streams by number; 0 is the recorder's own note."""
 MAX_CONSOLE_BYTES: Final = 10 << 20
 """The most text of a run that is recorded."""
-MAX_LINES: Final = 1 << 18
-"""The most messages that are read."""
+_MAX_READ: Final = 4 * MAX_CONSOLE_BYTES
+"""The most text that is read; a run that was resumed has more than one session's."""
 _LINE_BYTES: Final = 64
 """Counted for each line, so that the number of lines is bounded as well."""
 _MAX_COLUMNS: Final = 4096
@@ -268,16 +268,21 @@ def read_console(recording: TopicReader, clock: Clock | None) -> list[ConsoleLin
         clock: its clock.
 
     Raises:
-        RecordingError: a line is damaged, or there are too many.
+        RecordingError: a line is damaged.
     """
     lines: dict[tuple[float, int, int], ConsoleLine] = {}
+    left = _MAX_READ
     for count, fields in enumerate(recording.decoded(schema.CONSOLE_TOPIC, max_bytes=_MAX_MESSAGE)):
         number, started, seconds = (fields[name] for name in ("stream", "started", "seconds"))
-        if count == MAX_LINES or number >= len(STREAMS) or not abs(seconds) < float("inf"):
+        if number >= len(STREAMS) or not abs(seconds) < float("inf"):
             raise RecordingError(
                 f"{recording.path}: {schema.CONSOLE_TOPIC.name}: found stream {number} after {seconds} s in "
-                f"message {count}, expected at most {MAX_LINES:,} of the streams 0 to {len(STREAMS) - 1}."
+                f"message {count}, expected one of the streams 0 to {len(STREAMS) - 1}."
             )
+        left -= len(fields["text"]) + _LINE_BYTES
+        if left < 0:
+            lines[started, 0, -1] = ConsoleLine(seconds, 0, STREAMS[0], _NOTE)
+            break
         position = fields["log_time"] // schema.STEP_NANOSECONDS
         if clock is not None:
             seconds += clock.earlier.get(started, 0.0)

@@ -46,7 +46,8 @@ class HostSampler:
         self._looked = -math.inf
         self._before: tuple[float, float] | None = None
         """When the last sample was taken, and the processor time until then."""
-        psutil.cpu_percent()  # the next call measures from here
+        with contextlib.suppress(psutil.Error, OSError, RuntimeError, NotImplementedError):
+            psutil.cpu_percent()  # the next call measures from here
         self._gpus = _Gpus()
         self.sample()
 

@@ -128,7 +128,7 @@ class _Thread:
             self._wake.set()
             self._thread, self._wake = None, threading.Event()
         if thread is not None and thread is not threading.current_thread():
-            thread.join()
+            thread.join(SAMPLE_SECONDS)  # it may wait for a driver or a disk for ever
 
     def ensure_running(self) -> None:
         """Start the thread, if it does not run."""

@@ -83,7 +83,7 @@ class _Sources:
                 about = os.fstat(descriptor)
                 if not stat.S_ISREG(about.st_mode):
                     return
-                if about.st_size > MAX_FILE_BYTES:
+                if about.st_size > min(self.budget, MAX_FILE_BYTES):
                     self.left_out.append(f"{path} ({about.st_size:,} bytes)")
                     return
                 data = stream.read(MAX_FILE_BYTES + 1)
@@ -118,9 +118,9 @@ class CodeCollector:
         self._thread = threading.Thread(
             target=self._collect, args=(_cells(), recordings), name="recording-code", daemon=True
         )
-        if self._is_wanted and (found := _recent.fresh(_cells(), recordings)) is not None:
-            self._found = found
-        elif self._is_wanted:
+        with contextlib.suppress(OSError):  # there is no current folder: the thread notes it
+            self._found = _recent.fresh(_cells(), recordings) if self._is_wanted else None
+        if self._is_wanted and self._found is None:
             self._thread.start()
 
     def _collect(self, cells: str, recordings: Path) -> None:
@@ -280,12 +280,15 @@ def _named(left_out: list[str]) -> str:
 def _fitting_patch(repository: Repository, sources: _Sources) -> str:
     """Return the parts of the patch that fit, and note the others as left out."""
     kept = []
-    for path, part in patch_parts(redacted_text(repository.patch)).items():
-        size = len(part.encode())
-        if size > min(sources.budget, MAX_FILE_BYTES):
+    for path, part in patch_parts(repository.patch).items():
+        limit = min(sources.budget, MAX_FILE_BYTES)
+        is_short = len(part) <= limit  # redaction takes seconds for megabytes
+        shown = redacted_text(part) if is_short else part
+        size = len(shown.encode())
+        if size > limit:
             sources.left_out.append(f"the changes of {path} ({size:,} bytes)")
         else:
-            kept.append(part)
+            kept.append(shown)
             sources.budget -= size
     return "".join(kept)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import lru_cache
 from typing import Final
 
 REDACTED: Final = "[redacted]"
@@ -29,12 +29,13 @@ _IN_SOURCES: Final = (
 """In sources a mere `key` is seldom a secret: `sort(key="length")`."""
 _AFTER_NAME: Final = (
     r"[\w-]{0,40}[\"']?\]?(?:(?:\s{0,3}:\s{0,3}[\w.\[\]| ]{1,30})?\s{0,3}[:=]\s{0,3}|"
+    r"(?<=[\"'])\s{0,3},\s{0,3}|"
     r"[^\"'\n]{0,60}default\s?=\s?)"
 )
 SHAPES: Final = (
     (
         "private keys",
-        r"-----BEGIN [A-Z ]{0,30}PRIVATE KEY-----(?:[^-]|-(?!----)){0,20000}"
+        r"-----BEGIN [A-Z ]{0,30}PRIVATE KEY-----(?:[^-]|-(?!----)|-(?=-----END)){0,20000}"
         r"-----END [A-Z ]{0,30}PRIVATE KEY-----",
     ),
     ("AWS", r"\b(?:AKIA|ASIA)[0-9A-Z]{16}\b"),
@@ -72,7 +73,7 @@ _LONG_KEY: Final = re.compile(
 )
 _BARE: Final = re.compile(
     rf"({_IN_SOURCES}[\w-]{{0,40}}[ \t]{{0,3}}[:=][ \t]{{0,3}})"
-    r"(?=[\w+/=~-]{0,200}\d)[\w+/=~-]{16,500}(?=\s|$)",
+    r"(?=[\w+/=~-]{0,200}\d)[\w+/=~-]{16,500}(?=[\s;&|]|$)",
     re.IGNORECASE,
 )
 """Without quotes, as in shell scripts and YAML: only what is long and has a digit."""
@@ -138,12 +139,14 @@ def redacted_line(text: str) -> str:
     return text
 
 
-@cache
 def _secret_values() -> tuple[str, ...]:
-    """Return the values of the environment variables with the names of secrets, as this process began."""
-    return tuple(
-        value for name, value in os.environ.items() if len(value) >= _MIN_VARIABLE and is_secret_name(name)
-    )
+    """Return the values of the environment variables with the names of secrets."""
+    return _secrets_among(frozenset(os.environ.items()))
+
+
+@lru_cache(1)
+def _secrets_among(variables: frozenset[tuple[str, str]]) -> tuple[str, ...]:
+    return tuple(value for name, value in variables if len(value) >= _MIN_VARIABLE and is_secret_name(name))
 
 
 def _without_value(match: re.Match[str]) -> str:

@@ -206,7 +206,9 @@ class Run:
     @property
     def is_stop_requested(self) -> bool:
         """Whether the loop that records it was requested to stop."""
-        return (self.folder / STOP_FILE).exists()
+        with contextlib.suppress(OSError):  # of a network file system, perhaps for a moment
+            return (self.folder / STOP_FILE).exists()
+        return False
 
     def request_stop(self) -> None:
         """Request that the loop which records the run stops: `should_stop` of its environment becomes True.

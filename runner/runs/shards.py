@@ -26,7 +26,7 @@ RUN_VARIABLE: Final = "DUALTAXI_RUN"
 """The folder of the run that this process recorded last, which its child processes can join."""
 ENDS_AS: Final = "ends_as"
 """In `run.json` after the process that began the run has ended: the status that the run will have."""
-_NAME: Final = re.compile(r"[\w.-]{1,80}")
+_NAME: Final = re.compile(r"[\w-][\w.-]{0,79}")  # a folder that begins with a dot is no run
 _LOCK: Final = "shards.lock"
 
 
@@ -96,7 +96,7 @@ def new_shard(joined: Run, name: str | None, config: Mapping[str, Any], seed: in
         process = multiprocessing.current_process().name
         name = re.sub(r"[^\w.]+", "-", process).strip("-.")[:60] or "process"
     if not isinstance(name, str) or not _NAME.fullmatch(name) or not name.strip("."):
-        raise ConfigError(f"shard: found {name!r}, expected 1 to 80 letters, digits, _, . and -")
+        raise ConfigError(f"shard: found {name!r}, expected 1 to 80 letters, digits, _, . and -, no . first")
     names = itertools.chain([name], (f"{name}-{n}" for n in itertools.count(2)))
     with shards_locked(joined):
         _require_open(run_at(joined.folder))

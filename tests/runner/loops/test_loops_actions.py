@@ -276,3 +276,23 @@ def test_a_changed_action_is_found(tmp_path, monkeypatch):
 
     with pytest.raises((CannotRedo, Diverged)):
         _write(run.recording, tmp_path / "fresh.mcap", trust=False)
+
+
+def test_wide_actions_of_many_environments_stay_readable(tmp_path):
+    space = gymnasium.spaces.Box(-1, 1, (1024,), np.float64)
+    draws = np.random.default_rng(0)
+    with runner.record_batches(
+        "wide",
+        tmp_path,
+        observation_space=gymnasium.spaces.Box(-1, 1, (2,), np.float32),
+        action_space=space,
+        autoreset_mode="NextStep",
+        steps="actions",
+    ) as rec:
+        rec.reset(np.zeros((16, 2), np.float32))
+        actions = draws.uniform(-1, 1, (600, 16, 1024))
+        zeros = np.zeros((600, 16))
+        rec.batch(np.zeros((600, 16, 2), np.float32), actions, zeros, zeros > 1, zeros > 1)
+    with open_recording(rec.run.recording) as recording:
+        found = np.concatenate([rows["action"] for rows in recording.actions("train")])
+    assert found.tobytes() == actions.reshape(-1, 1024).tobytes()

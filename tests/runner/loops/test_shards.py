@@ -400,6 +400,8 @@ def test_mistakes_of_joining_are_named(tmp_path, monkeypatch):
         runner.record(env(), shard="w")
     with pytest.raises(ConfigError, match="1 to 80 letters"):
         runner.record(env(), join=rec.run, shard="a/b")
+    with pytest.raises(ConfigError, match="1 to 80 letters"):
+        runner.record(env(), join=rec.run, shard=".hidden")  # which nothing would find
     with pytest.raises(ConfigError, match="join: found 3"):
         runner.record(env(), join=3)
     two = runner.record(env(), join=rec.run, shard="w")

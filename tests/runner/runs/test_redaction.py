@@ -128,3 +128,22 @@ def test_the_lists_are_documented():
     for pattern in VARIABLES:
         name = "SLURM_" if pattern.startswith("SLURM_") else pattern.rstrip("*")
         assert f"`{name}`" in form, pattern
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'os.environ.setdefault("WANDB_API_KEY", "a1b2c3d4e5")',
+        'os.getenv("DB_PASSWORD", "a1b2c3d4e5")',
+        "export WANDB_API_KEY=a1b2c3d4e5a1b2c3d4e5; python x.py",
+        "------BEGIN PRIVATE KEY-----\n-a1b2c3d4e5\n------END PRIVATE KEY-----\n",
+    ],
+)
+def test_secrets_in_calls_in_commands_and_in_removed_lines(text):
+    assert "a1b2c3d4e5" not in redacted_text(text, {})
+
+
+def test_a_variable_that_the_process_sets_itself_is_a_secret(monkeypatch):
+    redacted_line("nothing")
+    monkeypatch.setenv("SVC_TOKEN", "correcthorsebattery")
+    assert redacted_line("it is correcthorsebattery") == f"it is {REDACTED}"
