@@ -197,7 +197,7 @@ def _group(label: str, runs: Sequence[RunSeries]) -> Group:
     best: dict[Hashable, RunSeries] = {}
     for run in runs:
         # A job follows from its seed; loops need their content, as workers of one training share a seed.
-        identity = run.content_digest or run.run_id if run.is_loop else run.seed
+        identity = run.seed if run.can_train_again else run.content_digest or run.run_id
         key = (_content(run), identity)
         if key not in best or run.finished >= best[key].finished:
             best[key] = run

@@ -227,7 +227,7 @@ def _uniform(actions: list[Any]) -> NDArray[Any]:
 
 def _parts(recording: Recording, actions: NDArray[Any], notes: list[str]) -> dict[str, NDArray[Any]]:
     """Return the numbers of actions by part: an agent, a field or an index; empty for a single number."""
-    if recording.is_job:
+    if recording.can_train_again:
         own = recording.mdp.own_actions[actions]
         agents = recording.mdp.agents
         return {agent if len(agents) > 1 else "": own[:, i] for i, agent in enumerate(agents)}
@@ -254,7 +254,7 @@ def _numbers(path: str, values: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any
 def _action_name(recording: Recording, part: str) -> Callable[[float], str]:
     """Return a function that names the discrete actions of a part."""
     start = 0
-    if recording.is_job:
+    if recording.can_train_again:
         agents = recording.mdp.agents
         names = tuple(numbered_actions(recording.mdp)[agents.index(part) if part else 0])
     else:

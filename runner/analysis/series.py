@@ -71,9 +71,9 @@ class RunSeries:
         return self.status == "finished"
 
     @property
-    def is_loop(self) -> bool:
-        """Whether the run was recorded from a loop, whose training is read at even numbers of episodes."""
-        return "made_by" in self.config
+    def can_train_again(self) -> bool:
+        """Whether the runner trained it and reported at evaluations; else it is read at even distances."""
+        return "made_by" not in self.config
 
     @property
     def has_goal(self) -> bool:
@@ -81,7 +81,7 @@ class RunSeries:
 
         A loop has one if its environment defines success: a pole is to be held for as long as possible.
         """
-        return not self.is_loop or any("success_percent" in readings for _, readings in self.evaluation)
+        return self.can_train_again or any("success_percent" in readings for _, readings in self.evaluation)
 
 
 def values_left_out(runs: Collection[RunSeries]) -> list[str]:
@@ -129,7 +129,7 @@ def points_of(run: RunSeries, metric: str, line: str, aligned: bool) -> dict[flo
             every run of a configuration; all of them if the run has no evaluation, or on another axis.
     """
     source = run.training if metric.startswith("training.") else run.evaluation
-    is_aligned = aligned and run.axis is EPISODES and not run.is_loop
+    is_aligned = aligned and run.axis is EPISODES and run.can_train_again
     at_evaluations = {place for place, _ in run.evaluation} if is_aligned else set()
     missing = 0.0 if metric == SHARES else np.nan
     points = {
@@ -183,7 +183,7 @@ def read_series(recording: Recording, axis: Axis = EPISODES) -> RunSeries:
         RecordingError: the recording is damaged, or does not have the axis.
     """
     not_finite: Counter[str] = Counter()
-    if axis is EPISODES and not recording.is_job and not any(recording.done().values()):
+    if axis is EPISODES and not recording.can_train_again and not any(recording.done().values()):
         axis = STEPS  # values without an environment have the steps that were given with them
     places = positions(recording, axis)
     evaluations = evaluation_records(recording)

@@ -78,7 +78,7 @@ def recorded(run: Run) -> Run:
         return run
     if run.status == "running":
         raise RunnerError(f"run {run.run_id} has no recording yet: it has just begun.")
-    if run.is_loop:
+    if not run.can_train_again:
         raise RunnerError(
             f"run {run.run_id} has no recording, and only the loop that recorded it can make another."
         )

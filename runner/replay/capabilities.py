@@ -11,7 +11,7 @@ from runner.replay.makers import is_whole_vector, why_not_made
 
 def environments_with_frames(recording: Recording, phase: str) -> Sequence[int]:
     """Return the environments of which frames were recorded in a phase; of a job none."""
-    if recording.is_job or not recording.has_messages(f"/{phase}/frame"):
+    if recording.can_train_again or not recording.has_messages(f"/{phase}/frame"):
         return ()
     frames = recording.config.get("frames")
     chosen = frames.get("environments") if isinstance(frames, Mapping) else None

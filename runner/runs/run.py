@@ -199,9 +199,9 @@ class Run:
             os.utime(self.folder / RUN_FILE)
 
     @property
-    def is_loop(self) -> bool:
-        """Whether it was recorded from a user's own loop."""
-        return "made_by" in self.file.config
+    def can_train_again(self) -> bool:
+        """Whether its configuration determines all of it, as the runner trained it; a loop's does not."""
+        return "made_by" not in self.file.config
 
     @property
     def is_stop_requested(self) -> bool:
@@ -217,7 +217,7 @@ class Run:
             RunnerError: no loop records it now.
             StorageError: its folder cannot be written.
         """
-        if not self.is_loop:
+        if self.can_train_again:
             raise RunnerError(f"run {self.run_id} is made by a job; cancel the job, or press Ctrl-C there.")
         if self.status != "running":
             raise RunnerError(

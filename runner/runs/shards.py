@@ -61,7 +61,7 @@ def find_joined(join: object, recordings: str | os.PathLike[str] | None) -> Run:
 
 
 def _require_open(run: Run) -> None:
-    if not run.is_loop:
+    if run.can_train_again:
         raise RunnerError(
             f"join: run {run.run_id} is a job, which the runner trains; expected one of runner.record."
         )

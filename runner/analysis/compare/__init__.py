@@ -173,7 +173,7 @@ def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: 
         group.label: run.config["env"]["id"]
         for group in groups
         for run in group.runs
-        if not run.is_loop and "env" in run.config
+        if run.can_train_again and "env" in run.config
     }
     if len(set(environments.values())) > 1:
         where = ", ".join(f"{env_id} in {label}" for label, env_id in environments.items())
@@ -192,7 +192,7 @@ def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: 
     few = [group for group in groups if seeds[group.label] < statistics.FEW_SEEDS]
     if few:
         listed_groups = ", ".join(f"{group.label} ({seeds[group.label]})" for group in few)
-        loops = all(run.is_loop for group in few for run in group.runs)
+        loops = all(not run.can_train_again for group in few for run in group.runs)
         more = "record more, each with a seed of its own" if loops else "`--set 'seeds={count: 10}'` runs ten"
         yield (
             f"fewer than {statistics.FEW_SEEDS} seeds in {listed_groups}: bootstrap intervals of so few are "

@@ -190,7 +190,7 @@ def evaluate_command(
     from runner.recording.reader import open_recording
 
     source = find_recorded(run_name, recordings)
-    if source.is_loop or checkpoint is not None or policy is not None:
+    if not source.can_train_again or checkpoint is not None or policy is not None:
         if checkpoint is None or policy is None:
             raise click.UsageError(
                 "a loop is evaluated by --checkpoint [NAME]@STEP and --policy module:function; "

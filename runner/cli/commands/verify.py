@@ -285,7 +285,7 @@ def _repair(repaired: Repair, run: Run | None) -> dict[str, str]:
         rows["lost"] = "\n".join(_losses(repaired))
     if repaired.original is not None:
         rows["damaged"] = f"{repaired.original} is kept"
-    if run is not None and not repaired.lossless and not run.is_loop:
+    if run is not None and not repaired.lossless and run.can_train_again:
         rows["next"] = command_for(run, "resume")
     return rows
 

@@ -101,7 +101,7 @@ def footnote(groups: Sequence[Group]) -> str:
     """Return what lines and bands mean, and which values are not drawn."""
     runs = [run for group in groups for run in group.runs]
     left_out = "".join(f" {sentence}" for sentence in values_left_out(runs))
-    loops = any(run.is_loop for run in runs)
+    loops = any(not run.can_train_again for run in runs)
     interpolated = loops or runs[0].axis is not EPISODES
     greedy = "" if loops else " Evaluation trials follow the greedy policy: no exploring."
     if max(len(group.runs) for group in groups) == 1:

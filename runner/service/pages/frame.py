@@ -72,7 +72,7 @@ def head_of(run: Run) -> RunHead:
 
 def has_tables(run: Run) -> bool:
     """Return whether the Q-tables of a run are known, without opening its recording."""
-    return not run.is_loop
+    return run.can_train_again
 
 
 def loop_results(run: Run) -> Summary:

@@ -346,7 +346,7 @@ def _overview(
 
 def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:
     number, live = _job_of(run, jobs)
-    summary = live or (_done_by(run) if run.is_loop and run.status == "running" else run.summary)
+    summary = live or (_done_by(run) if not run.can_train_again and run.status == "running" else run.summary)
     episodes = summary.get("episode", summary.get("episodes"))
     facts = _results(run, EvaluationMetrics.of(summary.get("last_evaluation") or {})) | {
         "Training episodes": humanize.number(episodes, 0),
@@ -380,7 +380,7 @@ def _done_by(run: Run) -> dict[str, Any]:
 
 
 def _stop_of(run: Run) -> Literal["", "possible", "requested"]:
-    if not run.is_loop or run.status != "running":
+    if run.can_train_again or run.status != "running":
         return ""
     return "requested" if run.is_stop_requested else "possible"
 
