@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.metadata import RECORDING_STOPPED
 from runner.recording.reader import Recording
 from runner.util.values import flatten, is_whole
 
@@ -34,7 +35,10 @@ def shortcomings(recording: Recording) -> list[str]:
             of = f" of {planned:,}" if is_whole(planned, 0, 2**63) else ""
             recorded = f"there are {recording.count(schema.TRAIN_EPISODE):,}{of} training episodes"
         problem = "is still running" if status == "running" else f"did not finish ({status})"
-        sentences.append(f"Run {recording.run_id} {problem}: {recorded}.")
+        sentence = f"Run {recording.run_id} {problem}: {recorded}."
+        if (error := recording.result.error or "").startswith(RECORDING_STOPPED):
+            sentence = f"Run {recording.run_id}: {error.partition(', and ')[0]}."
+        sentences.append(sentence)
     return sentences + [f"Some messages of {topic} were lost in a repair." for topic in recording.lost]
 
 

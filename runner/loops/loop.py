@@ -19,6 +19,7 @@ from runner.loops.rows import PhaseRows
 from runner.loops.values import check_phase, warn_user
 from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
+from runner.recording.metadata import RECORDING_STOPPED
 from runner.recording.recorder import FLUSH_SECONDS, Recorder
 from runner.runs.run import Run
 from runner.util.values import is_whole
@@ -265,7 +266,7 @@ class Loop(Generic[R]):
                 self._failure = str(error)
             else:
                 self._failure = (
-                    f"recording stopped at step {self.position:,}, and the loop went on without it: "
+                    f"{RECORDING_STOPPED}{self.position:,}, and the loop went on without it: "
                     f"{type(error).__name__}: {error}"
                 )
             self.close("failed", self._failure)

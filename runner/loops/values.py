@@ -70,7 +70,9 @@ def check_log_name(name: Any, value: Any) -> None:
     Raises:
         ConfigError: it is empty, or not text.
     """
-    if not isinstance(name, str) or not name or not is_utf8(name):
+    if name == "":
+        raise ConfigError(f"log: found an empty name for {value!r}, expected a name that is not empty")
+    if not isinstance(name, str) or not is_utf8(name):
         raise ConfigError(f"log: found the name {name!r} for {value!r}, expected text that is valid Unicode")
 
 

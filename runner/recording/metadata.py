@@ -27,6 +27,8 @@ from runner.util.values import MAX_JSON_DEPTH, is_too_deep, is_whole, without_su
 
 REQUIRED_RECORDS: Final = frozenset({"run", "config", "provenance"})
 """The metadata records without which a recording's messages cannot be interpreted."""
+RECORDING_STOPPED: Final = "recording stopped at step "
+"""The beginning of the error of a loop that went on when recording failed."""
 _RUN_TEXTS: Final = ("run_id", "name", "job", "created", "agents")
 _RUN_COUNTS: Final = {"seed": 2**64 - 1, "learners": MAX_AGENTS, "events": MAX_EVENTS}
 """The numbers that every metadata record `run` has, and the largest possible value of each."""

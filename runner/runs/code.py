@@ -261,7 +261,7 @@ def collect(
         "git.branch": repository.branch,
         "git.remote": redacted_text(repository.remote),
         "code.script": "" if script is None else _within(root, script),
-        "code.not_recorded": "; ".join(problems),
+        "git.not_recorded": "; ".join(problems),
         "code.left_out": _named(sources.left_out),
     }
     code = Code(sources.files, tuple(sorted(new)), patch)

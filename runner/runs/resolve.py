@@ -155,20 +155,23 @@ def of_name(name: str, index: Index) -> list[Candidate]:
 def choose(name: str, candidates: Sequence[Candidate]) -> Candidate:
     """Return the run that a name stands for, of those that `matching` returned, which are not empty.
 
+    An id comes before a name, and a name that one run has before the beginnings of ids.
+
     Raises:
         RunNotFound: the name is ambiguous.
     """
     exact = [run for run in candidates if run.run_id == name]
-    if len(exact) == 1 or len(candidates) == 1:
-        return (exact or candidates)[0]
+    named = [run for run in candidates if run.name == name]
+    for found in (exact, named, candidates):
+        if len(found) == 1:
+            return found[0]
     listed = [
         f"  {run.run_id}  {run_title(run.name, run.seed)}  {run.created:%Y-%m-%d %H:%M}"
         for run in candidates[:_MAX_LISTED]
     ]
     if len(candidates) > _MAX_LISTED:
         listed.append(f"  and {len(candidates) - _MAX_LISTED:,} more")
-    is_name = any(run.name == name for run in candidates)
-    newest = f", or the newest of this name by {name}{LATEST}" if is_name else ""
+    newest = f", or the newest of this name by {name}{LATEST}" if named else ""
     raise RunNotFound(
         "\n".join([f"{name!r} matches {len(candidates)} runs; name one by its id{newest}:", *listed])
     )

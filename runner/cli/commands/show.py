@@ -90,7 +90,7 @@ def _print_code(run: Run, as_json: bool) -> None:
         known["code.not_recorded"] = "the code of this run"
     committed = [path for path in found.files if path not in found.new]
     head = [f"# {key}: {printable(text)}" for key, text in known.items()]
-    head += [f"# recorded by --json as well: {', '.join(map(printable, committed))}"] if committed else []
+    head += [f"# also printed in full by --json: {', '.join(map(printable, committed))}"] if committed else []
     if console().is_terminal:
         draw(*head, patch_text(found.to_patch().splitlines()))
     else:

@@ -68,6 +68,7 @@ CODE_FACTS: Final = {
     "git": "Commit",
     "git.branch": "Branch",
     "git.remote": "Remote",
+    "git.not_recorded": "Git",
     "command": "Command",
     "code.script": "Script",
     "code.not_recorded": "Not recorded",

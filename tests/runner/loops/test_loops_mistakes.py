@@ -87,6 +87,7 @@ def test_a_recording_that_cannot_start_leaves_no_running_run(part, left, tmp_pat
     [
         (lambda rec: rec.log("a", "\ud800"), "valid Unicode"),
         (lambda rec: rec.log("\ud800", 1), "valid Unicode"),
+        (lambda rec: rec.log("", 1), "a name that is not empty"),
         (lambda rec: rec.log("a", 10**400), "a number that a float64 holds"),
         (lambda rec: rec.snapshot("a", [[1], [1, 2]]), "no array of numbers for 'a'"),
         (lambda rec: rec.snapshot("\ud800", [1.0]), "expected an array of numbers and a name"),

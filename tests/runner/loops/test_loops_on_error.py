@@ -15,6 +15,7 @@ from making import Leaving, dualtaxi
 
 import runner
 from runner.errors import RunnerError
+from runner.export.contents import shortcomings
 from runner.recording.reader import open_recording
 from runner.runs.listing import list_runs
 
@@ -87,6 +88,7 @@ def test_a_value_of_another_shape_ends_the_recording_only(tmp_path):
     assert "recording stopped at step 10, and the loop went on without it" in run.summary["error"]
     with open_recording(run.recording) as recording:
         assert recording.status == "failed"
+        assert shortcomings(recording) == [f"Run {run.run_id}: recording stopped at step 10."]
         counts = recording.done()
         assert counts["train_steps"] + counts["eval_steps"] == 10
     shown = dualtaxi(tmp_path, "show", run.run_id).output

@@ -73,7 +73,7 @@ def test_an_ignored_script_is_part_of_the_patch(project):
 def test_a_script_without_a_repository_comes_back_from_its_patch(tmp_path):
     (tmp_path / "train.py").write_text("rate = 2\n")
     entries, code = read(tmp_path, tmp_path / "train.py")
-    assert entries == {"code.script": "train.py", "code.not_recorded": "there is no git repository"}
+    assert entries == {"code.script": "train.py", "git.not_recorded": "there is no git repository"}
     copy = tmp_path / "copy"
     copy.mkdir()
     git(copy, "init", "-q")
@@ -87,7 +87,7 @@ def test_before_the_first_commit(tmp_path):
     (tmp_path / "train.py").write_text("rate = 2\n")
     git(tmp_path, "add", "-A")
     entries, code = read(tmp_path, tmp_path / "train.py")
-    assert entries["code.not_recorded"] == "there is no commit yet"
+    assert entries["git.not_recorded"] == "there is no commit yet"
     assert "git" not in entries
     assert code.new == ("train.py",)
 
@@ -102,7 +102,7 @@ def test_a_bare_repository(project, tmp_path):
     bare = tmp_path / "bare.git"
     git(tmp_path, "clone", "-q", "--bare", str(project), str(bare))
     entries, code = read(bare)
-    assert entries == {"code.not_recorded": "the repository is bare: it has no files"}
+    assert entries == {"git.not_recorded": "the repository is bare: it has no files"}
     assert code == Code()
 
 
@@ -139,7 +139,7 @@ def test_50_000_untracked_files(project):
     assert entries["git"].startswith(git(project, "rev-parse", "HEAD"))
     assert code.files["train.py"]
     assert sum(map(len, code.files.values())) <= MAX_CODE_BYTES
-    assert "code.left_out" in entries or "code.not_recorded" in entries or len(code.new) == 50_000
+    assert "code.left_out" in entries or "git.not_recorded" in entries or len(code.new) == 50_000
 
 
 def test_what_is_too_large_is_named(project):
@@ -170,7 +170,7 @@ def test_a_repository_of_another_user_is_not_read(project, monkeypatch):
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{program.parent}{os.pathsep}{os.environ['PATH']}")
     entries, code = read(project, project / "train.py")
-    assert "does not trust the repository" in entries["code.not_recorded"]
+    assert "does not trust the repository" in entries["git.not_recorded"]
     assert "git" not in entries
     assert code.files == {"train.py": "rate = 1\nsteps = 10\n"}
 
@@ -178,14 +178,14 @@ def test_a_repository_of_another_user_is_not_read(project, monkeypatch):
 def test_git_that_is_not_installed(project, monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     entries, code = read(project, project / "train.py")
-    assert entries == {"code.script": "train.py", "code.not_recorded": "git is not installed"}
+    assert entries == {"code.script": "train.py", "git.not_recorded": "git is not installed"}
     assert code.files == {"train.py": "rate = 1\nsteps = 10\n"}
 
 
 def test_a_broken_repository(project):
     (project / ".git" / "HEAD").write_text("nothing\n")
     entries, code = read(project, project / "train.py")
-    assert entries["code.not_recorded"]
+    assert entries["git.not_recorded"]
     assert "git" not in entries
     assert code.files
 
@@ -194,7 +194,7 @@ def test_a_damaged_index_leaves_the_commit(project):
     (project / ".git" / "index").write_bytes(b"nothing")
     entries, _ = read(project, project / "train.py")
     assert entries["git"] == git(project, "rev-parse", "HEAD")
-    assert "index" in entries["code.not_recorded"]
+    assert "index" in entries["git.not_recorded"]
 
 
 def test_a_hanging_git_is_stopped(project, monkeypatch):
@@ -242,7 +242,7 @@ def test_nothing_that_the_repository_configures_is_executed(project, tmp_path):
     (project / "notes.txt").write_text("b\n")
     entries, code = read(project, project / "train.py")
     assert not mark.exists(), mark.read_text()
-    assert "code.not_recorded" not in entries
+    assert "git.not_recorded" not in entries
     assert "+rate = 2" in code.patch
     assert "+b" in code.patch
 
@@ -252,7 +252,7 @@ def test_a_working_tree_that_is_elsewhere_is_not_read(project, tmp_path):
     (tmp_path / "home" / "diary.py").write_text("mine")
     git(project, "config", "core.worktree", str(tmp_path / "home"))
     entries, code = read(project, project / "train.py")
-    assert "code.not_recorded" in entries
+    assert "git.not_recorded" in entries
     assert not any("diary.py" in path for path in code.files)
 
 

@@ -122,6 +122,16 @@ def test_an_id_goes_before_a_prefix_and_a_name(folder):
         find_run("ab", folder)
 
 
+def test_the_only_run_of_a_name_goes_before_the_beginning_of_an_id(folder):
+    _renamed(create_run(folder, CONFIG, 1), "c2zzzzzz")
+    create_run(folder, CONFIG, 2, "c2")
+    assert find_run("c2", folder).seed == 2
+    _renamed(create_run(folder, CONFIG, 3), "c3zzzzzz")
+    _renamed(create_run(folder, CONFIG, 4), "c3yyyyyy")
+    with pytest.raises(RunNotFound, match="name one by its id:"):
+        find_run("c3", folder)
+
+
 def test_several_runs_of_a_name_are_listed(folder):
     made = [create_run(folder, CONFIG, seed) for seed in (1, 2)]
     with pytest.raises(RunNotFound, match=r"'some' matches 2 runs; .* by some@latest") as caught:
