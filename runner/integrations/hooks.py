@@ -44,8 +44,8 @@ class WaitingRun(Protocol):
     def begin_with(self, env: Any) -> None:
         """Begin to record an environment that is about to be reset."""
 
-    def warn_once(self, message: str) -> None:
-        """Warn the user of something once."""
+    def warn_once(self, message: str, about: str = "") -> None:
+        """Warn the user of something once: of this message, or of what it is about."""
 
     def disown(self) -> None:
         """Leave the run to the process that this one was just forked from."""
@@ -129,8 +129,9 @@ def _find_run(env: Any) -> None:
         for run in open_runs:
             if run.has_environment:
                 run.warn_once(
-                    f"run {run.run_id} records the environment that was reset first, and not the others: "
-                    f"{env} is not recorded. runner.record(env) records it in a run of its own."
+                    f"run {run.run_id} records the environment that was reset first, and no other: "
+                    f"{env} is not recorded. runner.record(env) records it in a run of its own.",
+                    about="other environments",
                 )
 
 

@@ -29,6 +29,7 @@ require_tested("stable_baselines3", "sb3", ("2.9", "2.9"))
 from stable_baselines3.common.base_class import BaseAlgorithm  # noqa: E402
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback  # noqa: E402
 from stable_baselines3.common.logger import KVWriter  # noqa: E402
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm  # noqa: E402
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv  # noqa: E402
 
 from runner.loops.recorded_vec_env import RecordedVecEnv  # noqa: E402
@@ -189,16 +190,22 @@ class Recording(BaseCallback):  # type: ignore[misc]
     def _on_training_start(self) -> None:
         self._next_checkpoint = self.num_timesteps + self._checkpoint_every
 
+    def _on_rollout_start(self) -> None:
+        if isinstance(self.model, OnPolicyAlgorithm):
+            for writer in [one for one in self.logger.output_formats if isinstance(one, _LogWriter)]:
+                writer.write_update(self.logger.name_to_value)
+
     def _on_step(self) -> bool:
         if self._checkpoint_every and self.num_timesteps >= self._next_checkpoint:
-            self._checkpoint()
+            if self.num_timesteps < self.model._total_timesteps:  # else there is one after the last update
+                self._checkpoint()
             self._next_checkpoint = self.num_timesteps + self._checkpoint_every
         return not self.recorded.should_stop
 
     def _on_training_end(self) -> None:
         logger = self.logger
         for writer in [one for one in logger.output_formats if isinstance(one, _LogWriter)]:
-            writer.write(logger.name_to_value, {})  # of the last update, which the library does not write
+            writer.log(logger.name_to_value)  # of the last update, which the library does not write
             logger.output_formats.remove(writer)
         if self._checkpoint_every:
             self._checkpoint()
@@ -231,12 +238,33 @@ class Recording(BaseCallback):  # type: ignore[misc]
 
 
 class _LogWriter(KVWriter):  # type: ignore[misc]
-    """Records what the library's logger writes: numbers and texts."""
+    """Records what the library's logger writes: numbers and texts.
+
+    An on-policy model writes the numbers of an update one rollout later, with those of the rollout. Here they
+    are recorded at the step of the update.
+    """
 
     def __init__(self, recorded: RecordedVector) -> None:
         self._recorded = recorded
+        self._of_updates: set[str] = set()
+        """The names that are recorded at the step of the update."""
+        self._is_update_due = False
+        """Whether the library wrote, so that the next update is recorded."""
 
     def write(self, key_values: Mapping[str, Any], key_excluded: Any, step: int = 0) -> None:  # noqa: ARG002
+        """Record what the library writes, without the numbers of an update that is recorded already."""
+        self.log({name: value for name, value in key_values.items() if name not in self._of_updates})
+        self._is_update_due = True
+
+    def write_update(self, key_values: Mapping[str, Any]) -> None:
+        """Record the numbers of an update, after each time that the library writes."""
+        if not self._of_updates:
+            self._of_updates = {name for name in key_values if name.startswith("train/")}
+        if self._is_update_due:
+            self.log({name: value for name, value in key_values.items() if name in self._of_updates})
+            self._is_update_due = False
+
+    def log(self, key_values: Mapping[str, Any]) -> None:
         """Record numbers and texts by name; figures, pictures, films and histograms are left out."""
         for name, value in key_values.items():
             is_number = isinstance(value, int | float | np.number) or (

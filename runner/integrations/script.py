@@ -13,13 +13,13 @@ import atexit
 import os
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from gymnasium.spaces import Discrete
 from gymnasium.vector import VectorEnv
 
-from runner.errors import ConfigError, RunnerError
+from runner.errors import ConfigError, nearest
 from runner.integrations.hooks import WatchedEnvironment, hook_environments, open_runs
 from runner.loops.description import Described
 from runner.loops.env import record
@@ -105,11 +105,14 @@ class ScriptRun:
     ) -> None:
         if unknown := sorted(options.keys() - OPTIONS):
             expected = ", ".join(sorted(OPTIONS))
-            raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {expected}")
+            hint = nearest(unknown[0], {*OPTIONS, "monitor_gym", "recordings"})
+            raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {expected}.{hint}")
         self._options = options
         self.settings: dict[str, Any] = dict(settings or {})
         self.name, self.takes_writers = name, takes_writers
         self.closed = self.has_writer = False
+        self.log_last: Callable[[], None] = lambda: None
+        """Logs what is known at the end only; called before the run is closed."""
         self._recordings, self._has_environment = recordings, has_environment
         self._tags = tuple(tag for tag in tags if is_tag(tag))
         if left_out := [tag for tag in tags if not is_tag(tag)]:
@@ -164,7 +167,8 @@ class ScriptRun:
     def _do(self, method: str, arguments: tuple[Any, ...], step: int | None) -> None:
         """Call a method of the recording's `Messages`, now or when there is a recording."""
         if self.closed:
-            raise RunnerError(f"run {self.run_id} is closed: nothing more can be logged into it.")
+            self.warn_once(f"run {self.run_id} is closed: values that are logged now are not recorded.")
+            return
         if self._is_foreign:
             self.warn_once(f"run {self.run_id} belongs to the process that this one was forked from.")
             return
@@ -193,10 +197,10 @@ class ScriptRun:
         else:
             loop.messages.log(loop.active_phase, STEP_NAME, step)
 
-    def warn_once(self, message: str) -> None:
-        """Warn the user of something once."""
-        if message not in self._warnings:
-            self._warnings.add(message)
+    def warn_once(self, message: str, about: str = "") -> None:
+        """Warn the user of something once: of this message, or of what it is about."""
+        if (about or message) not in self._warnings:
+            self._warnings.add(about or message)
             warn_user(message)
 
     # --- the recording ------------------------------------------------------------------------------------
@@ -285,6 +289,12 @@ class ScriptRun:
             return
         recorder: Any = record_vector if isinstance(env, VectorEnv) else record
         given = self._arguments()
+        missed = 0 if isinstance(env, VectorEnv) else _elapsed_steps(env)
+        if missed:
+            self.warn_once(
+                f"run {self.run_id} records {env} from this reset on. It was stepped before the run began: "
+                f"{missed:,} steps of its last episode, and any earlier episodes, are not in this run."
+            )
         recorded = recorder(env, self._recordings, run_id=self.run_id, **given, **self._options)
         self._watched = WatchedEnvironment(env, recorded)
         self._begin_own(recorded._loop)
@@ -296,6 +306,7 @@ class ScriptRun:
         if self.closed or self._is_foreign:
             return self.run
         try:
+            self.log_last()
             if self.is_waiting:
                 if not self._waiting and (self._has_joined or not self.settings):
                     return None  # there is nothing to record
@@ -321,6 +332,14 @@ class ScriptRun:
     def disown(self) -> None:
         """Leave the run to the process that this one was just forked from."""
         self._is_foreign = True
+
+
+def _elapsed_steps(env: Any) -> int:
+    """Return the steps since the last reset, as a `TimeLimit` counts them; 0 if none does."""
+    try:
+        return env.get_wrapper_attr("_elapsed_steps") or 0
+    except AttributeError:
+        return 0
 
 
 def script_name() -> str:

@@ -142,6 +142,7 @@ class Tracked:
         self.project, self.group, self.job_type, self.tags = project, group, job_type, tuple(tags)
         self.disabled = is_disabled
         self.config, self.summary = Config(self), Summary()
+        script.log_last = self._log_summary
         self.expects_writer = False
         """Whether the script's `SummaryWriter` is to write into the run."""
         self.step = 0
@@ -269,12 +270,14 @@ class Tracked:
                 "sync_tensorboard: found no SummaryWriter of PyTorch or tensorboardX when init was called, "
                 "expected it to be imported before."
             )
-        if not (self.script.closed or self.disabled):
-            for name, value in self.summary.own.items():
-                self._log(f"summary/{name}", value, None)
         self.script.close(status, error)
         if run is self:
             run = None
+
+    def _log_summary(self) -> None:
+        if not self.disabled:
+            for name, value in self.summary.own.items():
+                self._log(f"summary/{name}", value, None)
 
     def __getattr__(self, name: str) -> Any:
         if name in _NO_EFFECT:
@@ -423,8 +426,8 @@ def __getattr__(name: str) -> Any:
     if name in ("config", "summary"):
         return getattr(_open_run(name), name)
     raise AttributeError(
-        f"runner.integrations.wandb has no {name!r}, but {', '.join(_SUPPORTED)}; "
-        "for what else it has, import wandb itself"
+        f"runner.integrations.wandb does not have {name!r}. It has {', '.join(_SUPPORTED)}. "
+        "To use more of wandb, import the package itself next to it."
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from runner.config.loading import packing_from
 from runner.config.sections import Recording
-from runner.errors import ConfigError
+from runner.errors import ConfigError, nearest
 from runner.loops.description import Described
 from runner.runs.run import Run
 from runner.runs.shards import find_joined
@@ -24,6 +24,11 @@ MADE_BY: Final = "runner.record"
 ALL_INFO: Final = "*"
 """Among the names of info fields: all of them."""
 PACKING: Final = ("compression", "level", "index", "chunk_steps", "code", "system", "console")
+_ARGUMENTS: Final = (
+    *("recordings", "name", "seed", "config", "info", "make", "frames_every", "frame_format", "frames_of"),
+    *("join", "phase", "shard", "on_error"),
+)
+"""The other arguments of `record`, of which a misspelt one may be meant."""
 _STEPS: Final = ("all", "actions", "none")
 
 
@@ -124,7 +129,8 @@ def options_of(
     run_id = packing.pop("run_id", None)
     if unknown := sorted(set(packing) - set(PACKING)):
         expected = ", ".join(("steps", *PACKING))
-        raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {expected}")
+        hint = nearest(unknown[0], ("steps", *PACKING, *_ARGUMENTS))
+        raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {expected}.{hint}")
     if isinstance(info, str) and info != ALL_INFO:
         raise ConfigError(f"info: found {info!r}, expected a list of names, such as [{info!r}]")
     mapping = as_mapping({} if config is None else config)

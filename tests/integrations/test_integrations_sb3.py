@@ -145,6 +145,36 @@ def test_the_logger_and_the_settings_are_recorded(recordings):
     assert callback.run.facts["seed"] == 4
 
 
+@pytest.mark.parametrize("log_interval", [1, 2])
+def test_the_numbers_of_an_update_stand_at_its_step_once(recordings, log_interval):
+    losses: dict[int, float] = {}
+
+    class Updates(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def note(self):
+            if "train/loss" in self.logger.name_to_value:
+                losses[self.num_timesteps] = self.logger.name_to_value["train/loss"]
+
+        _on_rollout_start = _on_training_end = note
+
+    callback = Recording()
+    model = PPO("MlpPolicy", "CartPole-v1", seed=4, **SMALL)
+    model.learn(256, callback=[Updates(), callback], log_interval=log_interval)
+    with runner.open_recording(callback.run.recording) as recording:
+        scalars = list(recording.decoded(recording.topic("/scalar")))
+    found = [(one["step"], one["value"]) for one in scalars if one["name"] == "train/loss"]
+    steps = range(64 * log_interval, 257, 64 * log_interval)
+    assert found == [(step, losses[step]) for step in steps]
+
+
+def test_the_last_checkpoint_is_the_only_one_of_its_step(recordings):
+    callback = Recording(checkpoint_every=64)
+    PPO("MlpPolicy", "CartPole-v1", seed=4, **SMALL).learn(128, callback=callback)
+    assert [one.step for one in callback.run.checkpoints()] == [64, 128]
+
+
 def test_checkpoints_are_the_policy(recordings):
     model = PPO("MlpPolicy", "CartPole-v1", seed=4, **SMALL)
     callback = Recording(checkpoint_every=100)

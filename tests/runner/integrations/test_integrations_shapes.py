@@ -162,6 +162,58 @@ def test_only_the_environment_that_is_reset_first_is_recorded_and_the_next_gets_
     assert the_run().summary["train_steps"] == 1
 
 
+def test_environments_that_are_not_recorded_give_one_warning_in_all():
+    with SummaryWriter():
+        make().reset(seed=1)
+        with pytest.warns(RuntimeWarning, match="and no other") as found:
+            make().reset(seed=2)
+        SyncVectorEnv([make] * 2).reset(seed=3)  # a second warning would be an error
+    assert len(found) == 1
+
+
+def test_steps_before_the_writer_was_made_give_a_warning():
+    env = make()
+    env.reset(seed=1)
+    env.step(0)
+    with SummaryWriter():
+        with pytest.warns(RuntimeWarning, match="1 steps of its last episode"):
+            env.reset()
+        env.step(0)
+    assert the_run().summary["train_steps"] == 1
+
+
+def test_values_after_the_end_of_the_run_give_one_warning_and_are_not_recorded():
+    wandb.init()
+    joined = SummaryWriter()
+    joined.add_scalar("a", 1, 1)
+    wandb.finish()
+    writer = SummaryWriter()
+    writer.add_scalar("a", 1, 1)
+    writer.close()
+    for closed in (joined, writer):
+        with pytest.warns(RuntimeWarning, match="is closed"):
+            closed.add_scalar("b", 1, 51)
+        closed.add_histogram("c", np.arange(5))  # a second warning would be an error
+        closed.add_hparams({"lr": 1}, {"d": 1.0})
+    assert [run.summary["logged"] for run in runner.list_runs()] == [{"a": 1.0}] * 2
+
+
+def test_the_summary_of_wandb_is_recorded_without_finish(folder):
+    script = (
+        "from runner.integrations import wandb; wandb.init(); wandb.log({'a': 1}); wandb.summary['best'] = 7"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
+    assert the_run().status == "finished"
+    assert the_run().summary["logged"] == {"a": 1.0, "summary/best": 7.0}
+
+
+def test_the_nearest_of_all_arguments_is_suggested():
+    with pytest.raises(ConfigError, match=r"found the argument 'seeds'.* Did you mean 'seed'\?"):
+        runner.record(make(), seeds=1)
+    with pytest.raises(ConfigError, match=r"Did you mean 'recordings'\?"):
+        SummaryWriter(recording="here")
+
+
 def test_each_writer_has_a_run_of_its_own_with_its_own_environment():
     for seed in (1, 2):
         with SummaryWriter(f"runs/seed{seed}") as writer:
@@ -457,7 +509,7 @@ def test_calls_without_effect_say_so_once_and_unknown_names_what_there_is(monkey
     with pytest.warns(RuntimeWarning, match="wandb.watch does nothing"):
         wandb.watch(None)
     wandb.run.watch(None, log="all")  # a second warning would be an error
-    with pytest.raises(AttributeError, match="has no 'sweep', but Histogram, Image"):
+    with pytest.raises(AttributeError, match="does not have 'sweep'"):
         wandb.sweep  # noqa: B018
     with pytest.raises(AttributeError, match="has no 'log_artifact', but config"):
         wandb.run.log_artifact  # noqa: B018
