@@ -18,6 +18,7 @@ from runner.recording import schema
 from runner.recording.clock import Clock, read_clock
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import Summary
+from runner.recording.shards import Shard
 from runner.runs.checkpoints import Checkpoint, read_checkpoints
 from runner.runs.run import Run
 
@@ -77,6 +78,8 @@ class RunDetails:
 
     checkpoints: tuple[Checkpoint, ...] = ()
     """What a loop kept of its agent."""
+    shards: tuple[Shard, ...] = ()
+    """The processes that recorded a loop together; empty if it was one."""
     clock: Clock | None = None
     """The time that was recorded; None in recordings of earlier versions."""
 
@@ -133,6 +136,7 @@ def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> Ru
                     config if config == recording.config else recording.config,  # the former in better order
                     **done,
                     bytes=recording.size,
+                    shards=recording.shards,
                     clock=read_clock(recording),
                     provenance=recording.provenance,
                     success_events=tuple(recording.environment["success_events"]),

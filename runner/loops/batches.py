@@ -171,7 +171,11 @@ class RecordedBatches(Recorded[BatchRows]):
             if before is not None:
                 self._begin_with(before)
             final = None if finals is None else _numpy(finals)
-            values = self._loop.extras.checked_batch(extras, paid.shape)
+            values = {}
+            try:
+                values = self._loop.extras.checked_batch(extras, paid.shape)
+            except ConfigError as error:
+                self._loop.leave_out(error)
             self._rows.take_batch(seen, done, paid.astype(np.float64, copy=False), ends, cut, final)
             if values:
                 self._loop.extras.put_batch(self._phase, self._rows, values)

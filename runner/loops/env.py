@@ -63,7 +63,10 @@ class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
                     self._loop.activate(self._rows)
                 self._take(action, observation, reward, terminated, truncated)
                 if extras is not None:
-                    self._take_extras(extras)
+                    try:
+                        self._take_extras(extras)
+                    except ConfigError as error:
+                        self._loop.leave_out(error)
             if self._has_messages:
                 self._record_messages(info, terminated or truncated)
         except Exception as error:
@@ -135,8 +138,8 @@ def record(
             the name that `multiprocessing` gave it.
         on_error: what happens if recording fails while the loop runs, because the disk is full or a value
             cannot be recorded: `raise` the error, or `warn` once and go on without recording; the run then
-            has the status failed and says so. A value of `log` and the like that cannot be recorded is left
-            out. Mistakes in these arguments are always raised.
+            has the status failed and says so. A value of `log`, `extras` and the like that cannot be recorded
+            is left out. Mistakes in these arguments are always raised.
         packing: `compression`, `level`, `index`, `chunk_steps` and `code`, as in the section `recording` of a
             file; `code=False` records neither the script nor the state of its git repository. `steps` is
             what is recorded of a step: `all`, `actions`, from which the rest comes again, or `none`.

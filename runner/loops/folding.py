@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from runner.client.outbox import forget_upload
 from runner.config.loading import packing_from
-from runner.errors import ConfigError, RecordingError
+from runner.errors import ConfigError, RecordingError, truncated_message
 from runner.loops.copied_rows import Copied, CopiedMessages, CopiedRows
 from runner.loops.options import PACKING
 from runner.loops.outcomes import Outcomes
@@ -193,11 +193,18 @@ class _Fold:
             result |= {"episodes": recorder.counts["/train/episode"], "steps_recorded": True}
             if self._mdp is not None:
                 result["rewards_off_table"] = off_table
-            if error := self._run.file.summary.error:
-                result["error"] = error
+            if errors := self._errors():
+                result["error"] = truncated_message("; ".join(errors))
             write_result(file, _status(self._run), result)
             before = self._run.file.summary.seconds or 0.0
             return result | {"seconds": before + round(time.monotonic() - started, 3), "bytes": file.size}
+
+    def _errors(self) -> list[str]:
+        """Return the error of the process that began the run, and those of shards with their names."""
+        own = self._run.file.summary.error
+        failed = [shard for shard in shards_of(self._run) if shard.status == "failed"]
+        others = [f"{shard.run_id} failed: {shard.summary.error or 'of unknown cause'}" for shard in failed]
+        return ([own] if own else []) + others
 
     def _facts(self) -> dict[str, str]:
         """Return the metadata record `run`."""

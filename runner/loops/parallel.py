@@ -58,7 +58,10 @@ class RecordedParallel(RecordedAlone[AgentRows]):
                 over = not self.env.agents
                 self._rows.take_game(actions, observations, rewards, terminated, truncated, over)
                 if extras is not None:
-                    self._take_extras(self._extras_by_name(extras))
+                    try:
+                        self._take_extras(self._extras_by_name(extras))
+                    except ConfigError as error:
+                        self._loop.leave_out(error)
             if self._options.info:
                 self._messages.info(self._phase, self._info_by_field(infos))
             if self._options.frames_every:

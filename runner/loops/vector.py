@@ -96,7 +96,10 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
                 self._loop.activate(self._rows)
             self._rows.take(actions, observations, rewards, terminated, truncated, final, states)
             if extras is not None:
-                self._take_extras(extras)
+                try:
+                    self._take_extras(extras)
+                except ConfigError as error:
+                    self._loop.leave_out(error)
         if self._options.info:
             self._messages.info(self._phase, _by_environment(infos))
         if self._options.frames_every:

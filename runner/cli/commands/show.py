@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,9 +23,12 @@ if TYPE_CHECKING:
     from runner.analysis.summary import RecordedExtras, RunDetails
     from runner.recording.reader import Recording
     from runner.recording.run_file import Summary
+    from runner.recording.shards import Shard
     from runner.runs.branches import BranchOrigin
     from runner.runs.run import Run
 
+MAX_PROCESSES: Final = 16
+"""Names of processes shown."""
 MAX_CYCLES: Final = 8
 """Cycles of states shown, in which episodes reach the step limit."""
 
@@ -162,12 +165,23 @@ def _head(details: RunDetails) -> dict[str, str]:
         "damage": run.problem,
         "error": summary.error or "",
         "branch": "" if origin is None else f"of run {origin.run} {origin}",
+        "processes": _processes(details.shards),
         "steps": steps,
         "time": time,
         "digest": summary.content_digest or f"{UNKNOWN} (written when a run ends properly)",
         "file": f"{run.recording}  {size(details.bytes)}" if details.bytes else "no recording",
     }
     return {key: text for key, text in head.items() if text}
+
+
+def _processes(shards: Sequence[Shard]) -> str:
+    """Return the names of the processes that recorded a run, and how they ended if not properly."""
+    ill = [shard for shard in shards[1:] if shard.status != "finished"]  # the run has the status of the first
+    names = [shard.name or "the one that began the run" for shard in shards[:MAX_PROCESSES]]
+    more = [f"{len(shards) - MAX_PROCESSES:,} more"] if len(shards) > MAX_PROCESSES else []
+    ends = [f"{shard.name} {shard.status}" for shard in ill[:MAX_PROCESSES]]
+    ends += [f"{len(ill) - MAX_PROCESSES:,} more"] if len(ill) > MAX_PROCESSES else []
+    return "; ".join(", ".join(part) for part in (names + more, ends) if part)
 
 
 def _loop_results(loop: Summary) -> dict[str, str]:

@@ -155,6 +155,34 @@ def test_values_that_cannot_be_recorded_are_left_out(tmp_path):
     assert run.summary["train_steps"] == 2
 
 
+def test_extras_that_cannot_be_recorded_are_left_out_of_their_step(tmp_path):
+    with runner.record(Odd(until=100), tmp_path / "one", on_error="warn") as rec:
+        rec.reset(seed=0)
+        rec.step(0, extras={"v": 1.0})
+        with pytest.warns(RuntimeWarning, match="a value was left out: extras: found str"):
+            rec.step(0, extras={"v": "x"})
+        rec.step(0, extras={"v": 3.0})
+    run = only_run(tmp_path / "one")
+    assert (run.status, run.summary.train_steps) == ("finished", 3)
+    with open_recording(run.recording) as recording:
+        assert recording.extras("train").at(np.arange(3))["v"].tolist() == [1, None, 3]
+
+    base = SyncVectorEnv([Odd, Odd])
+    with runner.record_vector(base, tmp_path / "vector", on_error="warn") as envs:
+        envs.reset(seed=0)
+        with pytest.warns(RuntimeWarning, match="a value was left out: extras: found shape"):
+            envs.step(np.array([0, 1]), extras={"v": np.zeros(3)})
+    assert only_run(tmp_path / "vector").status == "finished"
+
+    with runner.record_parallel(Leaving(), tmp_path / "game", on_error="warn") as game:
+        game.reset(seed=0)
+        with pytest.warns(RuntimeWarning, match="a value was left out: extras: found 'nobody'"):
+            game.step(
+                {agent: game.action_space(agent).sample() for agent in game.agents}, {"nobody": {"v": 1}}
+            )
+    assert only_run(tmp_path / "game").summary.train_steps == 1
+
+
 def test_errors_of_the_environment_are_raised(tmp_path):
     with pytest.raises(ZeroDivisionError), runner.record(Broken(), tmp_path, on_error="warn") as rec:
         train(rec)

@@ -24,7 +24,7 @@ from runner.loops.folding import fold_if_over
 from runner.recording.reader import open_recording
 from runner.runs.listing import list_runs, run_at
 from runner.runs.shards import RUN_VARIABLE, shards_of
-from tests.runner.loops.making import Rooms
+from tests.runner.loops.making import Rooms, dualtaxi
 
 SPAWN = multiprocessing.get_context("spawn")
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
@@ -254,6 +254,38 @@ def test_a_killed_shard_loses_its_last_second_at_most(tmp_path, after):
             assert steps > 100
             assert victim.status == "interrupted"
     assert verify_by_redoing(run.recording, sample=5).verdict == "reproduced"
+
+
+def fail(how: str) -> None:
+    """Join the run of the parent process, and crash, with or without a `with`."""
+    rec = runner.record(gymnasium.make("CartPole-v1"), join=True)
+    play(rec, 101, 1)
+    if how == "with":
+        with rec:
+            raise RuntimeError("worker died")
+    raise RuntimeError("worker died")
+
+
+@pytest.mark.parametrize(
+    ("how", "ending", "error"),
+    [
+        ("with", "failed", "SpawnProcess-2 failed: RuntimeError: worker died"),
+        ("without", "interrupted", None),  # the exception is not known to the recording
+    ],
+)
+def test_a_crashed_process_is_named_with_its_exception(tmp_path, how, ending, error):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="crashed") as rec:
+        process = SPAWN.Process(target=fail, args=(how,), name="SpawnProcess-2")
+        process.start()
+        process.join(60)
+        play(rec, 100, 0)
+    run = run_at(rec.run.folder)
+    assert (run.status, run.summary.train_steps) == ("finished", 201)
+    shown = dualtaxi(tmp_path, "show", run.run_id).output
+    assert f"the one that began the run, SpawnProcess-2; SpawnProcess-2 {ending}" in shown
+    assert run.summary.error == error
+    with open_recording(run.recording) as recording:
+        assert recording.result.error == error
 
 
 OWNER = """
