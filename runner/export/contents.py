@@ -58,7 +58,9 @@ def require_steps(recording: Recording, purpose: str, may_redo: bool = False) ->
 
 
 def why_no_steps(recording: Recording) -> str:
-    """Return why a recording has no steps, and the command that records them."""
+    """Return why a recording has no steps, and the command that records them, if there is one."""
+    if recording.leaves_out_steps and not (recording.can_train_again or recording.has_actions):
+        return "they were left out (steps: none), and without its actions a loop's steps cannot be done again"
     if recording.leaves_out_steps:
         return (
             f"they were left out (steps: {recording.config['recording']['steps']}); "

@@ -102,7 +102,17 @@ def patch_parts(patch: str) -> dict[str, str]:
     return {path: "".join(lines) for path, lines in parts.items()}
 
 
-def unified_diff(a: str, b: str, path: str) -> list[str]:
-    """Return the lines by which two texts differ, with their context, as a unified diff."""
-    left, right = a.split("\n"), b.split("\n")
-    return list(difflib.unified_diff(left, right, f"A/{path}", f"B/{path}", lineterm=""))
+def unified_diff(a: str | None, b: str | None, path: str) -> list[str]:
+    """Return the lines by which two texts differ, with their context, as a unified diff of a file.
+
+    `git apply` and `patch -p1` accept it; None is a file that is not there.
+    """
+    names = ["/dev/null" if text is None else f"{side}/{path}" for side, text in (("A", a), ("B", b))]
+    texts = [(text or "").split("\n") for text in (a, b)]
+    lines = [[f"{line}\n" for line in text[:-1]] + [last for last in text[-1:] if last] for text in texts]
+    found = []
+    for line in difflib.unified_diff(lines[0], lines[1], names[0], names[1]):
+        found.append(line.removesuffix("\n"))
+        if not line.endswith("\n"):
+            found.append("\\ No newline at end of file")
+    return found

@@ -65,11 +65,9 @@ def _changes(a: Code, b: Code, same_commit: bool) -> Iterator[FileChange]:
     shown = 0
     for path in paths:
         ours, theirs = a.files.get(path), b.files.get(path)
-        if ours is None and theirs is not None and path in b.new:
-            ours = ""
-        elif theirs is None and ours is not None and path in a.new:
-            theirs = ""
-        if ours is not None and theirs is not None:
+        added = ours is None and path in b.new
+        removed = theirs is None and path in a.new
+        if added or removed or (ours is not None and theirs is not None):
             lines = [] if ours == theirs else _compared(ours, theirs, path)
         elif same_commit and parts[0].get(path) != parts[1].get(path):
             lines = _patches(parts[0].get(path), parts[1].get(path))
@@ -80,21 +78,32 @@ def _changes(a: Code, b: Code, same_commit: bool) -> Iterator[FileChange]:
             shown += 1
 
 
-def _compared(a: str, b: str, path: str) -> list[str]:
+def _compared(a: str | None, b: str | None, path: str) -> list[str]:
     """Return the unified diff of two texts; of very long ones that all lines differ."""
-    if max(a.count("\n"), b.count("\n")) < _MAX_COMPARED:
+    ours, theirs = a or "", b or ""
+    if max(ours.count("\n"), theirs.count("\n")) < _MAX_COMPARED:
         return unified_diff(a, b, path)
-    return [*(f"-{line}" for line in a.splitlines()), *(f"+{line}" for line in b.splitlines())]
+    return [*(f"-{line}" for line in ours.splitlines()), *(f"+{line}" for line in theirs.splitlines())]
 
 
 def _patches(a: str | None, b: str | None) -> list[str]:
     """Return how one run's changes since the same commit differ from the other's."""
     if a is None:
-        return (b or "").splitlines()
+        return (b or "").removesuffix("\n").split("\n")
     if b is not None:
         return unified_diff(a, b, "changes since the commit")
+    head, _, hunks = a.removesuffix("\n").partition("\n@@ ")
+    lines = head.split("\n")
+    if not hunks:
+        return lines  # a file without lines, or another mode
     opposite = {"+": "-", "-": "+"}
-    return [opposite.get(line[:1], line[:1]) + line[1:] for line in a.splitlines()]
+    undone = [f"--- {lines[-1][4:]}", f"+++ {lines[-2][4:]}"]
+    for line in f"@@ {hunks}".split("\n"):
+        if line.startswith("@@ "):
+            undone.append(re.sub(r"^@@ -(\S+) \+(\S+) @@", r"@@ -\2 +\1 @@", line))
+        else:
+            undone.append(opposite.get(line[:1], line[:1]) + line[1:])
+    return undone
 
 
 def _change(path: str, lines: Sequence[str], limit: int) -> FileChange:

@@ -192,6 +192,10 @@ def test_without_actions_nothing_comes_again(tmp_path):
         rerecord(run)
     redone = verify_by_redoing(run.recording)
     assert (redone.verdict, redone.reason) == ("impossible", "No steps were recorded.")
+    shown = CliRunner().invoke(cli, ["play", run.run_id, "--recordings", str(tmp_path)])
+    assert shown.exit_code
+    assert "without its actions a loop's steps cannot be done again" in " ".join(shown.output.split())
+    assert "rerecord" not in shown.output
 
 
 def test_values_that_vary_in_size_need_whole_steps(tmp_path):
