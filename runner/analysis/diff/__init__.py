@@ -191,19 +191,43 @@ def _diff_branch(
 
 def _diff_loops(difference: RunDiff, a: Recording, b: Recording) -> RunDiff:
     """Add to the difference of two runs, of which one is a loop, where they diverge."""
-    notes = ["recorded from a loop: what it learned is unknown, so neither a cause nor tables are reported"]
+    notes: list[str] = []
     train = evaluation = None
     if not have_same_spaces(a, b):
         notes.append("the environments have other spaces: no steps are compared")
     elif not difference.same_content:
+        notes += _left_out(a, b)
         train, evaluation = (loop_divergence(a, b, phase) for phase in ("train", "eval"))
         digests = [recording.result.topic_digests for recording in (a, b)]
         if train is evaluation is None and all(digests):
             names = sorted(digests[0].keys() | digests[1].keys())
             differing = [name for name in names if digests[0].get(name) != digests[1].get(name)]
-            if differing:
+            if differing and not any(one.leaves_out_steps for one in (a, b)):
                 notes.append(f"all steps are the same; what differs is in {', '.join(differing)}")
+            elif differing and all(one.has_actions for one in (a, b)):
+                notes.append(f"all actions are the same; what differs is in {', '.join(differing)}")
+        explained = difference.code or any(
+            change.path.split(".")[0] not in NOT_CONTENT for change in difference.config
+        )
+        if (train or evaluation) and not explained:
+            notes.append("how a loop learns is not recorded, so only where they diverge is known, not why")
     return replace(difference, divergence=train, evaluation_divergence=evaluation, notes=notes)
+
+
+def _left_out(a: Recording, b: Recording) -> list[str]:
+    """Return what recordings of loops left out of their steps, and what is compared instead."""
+    notes = []
+    for name, one in (("A", a), ("B", b)):
+        if not one.leaves_out_steps:
+            continue
+        again = f"`dualtaxi rerecord {one.run_id}` records them"
+        if one.has_actions:
+            notes.append(f"{name} holds the actions of its steps alone, which are compared; {again} whole")
+        elif one.can_train_again:
+            notes.append(f"{name} holds no steps, so none are compared; {again}")
+        else:
+            notes.append(f"{name} holds neither steps nor actions, so none are compared")
+    return notes
 
 
 def with_seconds(difference: RunDiff, a: Run, b: Run) -> RunDiff:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from runner.analysis.evaluations import evaluations_of
 from runner.analysis.step_reference import StepRef
 from runner.recording import schema
+from runner.recording.actions import kept_dtype
 from runner.recording.blocks import HEADER_BYTES
 from runner.recording.messages import decode
 from runner.recording.reader import Recording
@@ -52,7 +53,8 @@ class Divergence:
     """Training episode, or trial within the evaluation."""
     t: int
     field: str
-    """Field of the step; `step` where one run ends first; `reset.observation` of the reset before it."""
+    """Field of the step; `step` where one run ends first; `reset.observation` of the reset before it;
+    `digest` where only actions are recorded: observations or rewards of the episode differ by then."""
     a: Any
     b: Any
     a_step: np.void | None = None
@@ -64,6 +66,8 @@ class Divergence:
     """Training episodes before that evaluation; None in training."""
     trained: tuple[int, int] | None = None
     """Training steps before that evaluation, in A and in B; None in training and of loops."""
+    actions_alone: bool = False
+    """Whether actions and ends of episodes were compared, since of a run nothing else is recorded."""
 
     @property
     def reference(self) -> StepRef:
@@ -103,7 +107,7 @@ def first_difference(
 
 def differing_rows(a: Block, b: Block, fields: tuple[str, ...] = FIELDS) -> NDArray[np.bool_]:
     """Return which of two equally long blocks of records differ in any of the fields."""
-    if a.dtype == b.dtype:
+    if a.dtype == b.dtype and "digest" not in (a.dtype.names or ()):
         left, right = (
             np.ascontiguousarray(block).view(np.uint8).reshape(-1, block.itemsize) for block in (a, b)
         )
@@ -120,8 +124,11 @@ def _differs(a: Block, b: Block, name: str) -> NDArray[np.bool_]:
     left, right = a[name], b[name]
     if name in ("explored", "rewards") and a["rewards"].shape != b["rewards"].shape:
         left, right = (left != 0, right != 0) if name == "explored" else (left.sum(1), right.sum(1))
-    differs: NDArray[np.bool_] = np.not_equal(_bits(left), _bits(right)).reshape(len(a), -1)
-    return np.asarray(differs.any(axis=1))
+    differs: NDArray[np.bool_] = np.not_equal(_bits(left), _bits(right)).reshape(len(a), -1).any(axis=1)
+    if name == "digest":  # recorded at some steps only
+        for values in (left, right):
+            differs &= _bits(values).reshape(len(a), -1).any(axis=1)
+    return np.asarray(differs)
 
 
 def _bits(values: NDArray[Any]) -> NDArray[Any]:
@@ -229,8 +236,12 @@ def have_same_spaces(a: Recording, b: Recording) -> bool:
 def loop_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None:
     """Return the first step of a phase at which two recordings in the same spaces diverge.
 
-    If they diverge in what a reset observed, it is the step after it, and the field is `reset.observation`.
+    Where a recording has the actions of its steps alone, these are compared, and the digests of episodes if
+    both have them; None if a recording left its steps out. If they diverge in what a reset observed, it is
+    the step after it, and the field is `reset.observation`.
     """
+    if any(one.leaves_out_steps and not one.has_actions for one in (a, b)):
+        return None
     found = _first_in_phase(a, b, phase)
     if found is None or phase == "train":
         return found
@@ -250,12 +261,35 @@ def _first_in_phase(a: Recording, b: Recording, phase: str) -> Divergence | None
     topics = [recording.topic(f"/{phase}/step") for recording in (a, b)]
     if topics[0] not in a.dtypes:
         return _message_divergence(a, b, phase)
+    if any(recording.has_actions_alone(phase) for recording in (a, b)):
+        return _action_divergence(a, b, phase)
     fields = FIELDS if a.kind in ("job", "step") else _TRANSITION_FIELDS
     streams = [recording.blocks(topic) for recording, topic in zip((a, b), topics, strict=True)]
     found = _divergence(phase, first_difference(streams[0], streams[1], fields), fields)
     if fields is FIELDS:
         return found  # a step has the state before it
     return _reset_divergence(a, b, phase, math.inf if found is None else found.step) or found
+
+
+def _action_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None:
+    """Return where the actions or the episodes of two loops diverge, of which one has its actions alone."""
+    alone = [recording.has_actions_alone(phase) for recording in (a, b)]
+    topics = [recording.topic(f"/{phase}/step") for recording in (a, b)]
+    streams = [
+        recording.actions(phase) if is_alone else recording.blocks(topic)
+        for recording, topic, is_alone in zip((a, b), topics, alone, strict=True)
+    ]
+    dtypes = [recording.dtypes[topic] for recording, topic in zip((a, b), topics, strict=True)]
+    names = set.intersection(*(set(kept_dtype(dtype).names or ()) for dtype in dtypes))
+    fields = (*(name for name in _TRANSITION_FIELDS if name in names), *(["digest"] if all(alone) else []))
+    found = _divergence(phase, first_difference(streams[0], streams[1], fields), fields)
+    if a.kind not in ("job", "step"):
+        found = _reset_divergence(a, b, phase, math.inf if found is None else found.step) or found
+    if found is None:
+        return None
+    if found.field == "digest":
+        found = replace(found, a=found.a.hex(), b=found.b.hex())
+    return replace(found, a_step=None, b_step=None, actions_alone=True)
 
 
 def branch_divergence(a: Recording, b: Recording, origin: BranchOrigin) -> Divergence | None:

@@ -91,7 +91,8 @@ def summary(difference: RunDiff) -> str:
     if is_branch and cause is not None:
         sentences.append(f"{cause.text}.")
     elif divergence is not None and divergence.step:
-        sentences.append(f"Training is the same for {divergence.step:,} steps.")
+        what = "Training takes the same actions" if divergence.actions_alone else "Training is the same"
+        sentences.append(f"{what} for {divergence.step:,} step{'s' if divergence.step > 1 else ''}.")
     elif divergence is not None:
         sentences.append("Training differs from the first step on.")
     elif difference.overlap is not None:
@@ -222,6 +223,12 @@ def loop_divergence_in_words(divergence: Divergence) -> tuple[str, str]:
     if divergence.after is not None:
         episode = f"trial {divergence.episode:,} after {divergence.after:,} training episodes"
     where = f"at {phase} step {divergence.step:,}, of {episode} at time {divergence.t:,}"
+    if divergence.field == "digest":
+        where = f"in {phase}, {episode}, at step {divergence.step:,} at the latest"
+        return f"They diverge {where}", "the actions are the same, but observations or rewards differ"
+    if divergence.field == "step":
+        has, lacks = ("A", "B") if divergence.b == "none" else ("B", "A")
+        return f"They diverge {where}", f"{has} has that step, {lacks} ended before it"
     field = divergence.field.removeprefix("reset.")
     if field != divergence.field:
         where = f"in the reset before {phase} step {divergence.step:,}, of {episode}"

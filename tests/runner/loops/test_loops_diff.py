@@ -139,3 +139,82 @@ def test_diff_names_the_frame_that_differs(tmp_path):
             env.step(1)
     divergence = json.loads(dualtaxi(tmp_path, "diff", "of7", "of8", "--json").stdout)["divergence"]
     assert (divergence["field"], divergence["a"], divergence["b"]) == ("next_observation.picture[3, 4]", 7, 8)
+
+
+def record_pole(folder: Path, name: str, steps: str = "all", change: int = -1, scale: float = 1.0) -> str:
+    """Record three CartPole episodes whose rewards are scaled from step 20 on; return the run's id.
+
+    Args:
+        folder: of the recordings.
+        name: of the run.
+        steps: what is recorded of them.
+        change: the step with the opposite action.
+        scale: of the rewards.
+    """
+    env = gymnasium.make("CartPole-v1")
+    taken = 0
+    env = gymnasium.wrappers.TransformReward(env, lambda reward: reward * (scale if taken > 20 else 1.0))
+    with runner.record(env, folder, name=name, steps=steps, code=False) as rec:
+        rec.reset(seed=0)
+        episodes = 0
+        while episodes < 3:
+            taken += 1
+            *_, terminated, _, _ = rec.step(taken % 2 if taken != change + 1 else 1 - taken % 2)
+            if terminated:
+                rec.reset()
+                episodes += 1
+    return rec.run.run_id
+
+
+def test_loops_recorded_by_their_actions_diverge_where_these_do(tmp_path):
+    for name, options in {"whole": {}, "a": {"steps": "actions"}, "none": {"steps": "none"}}.items():
+        record_pole(tmp_path, name, **options)
+    other = record_pole(tmp_path, "b", "actions", change=17)
+    text = dualtaxi(tmp_path, "diff", "a", "b").stdout
+    assert "Training takes the same actions for 17 steps." in text
+    assert "They diverge at training step 17, of episode 0 at time 17: action is 0 in A, 1 in B." in text
+    assert f"B holds the actions of its steps alone, which are compared; `dualtaxi rerecord {other}`" in text
+    assert "all steps are the same" not in text
+    dualtaxi(tmp_path, "diff", "a", "b", "--html", str(tmp_path / "diff.html"))
+    assert "Action is 0 in A, 1 in B" in (tmp_path / "diff.html").read_text()
+    reply = dualtaxi(tmp_path, "diff", "whole", "b").stdout
+    assert "action is 0 in A, 1 in B." in reply
+    assert "A holds" not in reply
+    for same in ("a", "none"):
+        reply = dualtaxi(tmp_path, "diff", "whole", same)
+        assert (reply.exit_code, "the same, to the last byte" in reply.stdout) == (0, True)
+        assert "Note" not in reply.stdout
+    reply = dualtaxi(tmp_path, "diff", "none", "b").stdout
+    assert "A holds neither steps nor actions, so none are compared." in reply
+    assert "diverge" not in reply
+    assert "all actions are the same" not in reply
+
+
+def test_other_rewards_of_loops_recorded_by_their_actions_are_found(tmp_path):
+    for name, scale in (("a", 1.0), ("b", 2.0)):
+        record_pole(tmp_path, name, "actions", scale=scale)
+    divergence = json.loads(dualtaxi(tmp_path, "diff", "a", "b", "--json").stdout)["divergence"]
+    assert divergence["field"] == "digest"
+    assert divergence["a"] != divergence["b"]
+    with open_recording(runner.find_run("a", tmp_path).recording) as recording:
+        ends = recording.episodes("train")["last_step"]
+    episode = int(np.searchsorted(ends, 20))
+    assert (divergence["episode"], divergence["step"]) == (episode, ends[episode])
+    text = dualtaxi(tmp_path, "diff", "a", "b").stdout
+    assert (
+        f"They diverge in training, episode {episode}, at step {ends[episode]} at the latest: the act" in text
+    )
+
+
+def test_a_loop_that_goes_on_longer_is_named_as_such(tmp_path):
+    for name, steps in (("long", 2), ("short", 1)):
+        with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name=name, code=False) as env:
+            env.reset(seed=0)
+            for _ in range(steps):
+                env.step(0)
+    text = dualtaxi(tmp_path, "diff", "long", "short").stdout
+    assert "Training is the same for 1 step." in text
+    assert (
+        "They diverge at training step 1, of episode 0 at time 1: A has that step, B ended before it." in text
+    )
+    assert "Note: how a loop learns is not recorded" in text
