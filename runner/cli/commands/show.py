@@ -139,6 +139,8 @@ def _parts(details: RunDetails, branches: Mapping[str, BranchOrigin]) -> list[Re
     given = dict(details.config)
     if (frames := given.get("frames")) and isinstance(frames, Mapping) and not frames.get("every"):
         del given["frames"]
+    if given.get("env") == {"id": "none", "kwargs": {}}:  # only values were logged
+        del given["env"]
     config = {key: _yaml(value) for key, value in given.items() if value not in ([], {})}
     parts += [title("Configuration"), facts(config)]
     if details.provenance:
@@ -158,7 +160,9 @@ def _head(details: RunDetails) -> dict[str, str]:
         steps += f"{details.eval_steps:,} of evaluation"
     clock, time = details.clock, ""
     if clock is not None and clock.steps_a_second is not None:
-        time = f"{duration(clock.duration)} recorded, {clock.steps_a_second:,.0f} steps a second"
+        time = f"{duration(clock.duration)} recorded"
+        if details.train_steps or details.eval_steps:
+            time += f", {clock.steps_a_second:,.0f} steps a second"
     head = {
         "run": f"{run.run_id}  {run.title}",
         "status": f"{run.status}, begun {ago} ago{took}",

@@ -622,3 +622,15 @@ def test_a_run_with_pictures_and_actions_alone_is_repaired():
     assert done.exit_code == 0, done.output
     assert "5 pictures" in done.output
     assert "actions" in done.output
+
+
+def test_a_run_without_an_environment_is_shown_without_one(tmp_path, monkeypatch):
+    monkeypatch.setenv("DUALTAXI_RECORDINGS", str(tmp_path))
+    with SummaryWriter(str(tmp_path / "runs" / "x")) as writer:
+        writer.add_scalar("loss", 1.0, 1)
+    shown, verified = (CliRunner().invoke(cli, [command, "@latest"]).output for command in ("show", "verify"))
+    assert "logged loss" in shown
+    assert "id: none" not in shown
+    assert "steps a second" not in shown
+    assert "digest" in verified
+    assert "environment" not in verified
