@@ -217,6 +217,16 @@ def _labelled(runs_of: Sequence[Sequence[RunSeries]], names: Sequence[str]) -> l
             if not key.startswith("recording.")
             and any(values.get(key) != same[0].get(key) for values in same)
         ]
+        if "env.id" in differing:  # the values that repeat it, such as config.env_id, say nothing more
+            differing = [
+                key
+                for key in differing
+                if key == "env.id"
+                or any(
+                    values.get(key) not in (env_id := str(values.get("env.id")), env_id.rpartition(":")[2])
+                    for values in same
+                )
+            ]
         values = ", ".join(f"{key}={own.get(key)}" for key in differing)
         groups.append(_group(f"{name}, {values}" if values else name, runs))
     return groups

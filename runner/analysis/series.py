@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from runner.analysis.axes import EPISODES, STEPS, Axis, Positions, edges_of, positions
 from runner.analysis.evaluations import (
+    RECENT_EPISODES,
     EvaluationRecord,
     TrainingRecord,
     evaluation_records,
@@ -22,7 +23,7 @@ from runner.analysis.evaluations import (
 from runner.environments.naming import event_in_words, spoken
 from runner.errors import RunnerError
 from runner.recording import schema
-from runner.recording.metrics import LARGEST, METRIC_OF, METRICS, SHARES, is_usable
+from runner.recording.metrics import LARGEST, METRIC_OF, METRICS, SHARES, finite_mean, is_usable
 from runner.recording.reader import Recording
 
 Readings = dict[str, dict[str, float]]
@@ -64,6 +65,10 @@ class RunSeries:
     """The axis of the positions."""
     environment: str = ""
     """The environment's id, with its keyword arguments: `FrozenLake-v1 map_name=8x8`."""
+    recent: Readings = field(default_factory=dict)
+    """Means over the last training episodes of a finished loop, those that `ls` and `show` average too."""
+    recent_episodes: int = 0
+    """Number of these episodes."""
 
     @property
     def finished(self) -> bool:
@@ -188,6 +193,8 @@ def read_series(recording: Recording, axis: Axis = EPISODES) -> RunSeries:
     places = positions(recording, axis)
     evaluations = evaluation_records(recording)
     config = recording.config
+    recent: Readings = {}
+    recent_episodes = 0
     if recording.has_reports:
         agents = recording.agents
         exact = {each["evaluation"]: exact_readings(each, agents) for each in recording.optimality()}
@@ -197,6 +204,8 @@ def read_series(recording: Recording, axis: Axis = EPISODES) -> RunSeries:
     else:
         readings = [_single_agent_unnamed(evaluation_readings(each)) for each in evaluations]
         training = _loop_training(recording, places, not_finite)
+        if recording.status == "finished":
+            recent, recent_episodes = _recent_training(recording)
         if left_out := sum(each.not_finite for each in evaluations):
             not_finite["mean_return"] = left_out
         own = config.get("config")
@@ -217,6 +226,8 @@ def read_series(recording: Recording, axis: Axis = EPISODES) -> RunSeries:
         not_finite=dict(not_finite),
         axis=axis,
         environment=_environment(recording),
+        recent=recent,
+        recent_episodes=recent_episodes,
     )
 
 
@@ -331,6 +342,22 @@ def _mean_episodes(
         if means:
             readings["training.mean_return"] = means
     return found
+
+
+def _recent_training(recording: Recording) -> tuple[Readings, int]:
+    """Return mean length and return of the last training episodes of a loop, and how many these are."""
+    total = recording.count(schema.TRAIN_EPISODE)
+    if not total:
+        return {}, 0
+    episodes, agents = recording.episodes("train", max(0, total - RECENT_EPISODES), total), recording.agents
+    lines = agents if len(agents) > 1 else [""]
+    means = {"training.mean_length": {"": finite_mean(episodes["length"])}}
+    means["training.mean_return"] = dict(zip(lines, map(finite_mean, episodes["returns"].T), strict=True))
+    known = {
+        metric: {line: value for line, value in own.items() if value is not None}
+        for metric, own in means.items()
+    }
+    return known, len(episodes)
 
 
 def _mean_scalars(

@@ -15,16 +15,19 @@ from typing import Final
 
 import numpy as np
 
-from runner.analysis.axes import EPISODES
 from runner.analysis.compare import statistics
 from runner.analysis.compare.moments import (
     Measured,
     Moment,
     Seed,
+    few_seeds,
     higher_is_better,
+    last_episodes,
     measured,
+    moment_in_words,
     seed_of,
     seed_order,
+    uneven_ends,
 )
 from runner.analysis.compare.statistics import Estimate, Values
 from runner.analysis.groups import Group
@@ -142,7 +145,7 @@ def compare(
             for metric in results
         ]
     return Comparison(
-        moment=moment.described,
+        moment=moment_in_words(moment, [metric for metric, _ in metrics], groups),
         groups={group.label: [run.run_id for run in group.runs] for group in groups},
         metrics=results,
         notes=[*notes, *_notes(groups, metrics, moment)],
@@ -170,16 +173,24 @@ def _no_values(
 def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: Moment) -> Iterator[str]:
     """Yield what limits the comparison of these groups: environments, metrics, equal contents, few seeds."""
     environments = {
-        group.label: run.config["env"]["id"]
+        (
+            group.label,
+            run.config.get("env", {}).get("id", "") if run.can_train_again else run.environment,
+        ): None
         for group in groups
         for run in group.runs
-        if run.can_train_again and "env" in run.config
     }
-    if len(set(environments.values())) > 1:
-        where = ", ".join(f"{env_id} in {label}" for label, env_id in environments.items())
-        yield f"the environments differ ({where}): their figures do not measure the same"
+    if len({env_id for _, env_id in environments} - {""}) > 1:
+        where = ", ".join(f"{env_id} in {label}" for label, env_id in environments if env_id)
+        yield (
+            f"the environments differ ({where}): their figures do not measure the same; --normalise minmax, "
+            "or a table of scores, compares algorithms that all ran in the same environments"
+        )
     if moment.kind == "last" and all(metric.startswith("training.") for metric, _ in metrics):
-        yield "training is compared, as last reported; --moment area takes the mean over all of it"
+        yield (
+            f"training is compared, {moment_in_words(moment, [metric for metric, _ in metrics], groups)}; "
+            "--moment area takes the mean over all of it"
+        )
     digests = {
         group.label: sorted((run.seed or 0, run.content_digest) for run in group.runs)
         for group in groups
@@ -189,15 +200,7 @@ def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: 
         if digests[a] == digests[b]:
             yield f"{a} and {b} are identical: their runs have the same content, seed by seed"
     seeds = {group.label: len({seed_of(run) for run in group.runs}) for group in groups}
-    few = [group for group in groups if seeds[group.label] < statistics.FEW_SEEDS]
-    if few:
-        listed_groups = ", ".join(f"{group.label} ({seeds[group.label]})" for group in few)
-        loops = all(not run.can_train_again for group in few for run in group.runs)
-        more = "record more, each with a seed of its own" if loops else "`--set 'seeds={count: 10}'` runs ten"
-        yield (
-            f"fewer than {statistics.FEW_SEEDS} seeds in {listed_groups}: bootstrap intervals of so few are "
-            "too narrow (at 4 seeds one of 95 % covers 86 % of the time), so take them as a hint; " + more
-        )
+    yield from few_seeds(groups, seeds)
 
 
 def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> MetricResult:
@@ -206,12 +209,14 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
     present = {label: values for label, values in found.items() if values}
     title, unit = title_of(metric)
     better = higher_is_better(metric, groups)
-    notes += _uneven_ends(groups, metric, line) if moment.kind == "last" else []
+    notes += uneven_ends(groups, metric, line) if moment.kind == "last" else []
     if moment.level is not None:
         better, title, unit = False, f"{title}: first at {moment.level:g}", moment.axis.label
         for label, values in present.items():
             reached = sum(value < statistics.NEVER for _, value in values.values())
             notes.append(f"{label}: {reached} of {len(values)} seeds reach it")
+    if moment.kind == "last" and (episodes := last_episodes(metric, groups)):
+        title = f"{title}, {episodes}"
     sign = -1.0 if better is False else 1.0
     thresholds = _thresholds([value for values in present.values() for _, value in values.values()], sign)
     return MetricResult(
@@ -225,27 +230,6 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
         thresholds=thresholds.tolist(),
         notes=notes,
     )
-
-
-def _uneven_ends(groups: Sequence[Group], metric: str, line: str) -> list[str]:
-    """Return a note if the last evaluation comes after different numbers of episodes, ... in the groups."""
-    curves = [
-        (group.label, points)
-        for group in groups
-        for run in group.runs
-        if run.finished and (points := points_of(run, metric, line, aligned=True))
-    ]
-    last = {label: max(points) for label, points in curves}
-    if len(set(last.values())) < 2:
-        return []
-    axis = groups[0].axis
-    ends = ", ".join(f"after {axis.moment(end)} in {label}" for label, end in last.items())
-    what = "report of training" if metric.startswith("training.") else "evaluation"
-    shared = set.intersection(*(set(points) for _, points in curves))
-    if axis is not EPISODES:  # where runs are interpolated
-        shared = {min(last.values())}
-    hint = f"; --moment {max(shared):.10g} compares after as many" if shared else ""
-    return [f"the last {what} is {ends}{hint}"]
 
 
 def _thresholds(values: Sequence[float], sign: float) -> Values:

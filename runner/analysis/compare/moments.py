@@ -11,7 +11,7 @@ from typing import Final, Literal
 import numpy as np
 
 from runner.analysis.axes import EPISODES, Axis
-from runner.analysis.compare.statistics import NEVER
+from runner.analysis.compare.statistics import FEW_SEEDS, NEVER
 from runner.analysis.groups import Group
 from runner.analysis.series import RunSeries, first_crossing, mean_height, points_of
 from runner.errors import RunnerError
@@ -40,10 +40,10 @@ def higher_is_better(metric: str, groups: Sequence[Group]) -> bool | None:
 class Moment:
     """A moment, or a way to reduce a curve to one number.
 
-    last: the last evaluation. best: the best of all. area: the mean of the curve by the trapezoid rule,
-    over the span that every run covers. position: after `number` training episodes, steps, ...; episodes must
-    have an evaluation there, on other axes a run is interpolated between its readings. crossing: the position
-    at which the curve is first at `level`, coming from the other side.
+    last: the last evaluation, or a loop's last training episodes. best: the best of all. area: the mean of
+    the curve by the trapezoid rule, over the span that every run covers. position: after `number` training
+    episodes, steps, ...; episodes must have an evaluation there, on other axes a run is interpolated between
+    its readings. crossing: the position at which the curve is first at `level`, coming from the other side.
     """
 
     kind: Kind
@@ -70,6 +70,64 @@ class Moment:
                 return f"{self.axis.label} until it is first at {self.level:g}"
 
 
+def moment_in_words(moment: Moment, metrics: Sequence[str], groups: Sequence[Group]) -> str:
+    """Return at which moment these metrics are read: training has no evaluations."""
+    if moment.kind not in ("last", "best") or not all(name.startswith("training.") for name in metrics):
+        return moment.described
+    if moment.kind == "best":
+        return "at the best report of each run's training"
+    ends = {last_episodes(name, groups) for name in metrics}
+    if "" in ends:
+        return "at the end of training, as last reported"
+    return f"the mean over the {listed(sorted(ends))} of training"
+
+
+def last_episodes(metric: str, groups: Sequence[Group]) -> str:
+    """Return how many episodes the last value of a metric averages (`last 100 episodes`); else nothing."""
+    runs = [run for group in groups for run in group.runs if metric in run.recent]
+    counts = sorted({run.recent_episodes for run in runs})
+    if not counts:
+        return ""
+    if counts == [1]:
+        return "last episode"
+    return f"last {f'{counts[0]} to ' if len(counts) > 1 else ''}{counts[-1]} episodes"
+
+
+def few_seeds(groups: Sequence[Group], seeds: Mapping[str, int]) -> list[str]:
+    """Return a note if groups have fewer seeds, by label, than their intervals need."""
+    few = [group for group in groups if seeds[group.label] < FEW_SEEDS]
+    if not few:
+        return []
+    listed_groups = ", ".join(f"{group.label} ({seeds[group.label]})" for group in few)
+    loops = all(not run.can_train_again for group in few for run in group.runs)
+    more = "record more, each with a seed of its own" if loops else "`--set 'seeds={count: 10}'` runs ten"
+    return [
+        f"fewer than {FEW_SEEDS} seeds in {listed_groups}: bootstrap intervals of so few are "
+        "too narrow (at 4 seeds one of 95 % covers 86 % of the time), so take them as a hint; " + more
+    ]
+
+
+def uneven_ends(groups: Sequence[Group], metric: str, line: str) -> list[str]:
+    """Return a note if the last evaluation comes after different numbers of episodes, ... in the groups."""
+    curves = [
+        (group.label, points)
+        for group in groups
+        for run in group.runs
+        if run.finished and (points := points_of(run, metric, line, aligned=True))
+    ]
+    last = {label: max(points) for label, points in curves}
+    if len(set(last.values())) < 2:
+        return []
+    axis = groups[0].axis
+    ends = ", ".join(f"after {axis.moment(end)} in {label}" for label, end in last.items())
+    what = "report of training" if metric.startswith("training.") else "evaluation"
+    shared = set.intersection(*(set(points) for _, points in curves))
+    if axis is not EPISODES:  # where runs are interpolated
+        shared = {min(last.values())}
+    hint = f"; --moment {max(shared):.10g} compares after as many" if shared else ""
+    return [f"the last {what} is {ends}{hint}"]
+
+
 def moment_of(
     moment: str, target: tuple[str, float] | None, chosen: Sequence[str], axis: Axis = EPISODES
 ) -> tuple[Moment, Sequence[str]]:
@@ -86,7 +144,10 @@ def moment_of(
     """
     if target is not None:
         if moment != "last" or chosen:
-            raise RunnerError("target: found a moment or a metric as well, expected it alone.")
+            raise RunnerError(
+                "target: it names its metric and when it is read, so it excludes --metric and --moment; "
+                "drop it or them."
+            )
         metric, level = target
         return Moment("crossing", level=level, axis=axis), (metric,)
     for kind in _OF_WHOLE_RUNS:
@@ -152,7 +213,8 @@ def value_of(
         at = first_crossing(points, moment.level)
         return NEVER if at is None else float(at), ""
     best = min if higher_is_better(metric, groups) is False else max
-    return best(points.values()) if moment.kind == "best" else points[max(points)], ""
+    last = run.recent.get(metric, {}).get(line, points[max(points)])
+    return best(points.values()) if moment.kind == "best" else last, ""
 
 
 def _at(points: Mapping[float, float], moment: Moment) -> float | None:

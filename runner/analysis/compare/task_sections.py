@@ -46,7 +46,8 @@ def summary(comparison: TaskComparison) -> list[str]:
     """Return a sentence for each pair of algorithms, and the notes."""
     pairs = [
         f"{pair.a} scores higher than {pair.b} with a probability of {number(pair.probability.value)}, 95 % "
-        f"{interval(pair.probability)}, over {len(comparison.tasks)} environments."
+        f"{interval(pair.probability)}, over {len(comparison.tasks)} "
+        f"environment{'s' if len(comparison.tasks) != 1 else ''}."
         for pair in comparison.improvements
     ]
     return [*pairs, *(f"Note: {note}." for note in comparison.notes)]

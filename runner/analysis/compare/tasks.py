@@ -16,7 +16,16 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.compare import statistics
-from runner.analysis.compare.moments import Moment, Seed, higher_is_better, measured, seed_of
+from runner.analysis.compare.moments import (
+    Moment,
+    Seed,
+    few_seeds,
+    higher_is_better,
+    measured,
+    moment_in_words,
+    seed_of,
+    uneven_ends,
+)
 from runner.analysis.compare.score_table import MIN_MAX, Bounds
 from runner.analysis.compare.statistics import Estimate, Values
 from runner.analysis.groups import Group, metrics_of
@@ -126,7 +135,8 @@ def compare_tasks(
     better = higher_is_better(metric[0], groups)
     if better is None and table is None:
         own_notes.append(f"higher is taken as better, as nobody can say it of {metric[0]}")
-    bounds = _bounds(tasks, found, table, lower_is_better=better is False)
+    bounds = _bounds(tasks, found, table, better is False, own_notes)
+    tasks = list(bounds)
     scores = {label: {task: bounds[task].score(own[task]) for task in tasks} for label, own in found.items()}
     every = np.concatenate([values for own in scores.values() for values in own.values()])
     thresholds = np.linspace(float(every.min()), float(every.max()), POINTS)
@@ -138,10 +148,15 @@ def compare_tasks(
         for group in groups
     ]
     own_notes += _seed_notes(results)
+    own_notes += few_seeds(groups, {result.label: min(result.seeds.values()) for result in results})
+    if moment.kind == "last":
+        for task in tasks:
+            here = [replace(each, runs=tuple(_runs([each], [task]))) for each in groups]
+            own_notes += [f"{task}: {note}" for note in uneven_ends(here, *metric)]
     return TaskComparison(
         metric=".".join(filter(None, metric)),
         title=title_of(metric[0])[0],
-        moment=moment.described,
+        moment=moment_in_words(moment, [metric[0]], groups),
         normalised_by="the worst and the best value in each environment"
         if table is None
         else "a table: 0 is the random, 1 the expert score",
@@ -191,6 +206,7 @@ def _bounds(
     found: Mapping[str, Mapping[str, Values]],
     table: Mapping[str, Bounds] | None,
     lower_is_better: bool,
+    notes: list[str],
 ) -> dict[str, Bounds]:
     """Return the values of the scores 0 and 1: of the table, or the worst and the best there."""
     if table is not None:
@@ -200,15 +216,24 @@ def _bounds(
             )
         return {task: table[task] for task in tasks}
     bounds = {}
+    equal = []
     for task in tasks:
         values = np.concatenate([own[task] for own in found.values()])
         low, high = float(values.min()), float(values.max())
         if low == high:
-            raise RunnerError(
-                f"normalise: {MIN_MAX}: {task}: found the value {low:g} in every run, expected different "
-                "ones; a table of scores can normalise them."
-            )
-        bounds[task] = Bounds(high, low) if lower_is_better else Bounds(low, high)
+            equal.append(f"{task} ({low:g})")
+        else:
+            bounds[task] = Bounds(high, low) if lower_is_better else Bounds(low, high)
+    if equal and not bounds:
+        raise RunnerError(
+            f"normalise: {MIN_MAX}: found one value in every run, in {listed(equal)}, expected different "
+            "ones; a table of scores can normalise them."
+        )
+    if equal:
+        notes.append(
+            f"left out, as every run has the same value there, so {MIN_MAX} has no scale: {listed(equal)}; a "
+            "table of scores can normalise them"
+        )
     return bounds
 
 

@@ -103,7 +103,7 @@ def compare_command(
       dualtaxi compare first second third --metric mean_length --moment 10000
       dualtaxi compare ppo dqn --at-step 100000
       dualtaxi compare sweep --by discount --target success_percent=80
-      dualtaxi compare ppo dqn --normalise scores.csv --metric mean_return
+      dualtaxi compare ppo dqn --normalise scores.csv --metric training.mean_return
       dualtaxi compare cooperative competitive --html comparison.html
     """
     from runner.analysis.axes import EPISODES, STEPS
@@ -118,7 +118,10 @@ def compare_command(
         require_page(html, force)
     if at_step is not None:
         if moment != "last" or axis is not EPISODES:
-            raise click.UsageError("--at-step: found --moment or --axis as well, expected it alone.")
+            raise click.UsageError(
+                "--at-step stands for --axis steps --moment N, so it excludes --axis and --moment; "
+                "drop it or them."
+            )
         moment, axis = str(at_step), STEPS
     read_at, chosen = moment_of(moment, target, metrics, axis)
     runs = find_all_recorded(run_names, recordings)

@@ -102,7 +102,7 @@ def plot_command(
     with stage_line("drawing"):
         write_new(output, force, lambda path: save(curves_sheet(groups, panels, lines), path))
     count = sum(len(group.runs) for group in groups)
-    text = f"{output}: {len(panels)} metrics of {_runs(count)}"
+    text = f"{output}: {len(panels)} metric{'s' if len(panels) != 1 else ''} of {_runs(count)}"
     print_written(text, as_json, output, metrics=len(panels), runs=count)
 
 

@@ -108,8 +108,8 @@ def footnote(groups: Sequence[Group]) -> str:
         return f"Each line is one run, as reported.{greedy}{left_out}"
     between = " Between its points a run is interpolated." if interpolated else ""
     return (
-        "Lines: interquartile mean of the runs of a configuration that have come as far; bands: its 95 % "
-        "bootstrap interval; below four runs, their mean, and from the lowest to the highest."
+        "A line is the interquartile mean of a configuration's runs at that point, with its 95 % bootstrap "
+        "interval as a band. With fewer than four runs it is their mean, with a band from lowest to highest."
         f"{between}{greedy}{left_out}"
     )
 

@@ -171,7 +171,7 @@ def test_groups_are_by_configuration_without_environment_or_by_a_path():
     ("table", "expected"),
     [
         ({"Cart": Bounds(0, 1)}, "the table has no row for Lake, Hill; it has Cart"),
-        (None, "Cart: found the value 5 in every run"),
+        (None, r"one value in every run, in Cart \(5\)"),
     ],
 )
 def test_what_cannot_be_normalised_is_refused(table, expected):
@@ -289,3 +289,44 @@ def test_what_the_command_cannot_normalise_is_reported(folder, words, expected):
     assert refused.exit_code == 2
     assert expected in refused.stderr
     assert "Traceback" not in refused.output
+
+
+def test_training_is_compared_by_the_mean_of_the_last_100_episodes(tmp_path):
+    returns = {}
+    for name, episodes in (("short", 12), ("long", 130)):
+        for env_id in ("CartPole-v1", "FrozenLake-v1"):
+            config = {"algorithm": name, "env_id": env_id}
+            with runner.record(
+                gymnasium.make(env_id), tmp_path / "r", name=name, seed=0, config=config
+            ) as env:
+                own = returns[name, env_id] = []
+                for k in range(episodes):
+                    env.reset(seed=k)
+                    total, done = 0.0, False
+                    while not done:  # to the left: FrozenLake never pays
+                        _, reward, terminated, truncated, _ = env.step(
+                            0 if "Lake" in env_id or k % 3 else k % 2
+                        )
+                        total, done = total + reward, terminated or truncated
+                    own.append(total)
+    mean = {name: np.mean(returns[name, "CartPole-v1"][-100:]) for name in ("short", "long")}
+
+    def compared_as(*options):
+        words = ["compare", "short", "long", "--recordings", str(tmp_path / "r"), *options]
+        found = CliRunner().invoke(cli, words)
+        assert found.exit_code == 0, found.output
+        return found.stdout
+
+    plain = json.loads(compared_as("--json"))
+    values = {group["label"]: group["values"][0] for group in plain["metrics"][0]["groups"]}
+    assert sorted(values.values()) == pytest.approx(sorted([0, 0, *mean.values()]))
+    assert not any("env_id" in label for label in values)
+    assert any("--normalise minmax" in note for note in plain["notes"])
+    text = compared_as("--normalise", "minmax")
+    assert "the mean over the last 12 to 100 episodes of training" in text
+    assert "last evaluation" not in text
+    assert "every run has the same value there, so minmax has no scale: FrozenLake-v1" in text
+    assert "fewer than 10 seeds in short (1), long (1)" in text
+    assert "CartPole-v1: the last report of training is after 12 training episodes in short" in text
+    bounds = json.loads(compared_as("--normalise", "minmax", "--json"))["tasks"]["CartPole-v1"]
+    assert sorted(bounds.values()) == pytest.approx(sorted(mean.values()))
