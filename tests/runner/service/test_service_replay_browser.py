@@ -191,10 +191,10 @@ def test_a_branch_is_listed_by_its_parent_and_shown_next_to_it(tmp_path):
             assert compared.status_code == 200
             for name, place in zip((run.run_id, branch), places, strict=True):
                 assert f"/api/v1/runs/{name}/replay/{place}" in compared.text
-        assert f"Branch of {run.run_id} at 2:3, action 0, then constant" in own
+        assert f"Branch of {run.run_id} at 2:3, action 0 (left), then constant" in own
         assert tried not in own
         divergence = client.get(f"/compare/divergence?run={run.run_id}&run={trained}").text
-        assert "B is a branch of A, at 2:3, action 0, then constant" in divergence
+        assert "B is a branch of A, at 2:3, action 0 (left), then constant" in divergence
         assert f"/runs/{run.run_id}/rerun?at=2%3A" in divergence
         assert f"/runs/{trained}/rerun?at=0%3A" in divergence
         for branch, episode, t in ((trained, "2", 3), (tried, "eval:4:1", 2)):

@@ -67,7 +67,7 @@ def test_the_learning_curves_are_those_of_the_runs(results, done):
     assert {run.run_id for run in best.runs} == set(results.ranking[0].runs.values())
     panel = panel_of("training.mean_reward", panels)
     curve = next(curve for curve in panel.curves if groups[curve.group] is best)
-    assert curve.median[-1] == pytest.approx(results.ranking[0].median)
+    assert curve.middle[-1] == pytest.approx(results.ranking[0].median)
 
 
 @pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
