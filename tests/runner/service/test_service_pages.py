@@ -290,7 +290,7 @@ def test_a_form_of_another_site_is_refused(client):
 
 
 def test_a_job_is_shown_and_cancelled(client):
-    text = "name: shown\nmode: cooperative\nepisodes: 1000000\n"
+    text = "name: shown\nmode: cooperative\nepisodes: 1000000\nrecording: {steps: none}\n"
     answer = client.post("/submit", data={"text": text}, headers=ACCEPT_HTML, follow_redirects=False)
     assert answer.headers["location"] == "/queue/1"
     assert "episodes: 1000000" in page_of(client, "/queue/1")
