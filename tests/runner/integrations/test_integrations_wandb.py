@@ -1,0 +1,268 @@
+"""Scripts that log in the shape of wandb."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from gymnasium.vector import SyncVectorEnv
+from scripts import SETTINGS, arrays, images, learn, make, scalars, texts, the_run
+
+import runner
+from runner.cli import cli
+from runner.errors import ConfigError, RunnerError
+from runner.execution.redo import verify_by_redoing
+from runner.integrations import wandb
+from runner.integrations.tensorboard import SummaryWriter
+
+
+def test_a_script_of_wandb_is_recorded_whole_by_the_import():
+    wandb.init(
+        project="cartpole",
+        entity="me",
+        config=SimpleNamespace(**SETTINGS),
+        name="a run",
+        group="seeds",
+        tags=["baseline"],
+        notes="the first",
+        monitor_gym=True,
+        save_code=True,
+    )
+    run_id = wandb.run.id
+    envs = SyncVectorEnv([make] * 2)
+    learn(envs, lambda step, value: wandb.log({"losses": {"value": value}, "global_step": step}))
+    wandb.finish()
+    run = the_run()
+    assert (run.run_id, run.name, run.seed, run.note) == (run_id, "a-run", 3, "the first")
+    assert run.tags == ("baseline", "group=seeds", "project=cartpole")
+    assert run.facts["config"]["config"] == SETTINGS
+    assert run.summary["train_steps"] == 100
+    assert scalars(run)[-2:] == [("losses/value", 1 / 50, 100), ("global_step", 100.0, 100)]
+    assert verify_by_redoing(run.recording).verdict == "reproduced"
+    assert wandb.run is None
+
+
+def test_a_writer_logs_into_the_run_of_wandb_and_its_end_is_finish():
+    wandb.init(project="both", sync_tensorboard=True, config=SETTINGS)
+    writer = SummaryWriter("runs/other")
+    learn(make(), lambda step, value: writer.add_scalar("loss", value, step))
+    writer.close()
+    assert the_run().status == "running"
+    wandb.finish()
+    assert (the_run().name, the_run().summary["logged"]["loss"]) == ("both", 1 / 50)
+
+
+def test_settings_are_read_and_changed_by_item_and_attribute():
+    run = wandb.init(config={"lr": 0.1})
+    wandb.config.batch = 32
+    wandb.config["layers"] = [64, 64]
+    wandb.config.update({"lr": 0.2}, allow_val_change=True)
+    wandb.config.setdefaults({"lr": 0.3, "gamma": 0.9})
+    assert (wandb.config.lr, wandb.config["batch"], run.config.get("none", 7)) == (0.2, 32, 7)
+    with pytest.raises(AttributeError, match="config has no 'rate', but lr, batch"):
+        wandb.config.rate  # noqa: B018
+    wandb.log({"loss": 1.0})
+    wandb.finish()
+    expected = {"lr": 0.2, "batch": 32, "layers": [64, 64], "gamma": 0.9}
+    assert the_run().facts["config"]["config"] == expected
+
+
+def test_settings_that_json_cannot_hold_become_text_with_one_warning():
+    with pytest.warns(RuntimeWarning, match=r"config: device, model\.activation are recorded as text"):
+        wandb.init(config={"device": object(), "model": {"activation": len}, "array": np.arange(2), "f": 1.5})
+    wandb.log({"loss": 1.0})
+    wandb.finish()
+    found = the_run().facts["config"]["config"]
+    assert found["array"] == [0, 1]
+    assert found["model"]["activation"] == "<built-in function len>"
+
+
+def test_settings_after_the_recording_began_are_logged_as_text():
+    wandb.init()
+    env = make()
+    env.reset(seed=0)
+    with pytest.warns(RuntimeWarning, match="found settings after the recording began"):
+        wandb.config.late = 5
+    wandb.finish()
+    assert texts(the_run())["config"] == '{"late": 5}'
+
+
+def test_steps_are_counted_where_no_environment_is_recorded():
+    wandb.init(project="regression", monitor_gym=False)
+    wandb.log({"a": 0.0})
+    wandb.log({"a": 1.0}, commit=False)
+    wandb.log({"b": 1.0})
+    wandb.log({"a": 7.0}, step=7)
+    wandb.log({"a": 8.0}, step=7)
+    wandb.finish()
+    assert scalars(the_run()) == [
+        ("a", 0.0, 0),
+        ("a", 1.0, 1),
+        ("b", 1.0, 1),
+        ("a", 7.0, 7),
+        ("a", 8.0, 7),
+    ]
+
+
+def test_values_of_every_kind_are_logged():
+    wandb.init(monitor_gym=False)
+    wandb.log({"image": wandb.Image(np.zeros((4, 4), np.uint8), caption="black")})
+    wandb.log({"pair": [wandb.Image(np.zeros((4, 4, 3))), wandb.Image(np.ones((4, 4, 3)))]})
+    wandb.log({"film": wandb.Video(np.zeros((3, 3, 4, 4), np.uint8), fps=5)})
+    wandb.log({"histogram": wandb.Histogram([1, 2, 3]), "given": wandb.Histogram(np_histogram=([1], [0, 2]))})
+    wandb.log({"table": wandb.Table(columns=["a", "b"], data=[[1, "x"]]), "text": "hello", "array": [1, 2]})
+    with pytest.warns(RuntimeWarning, match="found object for 'thing', which is recorded as text"):
+        wandb.log({"thing": object()})
+    with pytest.warns(RuntimeWarning, match="None is not recorded, first found for 'nothing'"):
+        wandb.log({"nothing": None})
+    wandb.finish()
+    run = the_run()
+    assert [name for name, *_ in images(run)] == ["image", "pair/0", "pair/1", "film"]
+    assert texts(run)["image/caption"] == "black"
+    assert texts(run)["table"] == '{"columns": ["a", "b"], "data": [[1, "x"]]}'
+    assert set(arrays(run)) >= {"histogram/counts", "given/edges", "array"}
+
+
+def test_a_summary_has_the_last_values_and_what_the_script_puts_there():
+    with wandb.init(monitor_gym=False) as run:
+        run.log({"loss": 0.5})
+        assert run.summary["loss"] == 0.5
+        run.summary["best"] = 3
+    assert the_run().summary["logged"] == {"loss": 0.5, "summary/best": 3.0}
+
+
+def test_calls_without_effect_say_so_once_and_unknown_names_what_there_is(monkeypatch):
+    monkeypatch.setattr(wandb, "_warned", set())
+    wandb.init()
+    with pytest.warns(RuntimeWarning, match="wandb.watch does nothing"):
+        wandb.watch(None)
+    wandb.run.watch(None, log="all")  # a second warning would be an error
+    with pytest.raises(AttributeError, match="does not have 'sweep'"):
+        wandb.sweep  # noqa: B018
+    with pytest.raises(AttributeError, match="has no 'log_artifact', but config"):
+        wandb.run.log_artifact  # noqa: B018
+    wandb.finish()
+    with pytest.raises(ConfigError, match="found the argument 'projekt', expected one of"):
+        wandb.init(projekt="x")
+
+
+def test_there_must_be_a_run():
+    for use in (lambda: wandb.log({"a": 1}), lambda: wandb.config, lambda: wandb.summary):
+        with pytest.raises(RunnerError, match="no run is open: call wandb"):
+            use()
+    wandb.finish()
+
+
+def test_a_second_init_returns_the_open_run_or_finishes_it():
+    first = wandb.init(monitor_gym=False)
+    with pytest.warns(RuntimeWarning, match="is still open, and is returned"):
+        assert wandb.init() is first
+    first.log({"a": 1.0})
+    second = wandb.init(reinit=True, monitor_gym=False)
+    second.log({"a": 2.0})
+    wandb.finish(exit_code=1)
+    assert {run.run_id: run.status for run in runner.list_runs()} == {
+        first.id: "finished",
+        second.id: "failed",
+    }
+
+
+def test_disabled_records_nothing(folder):
+    wandb.init(mode="disabled", config={"a": 1})
+    wandb.log({"a": 1.0})
+    make().reset(seed=0)
+    wandb.finish()
+    assert runner.list_runs() == []
+
+
+def test_another_writer_is_followed(monkeypatch):
+    tensorboard = pytest.importorskip("tensorboardX")
+    assert sys.modules["tensorboardX.writer"]
+    wandb.init(project="synced", sync_tensorboard=True, monitor_gym=False)
+    with tensorboard.SummaryWriter("runs/x") as writer:
+        writer.add_scalar("loss", 0.5, 7)
+    wandb.finish()
+    assert scalars(the_run()) == [("loss", 0.5, 7)]
+    with tensorboard.SummaryWriter("runs/x") as writer:
+        writer.add_scalar("loss", 0.5, 8)
+    assert len(runner.list_runs()) == 1
+
+
+SCRIPT = """
+import gymnasium, os, sys
+from runner.integrations import wandb
+wandb.init(project="end")
+env = gymnasium.make("CartPole-v1")
+env.reset(seed=0)
+env.step(0)
+wandb.log({"loss": 0.5})
+"""
+
+
+@pytest.mark.parametrize(
+    ("ending", "status", "error"),
+    [("", "finished", None), ("1 / 0", "failed", "ZeroDivisionError"), ("os._exit(1)", "interrupted", None)],
+)
+def test_a_script_that_does_not_finish_its_run(ending, status, error, folder):
+    (folder / "script.py").write_text(SCRIPT + "import time; time.sleep(1.5)\n" + ending)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run([sys.executable, "script.py"], capture_output=True, check=False, env=environment)
+    run = the_run()
+    assert run.status == status
+    assert error is None or error in run.summary["error"]
+    with runner.open_recording(run.recording) as recording:
+        assert recording.count(recording.topic("/train/step")) == 1
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
+def test_a_forked_process_logs_nothing(folder):
+    program = """
+    pid = os.fork()
+    if not pid:
+        import warnings
+        warnings.simplefilter("error", DeprecationWarning)
+        wandb.log({"loss": 1.0})
+        env.step(0)
+        other = gymnasium.make("CartPole-v1")
+        other.reset()
+        sys.exit()
+    os.waitpid(pid, 0)
+    wandb.log({"loss": 2.0})
+    """
+    (folder / "script.py").write_text(SCRIPT + textwrap.dedent(program))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(
+        [sys.executable, "script.py"], capture_output=True, check=True, env=environment, text=True
+    )
+    assert "belongs to the process that this one was forked from" in done.stderr
+    assert [value for _, value, _ in scalars(the_run())] == [0.5, 2.0]
+    assert the_run().summary["train_steps"] == 1
+
+
+def test_a_run_with_pictures_and_actions_alone_is_repaired():
+    with SummaryWriter("runs/pictured", steps="actions") as writer:
+        learn(make(), lambda step, value: writer.add_image("view", np.zeros((3, 4, 4), np.uint8), step))
+    path = the_run().recording
+    os.truncate(path, path.stat().st_size - 1000)
+    done = CliRunner().invoke(cli, ["repair", "pictured"])
+    assert done.exit_code == 0, done.output
+    assert "5 pictures" in done.output
+    assert "actions" in done.output
+
+
+def test_a_run_without_an_environment_is_shown_without_one(tmp_path, monkeypatch):
+    monkeypatch.setenv("DUALTAXI_RECORDINGS", str(tmp_path))
+    with SummaryWriter(str(tmp_path / "runs" / "x")) as writer:
+        writer.add_scalar("loss", 1.0, 1)
+    shown, verified = (CliRunner().invoke(cli, [command, "@latest"]).output for command in ("show", "verify"))
+    assert "logged loss" in shown
+    assert "id: none" not in shown
+    assert "steps a second" not in shown
+    assert "digest" in verified
+    assert "environment" not in verified
