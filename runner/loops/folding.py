@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 
 from runner.client.outbox import forget_upload
 from runner.config.loading import packing_from
-from runner.errors import ConfigError, RecordingError, truncated_message
+from runner.errors import RecordingError, truncated_message
+from runner.loops.copied_extras import CopiedExtras
 from runner.loops.copied_rows import Copied, CopiedMessages, CopiedRows
 from runner.loops.options import PACKING
 from runner.loops.outcomes import Outcomes
 from runner.loops.shard_sources import PHASES, Source
 from runner.recording import schema
-from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAME_LENGTH, MAX_NAMES, ExtraLayout
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.messages import decode, encode, encode_image, encode_log, frame_id, frame_place
 from runner.recording.metadata import json_object, sizes_of, write_result
@@ -294,7 +294,7 @@ class _Fold:
         recorder, copied = self._recorder, Copied(self._first.kind, self._mdp)
         kind = CopiedMessages if copied.kind == "variable" else CopiedRows
         rows = {phase: kind(recorder, copied, phase) for phase in PHASES}
-        extras = _CopiedExtras(recorder, self._sources)
+        extras = CopiedExtras(recorder, self._sources)
         active, copied_steps, total = rows["train"], 0, sum(self._totals.values())
         for unit in self._units:
             phase, source = PHASES[unit["phase"]], self._sources[unit["source"]]
@@ -410,70 +410,3 @@ class _Fold:
         elif source is (self._main if topic == schema.CLOCK_TOPIC else self._sources[0]):
             # Of a machine or a process, such as what it printed.
             yield place, encode(topic.message, fields)
-
-
-class _CopiedExtras:
-    """The extras of all processes, with the names of all of them."""
-
-    def __init__(self, recorder: Recorder, sources: Sequence[Source]) -> None:
-        self._recorder = recorder
-        self._own = {
-            (source.number, phase): source.recording.extras(phase) for source in sources for phase in PHASES
-        }
-        dtypes: dict[str, np.dtype[Any]] = {}
-        self._names: dict[tuple[int, str], str] = {}
-        """The names in the run, by number of the process and its own name."""
-        for (number, _), own in self._own.items():
-            for name, dtype in own.items():
-                new = name
-                if dtypes.get(name, dtype).shape != dtype.shape:
-                    new = f"{name} ({sources[number].name})"[:MAX_NAME_LENGTH]
-                before = dtypes.get(new, dtype)
-                dtypes[new] = np.dtype((np.promote_types(before.base, dtype.base), dtype.shape))
-                self._names[number, name] = new
-        self._layout = ExtraLayout(0, np.dtype(list(dtypes.items())))
-        if len(dtypes) > MAX_NAMES or self._layout.values.itemsize > MAX_EXTRA_BYTES:
-            raise ConfigError(
-                f"extras: found {len(dtypes)} names and {self._layout.values.itemsize:,} bytes a step in all "
-                f"shards, expected at most {MAX_NAMES} and {MAX_EXTRA_BYTES:,}"
-            )
-        self._is_described = False
-
-    def copy(
-        self, source: Source, phase: str, numbers: NDArray[np.int64], new_step: int, new_position: int
-    ) -> None:
-        """Copy the extras of some steps, which follow each other in the run.
-
-        Args:
-            source: of the process.
-            phase: `train` or `eval`.
-            numbers: of the steps, as their process counted them.
-            new_step: the number of the first step in the run.
-            new_position: the steps of the run before it.
-        """
-        own = self._own[source.number, phase]
-        if not own:
-            return
-        values = {self._names[source.number, name]: each for name, each in own.at(numbers).items()}
-        given = {
-            name: ~np.ma.getmaskarray(each).reshape(len(numbers), -1)[:, 0] for name, each in values.items()
-        }
-        rows = np.flatnonzero(np.logical_or.reduce(list(given.values())))
-        if not len(rows):
-            return
-        if not self._is_described:
-            payload = encode(schema.EXTRA_COLUMNS, {"json": self._layout.json})
-            self._recorder.append(schema.EXTRA_COLUMNS_TOPIC, payload, new_position + int(rows[0]) + 1)
-            self._recorder.flush_messages()
-            topics = (schema.TRAIN_EXTRA, schema.EVAL_EXTRA)
-            self._recorder.resize(dict.fromkeys(topics, self._layout.sizes))
-            self._is_described = True
-        topic = schema.TRAIN_EXTRA if phase == "train" else schema.EVAL_EXTRA
-        while len(rows):
-            block = self._recorder.block(topic)[: len(rows)]
-            part, rows = rows[: len(block)], rows[len(block) :]
-            block["step"] = new_step + part
-            for name in self._layout.names:
-                block["given"][name] = given[name][part] if name in given else False
-                block["values"][name] = values[name].data[part] if name in given else 0
-            self._recorder.take(topic, (new_position + part + 1).astype(np.uint64))
