@@ -30,6 +30,7 @@ ORDER = """
     client
     loops
     integrations
+    debugging
     golden
     service
     api

@@ -28,7 +28,6 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "sweep": ("sweep", "Run an experiment with many values, and rank them."),
         "resume": ("resume", "Resume an interrupted run, to the same content as an undisturbed one."),
         "evaluate": ("resume", "Evaluate a run's Q-table at any step in new episodes."),
-        "branch": ("branch", "Take another action at a recorded step, and play on."),
         "rerecord": ("resume", "Record the steps of a run that was recorded without them."),
     },
     "Inspect": {
@@ -46,6 +45,9 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "values": ("checkpoints", "Compute what a checkpoint's agent thinks along an old episode."),
         "qtable": ("tables", "Show the exact Q-table of a run at any step."),
         "table": ("tables", "Print an environment's transition table with names."),
+    },
+    "Debug": {
+        "branch": ("branch", "Take another action at a recorded step, and play on."),
     },
     "Manage": {
         "label": ("catalogue", "Change the name, note and tags of a run."),

@@ -1,0 +1,1 @@
+"""Questions about how a run learned: what if, when, why, which change."""
