@@ -11,10 +11,10 @@ import numpy as np
 from gymnasium import ActionWrapper, spaces
 from gymnasium.wrappers import StickyAction
 
+from runner.environments.gym_types import Space
 from runner.environments.naming import spoken
 from runner.errors import ConfigError, nearest
 from runner.recording.gym_json import registered, value_of
-from runner.recording.gym_spaces import Space
 from runner.recording.maker import MAX_NAMES
 from runner.util.values import is_text
 

@@ -14,6 +14,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
+from runner.environments.gym_types import AnyVectorEnv, Space
 from runner.errors import ConfigError, RunnerError
 from runner.loops.batch_rows import BatchRows
 from runner.loops.loop import Loop
@@ -23,12 +24,11 @@ from runner.loops.recorded import Recorded
 from runner.loops.values import as_array, check_phase
 from runner.loops.vector import autoreset_mode_of, described_vector, first_of, require_fixed
 from runner.loops.vector_counts import Flags
-from runner.recording.gym_spaces import Space
 from runner.recording.gym_values import element_of
 from runner.runs.run import Run
 
 
-class NamedEnvironments(VectorEnv[Any, Any, Any]):
+class NamedEnvironments(AnyVectorEnv):
     """Environments that exist only as arrays: what a recording says of them."""
 
     def __init__(
@@ -46,7 +46,7 @@ class RecordedBatches(Recorded[BatchRows]):
 
     def __init__(
         self,
-        envs: VectorEnv[Any, Any, Any] | str,
+        envs: AnyVectorEnv | str,
         mode: AutoresetMode,
         own_spaces: tuple[Space | None, Space | None],
         options: Options,
@@ -66,7 +66,7 @@ class RecordedBatches(Recorded[BatchRows]):
             )
         raise AttributeError(name)
 
-    def _open(self, envs: VectorEnv[Any, Any, Any]) -> None:
+    def _open(self, envs: AnyVectorEnv) -> None:
         """Begin the run, now that the environments and their spaces are known."""
         with first_of(envs) as first:
             described = described_vector(envs, first)
@@ -231,7 +231,7 @@ class RecordedBatches(Recorded[BatchRows]):
 
 
 def record_batches(
-    envs: VectorEnv[Any, Any, Any] | str,
+    envs: AnyVectorEnv | str,
     recordings: str | os.PathLike[str] | None = None,
     *,
     observation_space: Any = None,

@@ -10,10 +10,11 @@ from typing import Any, Final
 
 from gymnasium import spaces
 
+from runner.environments.gym_types import Space
 from runner.environments.loading import mdp_of
 from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
-from runner.recording.gym_spaces import Space, describe_space, parts_of
+from runner.recording.gym_spaces import describe_space, parts_of
 from runner.recording.metadata import Attachments, environment_attachments
 from runner.util.jsonable import as_json
 

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import gymnasium
 from gymnasium.vector import VectorEnv
 
+from runner.environments.gym_types import Env
 from runner.errors import ConfigError
 from runner.loops.description import describe
 from runner.loops.generators import GeneratorWatch
@@ -26,11 +27,11 @@ from runner.runs.run import Run
 class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
     """A Gymnasium environment whose every reset and step is recorded; made by `record`."""
 
-    env: gymnasium.Env[Any, Any]
+    env: Env
 
     def __init__(
         self,
-        env: gymnasium.Env[Any, Any],
+        env: Env,
         loop: Loop[Rows],
         phase: str = "train",
         owner: RecordedEnv | None = None,
@@ -87,7 +88,7 @@ class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def record(
-    env: gymnasium.Env[Any, Any],
+    env: Env,
     recordings: str | os.PathLike[str] | None = None,
     *,
     name: str | None = None,
@@ -200,7 +201,7 @@ def _is_vec_env(env: object) -> bool:
     return module is not None and isinstance(env, module.VecEnv)
 
 
-def _record_into_run(env: gymnasium.Env[Any, Any], into: RecordedEnv, phase: str, make: str) -> RecordedEnv:
+def _record_into_run(env: Env, into: RecordedEnv, phase: str, make: str) -> RecordedEnv:
     """Return an environment recorded into the run of another one."""
     if not isinstance(into, RecordedEnv):
         raise ConfigError(f"into: found {type(into).__name__}, expected what runner.record returned")

@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
+from runner.environments.gym_types import AnyVectorEnv
 from runner.loops.vec_env import mode_of
 from runner.recording.reset_states import SEED_BYTES, STEPS_BETWEEN, ResetState
 
@@ -92,7 +93,7 @@ class VectorWatch:
     """
 
     def __init__(
-        self, envs: VectorEnv[Any, Any, Any], first: Any, autoreset: AutoresetMode, sparse: bool = False
+        self, envs: AnyVectorEnv, first: Any, autoreset: AutoresetMode, sparse: bool = False
     ) -> None:
         base: Any = envs.unwrapped
         self._watches: list[GeneratorWatch] = []

@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv
+from gymnasium.vector import AutoresetMode, VectorActionWrapper
 
+from runner.environments.gym_types import AnyVectorEnv
 from runner.errors import ConfigError
 from runner.loops.actions import action_names
 from runner.loops.vec_env import LIBRARY, VecEnvVector, mode_of
@@ -111,7 +112,7 @@ def _with_spec(
 
 
 def vector_maker_of(
-    envs: VectorEnv[Any, Any, Any], first: Any, autoreset: AutoresetMode, make: str = ""
+    envs: AnyVectorEnv, first: Any, autoreset: AutoresetMode, make: str = ""
 ) -> EnvironmentMaker:
     """Return how a vector environment was made.
 

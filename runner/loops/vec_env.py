@@ -5,13 +5,15 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+
+from runner.environments.gym_types import AnyVectorEnv
 
 LIBRARY: Final = "stable-baselines3"
 _MODES: Final = {"DummyVecEnv": "sync", "SubprocVecEnv": "async"}
 
 
-class VecEnvVector(VectorEnv[Any, Any, Any]):
+class VecEnvVector(AnyVectorEnv):
     """The environments of a `VecEnv` without wrappers, as a vector that resets itself within a step.
 
     A `DummyVecEnv` rounds rewards to float32. As long as this object is open they are kept as they came, and

@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
+from runner.environments.gym_types import AnyVectorEnv
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, describe
 from runner.loops.generators import States, VectorWatch
@@ -35,11 +36,11 @@ else:
 class RecordedVector(Recorded[VectorRows], _Wrapper):
     """A vector environment whose every reset and step is recorded; made by `record_vector`."""
 
-    env: VectorEnv[Any, Any, Any]
+    env: AnyVectorEnv
 
     def __init__(
         self,
-        env: VectorEnv[Any, Any, Any],
+        env: AnyVectorEnv,
         loop: Loop[VectorRows],
         mode: AutoresetMode,
         watch: VectorWatch,
@@ -175,7 +176,7 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
 
 
 def record_vector(
-    envs: VectorEnv[Any, Any, Any],
+    envs: AnyVectorEnv,
     recordings: str | os.PathLike[str] | None = None,
     *,
     name: str | None = None,
@@ -265,9 +266,7 @@ def record_vector(
     return RecordedVector(envs, loop, mode, watch, phase)
 
 
-def autoreset_mode_of(
-    envs: VectorEnv[Any, Any, Any] | None, chosen: AutoresetMode | str | None
-) -> AutoresetMode:
+def autoreset_mode_of(envs: AnyVectorEnv | None, chosen: AutoresetMode | str | None) -> AutoresetMode:
     """Return how environments reset themselves: as chosen, else as their metadata states.
 
     Raises:
@@ -290,7 +289,7 @@ def autoreset_mode_of(
     return stated
 
 
-def described_vector(envs: VectorEnv[Any, Any, Any], first: Any) -> Described:
+def described_vector(envs: AnyVectorEnv, first: Any) -> Described:
     """Return the description of a vector environment; `first` is its first environment."""
     registered = first if getattr(envs, "spec", None) is None else envs
     described = describe(registered, *spaces_of_one(envs))
@@ -298,7 +297,7 @@ def described_vector(envs: VectorEnv[Any, Any, Any], first: Any) -> Described:
 
 
 @contextlib.contextmanager
-def first_of(envs: VectorEnv[Any, Any, Any]) -> Iterator[Any]:
+def first_of(envs: AnyVectorEnv) -> Iterator[Any]:
     """Yield the first environment of a vector, or the vector if it has none of its own.
 
     Those of an AsyncVectorEnv are in other processes, which end if a registration cannot be sent; so one is

@@ -13,10 +13,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector.utils import iterate
 
+from runner.environments.gym_types import Space
 from runner.errors import ConfigError
 from runner.util.jsonable import as_json
 
-Space = spaces.Space[Any]
 _MAX_REPR: Final = 1000
 
 

@@ -15,13 +15,13 @@ from typing import Any, Final
 import numpy as np
 from gymnasium import spaces
 
+from runner.environments.gym_types import Space
 from runner.errors import EnvironmentNotUsable
 from runner.recording.gym_json import registered, structure_of, text_of
 from runner.recording.spaces import MAX_VALUE_BYTES
 from runner.util.jsonable import as_json
 from runner.util.values import is_text
 
-Space = spaces.Space[Any]
 Description = Mapping[str, Any]
 Keys = tuple[str | int, ...]
 _MAX_TEXT: Final = 4096

@@ -9,8 +9,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.environments.gym_types import Space
 from runner.errors import RecordingError
-from runner.recording.gym_spaces import Part, Space, parts_of
+from runner.recording.gym_spaces import Part, parts_of
 from runner.recording.spaces import MAX_VALUE_BYTES, encode_text
 
 SCALARS: Final = (np.bool_, *(np.dtype(code).type for code in "bBhHiIlLqQefd"))

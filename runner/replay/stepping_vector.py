@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.environments.gym_types import Space
 from runner.errors import CannotRedo
 from runner.recording import schema
-from runner.recording.gym_spaces import Space
 from runner.recording.gym_values import filler, leaves_of, put_chosen
 from runner.recording.reader import Recording
 from runner.replay.recorded import RecordedReset
