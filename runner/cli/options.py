@@ -360,6 +360,15 @@ def workers_option(default: int | str) -> Decorator:
     )
 
 
+ray_option: Final = click.option(
+    "--ray",
+    is_flag=False,
+    flag_value="",
+    metavar="[ADDRESS]",
+    help="Run on Ray: on the cluster at ADDRESS, or on this machine.",
+)
+
+
 def target_option(multiple: bool) -> Decorator:
     """Return the option --target: a level of a metric; runs are compared when they first reach it."""
     return click.option(

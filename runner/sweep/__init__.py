@@ -7,6 +7,7 @@ objective   readings of a metric during a run, and what a run is worth
 task        one run, as a worker does it
 local       worker processes on this machine
 cluster     the same on Ray
+pool        the workers that a command uses, of either kind
 state       a sweep on disk: its resolved file, and locks; progress follows from its runs
 trials      trials, and what is recorded of them
 running     the loop that gives batches of runs to workers

@@ -10,12 +10,11 @@ import os
 import socket
 import threading
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar
+from typing import Any, Concatenate, Final, Generic, ParamSpec, Self, TypeVar
 
 from runner.errors import RunnerError
-from runner.sweep.local import CLOSE_SECONDS
-from runner.sweep.task import Result, Task, run_task
+from runner.sweep.local import CLOSE_SECONDS, R, Work
+from runner.sweep.local import T as TaskT
 from runner.util.extras import require
 
 _CONNECT_SECONDS: Final = 5.0
@@ -98,11 +97,11 @@ def start_actor(ray: Any) -> Any:
     return ray.remote(RayActor).options(num_cpus=1, max_concurrency=3, max_restarts=0).remote()
 
 
-def _run(actor: RayActor, task: Task) -> Result:
-    return run_task(task, actor.stop)
+def _run(actor: RayActor, task: Work) -> Any:
+    return task.run(actor.stop)
 
 
-class RayWorkers:
+class RayWorkers(Generic[TaskT, R]):
     """Actors of Ray, started when they are needed; each keeps what it has loaded.
 
     Args:
@@ -121,22 +120,22 @@ class RayWorkers:
         self._count = max(1, min(count or processors, limit))
         self._on_own_disk = address is not None
         self._idle: list[Any] = []
-        self._busy: dict[Any, tuple[Any, Task]] = {}
+        self._busy: dict[Any, tuple[Any, TaskT]] = {}
 
     @property
     def idle(self) -> int:
         """The number of tasks that can be started now."""
         return self._count - len(self._busy)
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: TaskT) -> None:
         """Start a task on an idle worker."""
         actor = self._idle.pop() if self._idle else start_actor(self._ray)
-        remote = replace(task, on_own_disk=self._on_own_disk, threads=False)
+        remote = task.placed(threads=False, on_own_disk=self._on_own_disk)
         self._busy[actor.run.remote(_run, remote)] = actor, task
 
-    def collect(self, seconds: float) -> list[tuple[Task, Result | None]]:
+    def collect(self, seconds: float) -> list[tuple[TaskT, R | None]]:
         """Wait up to this time for tasks to end; return them with their results (None if the worker died)."""
-        done: list[tuple[Task, Result | None]] = []
+        done: list[tuple[TaskT, R | None]] = []
         ready = self._ray.wait(list(self._busy), timeout=seconds)[0] if self._busy else []
         for reference in ready:
             actor, task = self._busy.pop(reference)

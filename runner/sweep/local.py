@@ -6,34 +6,46 @@ import contextlib
 import multiprocessing
 import os
 import signal
-from dataclasses import replace
+from collections.abc import Callable
 from multiprocessing import connection
-from typing import Any, Final, Protocol, Self
-
-from runner.sweep.task import Result, Task, run_task
+from typing import Any, Final, Generic, Protocol, Self, TypeVar
 
 CLOSE_SECONDS: Final = 30.0
 """The time that a worker has to close its recording before it is killed."""
 
 
-class Workers(Protocol):
-    """Workers that run tasks, on this machine or on others."""
+class Work(Protocol):
+    """A task for workers, which goes to them by pickle; so does its result."""
+
+    def placed(self, threads: bool, on_own_disk: bool = False) -> Self:
+        """Return the task for a worker with several processors, or with a disk of its own."""
+
+    def run(self, stop: Callable[[], bool]) -> Any:
+        """Return the result; `stop` is called every few milliseconds, and returns whether to stop."""
+
+
+T = TypeVar("T", bound=Work)
+R = TypeVar("R")
+
+
+class Workers(Protocol[T, R]):
+    """Workers that run tasks T with results R, on this machine or on others."""
 
     @property
     def idle(self) -> int:
         """The number of tasks that can be started now."""
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: T) -> None:
         """Start a task on an idle worker."""
 
-    def collect(self, seconds: float) -> list[tuple[Task, Result | None]]:
+    def collect(self, seconds: float) -> list[tuple[T, R | None]]:
         """Wait up to this time for tasks to end; return them with their results (None if the worker died)."""
 
     def stop(self) -> None:
         """Make every worker close its recording and return its task as interrupted."""
 
 
-class LocalWorkers:
+class LocalWorkers(Generic[T, R]):
     """Processes, started when they are needed.
 
     Args:
@@ -45,30 +57,30 @@ class LocalWorkers:
         # Fresh interpreters: a fork would copy locks that threads of this one hold.
         self._context = multiprocessing.get_context("spawn")
         self._stopping = self._context.Event()
-        self._idle: list[_Worker] = []
-        self._busy: dict[Any, tuple[_Worker, Task]] = {}
+        self._idle: list[_Worker[R]] = []
+        self._busy: dict[Any, tuple[_Worker[R], T]] = {}
 
     @property
     def idle(self) -> int:
         """The number of tasks that can be started now."""
         return self._count - len(self._busy)
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: T) -> None:
         """Start a task on an idle worker."""
-        local = replace(task, threads=self._count < (os.cpu_count() or 1))
+        local = task.placed(threads=self._count < (os.cpu_count() or 1))
         while self._idle:
             worker = self._idle.pop()
             if worker.send(local):
                 break
             worker.end()
         else:
-            worker = _Worker(self._context, self._stopping)
+            worker = _Worker[R](self._context, self._stopping)
             worker.send(local)  # `collect` notices if it is dead already
         self._busy[worker.pipe] = worker, task
 
-    def collect(self, seconds: float) -> list[tuple[Task, Result | None]]:
+    def collect(self, seconds: float) -> list[tuple[T, R | None]]:
         """Wait up to this time for tasks to end; return them with their results (None if the worker died)."""
-        done: list[tuple[Task, Result | None]] = []
+        done: list[tuple[T, R | None]] = []
         for pipe in connection.wait(list(self._busy), seconds) if self._busy else ():
             worker, task = self._busy.pop(pipe)
             result = worker.receive()
@@ -90,7 +102,7 @@ class LocalWorkers:
             worker.end()
 
 
-class _Worker:
+class _Worker(Generic[R]):
     """A process and the pipe to it."""
 
     def __init__(self, context: Any, stopping: Any) -> None:
@@ -101,7 +113,7 @@ class _Worker:
         self._process.start()
         theirs.close()
 
-    def send(self, task: Task) -> bool:
+    def send(self, task: Work) -> bool:
         """Send a task; return False if the process is dead."""
         try:
             self.pipe.send(task)
@@ -109,10 +121,10 @@ class _Worker:
             return False
         return True
 
-    def receive(self) -> Result | None:
+    def receive(self) -> R | None:
         """Return the result of the task; None if the process died."""
         try:
-            result: Result = self.pipe.recv()
+            result: R = self.pipe.recv()
         except (EOFError, OSError):
             self.end()
             return None
@@ -133,4 +145,4 @@ def serve(pipe: Any, stopping: Any) -> None:
     parent = os.getppid()
     with contextlib.suppress(EOFError, OSError):
         while True:
-            pipe.send(run_task(pipe.recv(), lambda: stopping.is_set() or os.getppid() != parent))
+            pipe.send(pipe.recv().run(lambda: stopping.is_set() or os.getppid() != parent))

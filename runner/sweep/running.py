@@ -55,7 +55,7 @@ Limit = Callable[[SweepStatus, Task], str]
 def run_sweep(
     sweep: Sweep,
     recordings: Path,
-    workers: Workers,
+    workers: Workers[Task, Result],
     *,
     stop: Callable[[], bool] = lambda: False,
     report: Callable[[SweepStatus], None] = lambda _: None,
@@ -96,7 +96,7 @@ class _Runner:
         self,
         sweep: Sweep,
         recordings: Path,
-        workers: Workers,
+        workers: Workers[Task, Result],
         *,
         stop: Callable[[], bool],
         report: Callable[[SweepStatus], None],

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,7 @@ from runner.cli.options import (
     force_option,
     json_option,
     markdown_option,
+    ray_option,
     recordings_option,
     workers_option,
 )
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from runner.sweep.model import Sweep
     from runner.sweep.plan import Plan
     from runner.sweep.running import SweepStatus
+    from runner.sweep.task import Result, Task
     from runner.sweep.trials import Trials
 
 
@@ -55,13 +57,7 @@ def sweep_command() -> None:
 @sweep_command.command("run")
 @click.argument("file", metavar="FILE", type=ConfigName("sweep"))
 @workers_option("one per processor")
-@click.option(
-    "--ray",
-    is_flag=False,
-    flag_value="",
-    metavar="[ADDRESS]",
-    help="Run on Ray: on the cluster at ADDRESS, or on this machine.",
-)
+@ray_option
 @click.option("--resume", "is_resumed", is_flag=True, help="Resume a sweep.")
 @click.option("--retry-failed", is_flag=True, help="With --resume: retry failed runs.")
 @accept_changes_option
@@ -103,6 +99,7 @@ def run(
     from runner.sweep import state
     from runner.sweep.loading import load_sweep
     from runner.sweep.plan import limit_of, plan_of, require_disk
+    from runner.sweep.pool import worker_pool
     from runner.sweep.running import run_sweep
     from runner.sweep.search import require_optuna
 
@@ -119,8 +116,9 @@ def run(
         require_disk(plan, before, folder)
         started = f"; {before:,} started before" if before else ""
         say(f"{sweep.name}: {plan.runs:,} runs, about {size(plan.bytes)}{started}.")
+        pool_context: AbstractContextManager[Workers[Task, Result]] = worker_pool(workers, ray, plan.runs)
         with (
-            _worker_pool(workers, ray, plan.runs) as pool,
+            pool_context as pool,
             interruptible(second=signal.SIG_DFL) as interrupt,
             _live_status(sweep) as report,
         ):
@@ -223,22 +221,6 @@ def ls(recordings: Path | None, as_json: bool) -> None:
         click.echo("\n".join(names))
     else:
         say("No sweeps yet. `dualtaxi sweep run FILE` starts one.")
-
-
-@contextlib.contextmanager
-def _worker_pool(count: int | None, ray: str | None, runs: int) -> Iterator[Workers]:
-    """Yield the workers, at most one per run."""
-    if ray is None:
-        from runner.sweep.local import LocalWorkers
-
-        with LocalWorkers(min(count or os.cpu_count() or 1, runs)) as local:
-            yield local
-    else:
-        from runner.sweep.cluster import RayWorkers
-
-        # Ray prints messages about dead workers on stdout, which is for results only.
-        with contextlib.redirect_stdout(sys.stderr), RayWorkers(count, ray or None, runs) as remote:
-            yield remote
 
 
 @contextlib.contextmanager

@@ -84,13 +84,13 @@ def _locked_sweep(spec: JobSpec, stop: Callable[[], bool]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _workers(spec: JobSpec, channel: PipeChannel, runs: int) -> Iterator[Workers]:
+def _workers(spec: JobSpec, channel: PipeChannel, runs: int) -> Iterator[Workers[Task, Result]]:
     """Yield what runs the sweep's tasks: processes of this machine within the slots, or a cluster."""
     if spec.ray is not None:
-        with RayWorkers(None, spec.ray, runs) as remote:
+        with RayWorkers[Task, Result](None, spec.ray, runs) as remote:
             yield remote
         return
-    with LocalWorkers(runs) as local:
+    with LocalWorkers[Task, Result](runs) as local:
         yield SlottedWorkers(local, channel)
 
 
@@ -102,7 +102,7 @@ class SlottedWorkers:
         channel: the source of the number of slots; receives how many are in use.
     """
 
-    def __init__(self, workers: Workers, channel: PipeChannel) -> None:
+    def __init__(self, workers: Workers[Task, Result], channel: PipeChannel) -> None:
         self._workers, self._channel = workers, channel
         self._busy, self._sent = 0, (0, 0)
 
