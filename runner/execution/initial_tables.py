@@ -64,18 +64,29 @@ def address(run: Run, recordings: Path) -> str:
 
 
 def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Held] | None:
-    """Return what the learners of the run in a job's `initial_q` held; None if it has none.
+    """Return what the learners of the run in a job's `initial_q` held; see `tables_of`."""
+    return tables_of(job.config, mdp, run.folder.parent, exclude=run.run_id)
+
+
+def tables_of(config: ExperimentConfig, mdp: Mdp, recordings: Path, exclude: str = "") -> list[Held] | None:
+    """Return what the learners of the run in `initial_q` held; None if the configuration has none.
+
+    Args:
+        config: the configuration.
+        mdp: its environment.
+        recordings: the folder to find the run in.
+        exclude: the id of a run that is never meant.
 
     Raises:
         RunnerError: there is no such run or step, or its tables have another shape.
     """
-    start = job.config.initial_q
+    start = config.initial_q
     if not isinstance(start, RunTable):
         return None
-    source = find_run(start.run, run.folder.parent, exclude=run.run_id)
+    source = find_run(start.run, recordings, exclude=exclude)
     with open_recording(at_hand(source).recording) as recording:
         held = held_at(recording, last_step(recording) if start.step is None else start.step)
-    joint = job.config.tables == "joint"
+    joint = config.tables == "joint"
     shapes = [(mdp.states, n) for n in ([mdp.joint_actions] if joint else mdp.action_counts)]
     found = [one["q"].shape for one in held]
     if found != shapes:

@@ -108,8 +108,13 @@ class Learner:
         self._mark_success(episodes[:ended])
         return filled, ended
 
-    def begin_evaluation(self) -> None:
-        """Fix the policy to evaluate: greedy in the present tables, the learned one, or random."""
+    def begin_evaluation(self, trial: int | None = None) -> None:
+        """Fix the policy to evaluate: greedy in the present tables, the learned one, or random.
+
+        The next trial is number `trial`, counted over the run; by default the one after the last.
+        """
+        if trial is not None:
+            self._eval_cursor["episode"] = trial
         if not self.rules.learns or len(self.rules.algorithm) == algorithms.WOLF_PHC:
             self._policy.fill(kernel.DRAWN if self.rules.learns else -1)
             return

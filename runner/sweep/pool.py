@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import sys
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 
 from runner.sweep.local import LocalWorkers, R, T, Workers
 
 
-@contextlib.contextmanager
-def worker_pool(count: int | None, ray: str | None, tasks: int) -> Iterator[Workers[T, R]]:
-    """Yield workers, at most one per task.
+def worker_pool(
+    count: int | None, ray: str | None, tasks: int
+) -> AbstractContextManager[Workers[T, R], None]:
+    """Return workers, at most one per task; Ray prints messages about workers that died on stdout.
 
     Args:
         count: the maximum number of workers; None for one per processor.
@@ -24,12 +23,7 @@ def worker_pool(count: int | None, ray: str | None, tasks: int) -> Iterator[Work
         RunnerError: the cluster cannot be reached.
     """
     if ray is None:
-        with LocalWorkers[T, R](min(count or os.cpu_count() or 1, tasks)) as local:
-            yield local
-        return
+        return LocalWorkers(min(count or os.cpu_count() or 1, tasks))
     from runner.sweep.cluster import RayWorkers
 
-    with contextlib.redirect_stdout(sys.stderr):  # Ray's messages about dead workers are no results
-        cluster: RayWorkers[T, R] = RayWorkers(count, ray or None, tasks)
-        with cluster as remote:
-            yield remote
+    return RayWorkers(count, ray or None, tasks)

@@ -7,7 +7,6 @@ import dataclasses
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -116,9 +115,10 @@ def run(
         require_disk(plan, before, folder)
         started = f"; {before:,} started before" if before else ""
         say(f"{sweep.name}: {plan.runs:,} runs, about {size(plan.bytes)}{started}.")
-        pool_context: AbstractContextManager[Workers[Task, Result]] = worker_pool(workers, ray, plan.runs)
+        pool: Workers[Task, Result]
         with (
-            pool_context as pool,
+            contextlib.redirect_stdout(sys.stderr),  # Ray prints messages about workers that died
+            worker_pool(workers, ray, plan.runs) as pool,
             interruptible(second=signal.SIG_DFL) as interrupt,
             _live_status(sweep) as report,
         ):

@@ -1,0 +1,300 @@
+"""Training mixtures of two configurations on the workers of sweeps, without recording them.
+
+A run is trained up to its end and evaluated there once, in the trials of the evaluation that a recorded run
+has at that episode: its readings are those of the recorded run. What was measured is kept in a file, by the
+identity of its job, and never measured again.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+from blake3 import blake3
+from numpy.typing import NDArray
+
+from runner.config import ExperimentConfig, from_mapping
+from runner.config.job import identity_of
+from runner.debugging.factors import Mixing
+from runner.environments.loading import load_mdp
+from runner.environments.mdp import Mdp
+from runner.errors import RunnerError
+from runner.execution.initial_tables import tables_of
+from runner.execution.session import evaluation_metrics
+from runner.learning.learner import Learner
+from runner.planning import ExactEvaluator
+from runner.recording import schema
+from runner.recording.blocks import blank_records, topic_sizes
+from runner.sweep.local import Workers
+from runner.sweep.objective import readings
+from runner.util.files import storage_errors
+from runner.util.values import finite
+from runner.util.version import __version__
+
+VALUES: Final = "values.jsonl"
+MAX_LINE: Final = 1 << 20
+MAX_BYTES: Final = 1 << 30
+"""Bytes of a file of values that are read."""
+TASK_SECONDS: Final = 0.4
+"""The time that a task should take: seeds are trained in batches, so that handing them over costs little."""
+_BLOCK_STEPS: Final = 4096
+_WAIT_SECONDS: Final = 0.2
+
+Readings = Mapping[str, float | None]
+"""The metrics of an evaluation by name; None for one that is not finite."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The result of a task."""
+
+    readings: Mapping[int, Readings] = field(default_factory=dict)
+    """By seed; seeds that were not finished are missing."""
+    seconds: float = 0.0
+    """The time that the last of them took."""
+    error: str = ""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A task: train a configuration with some seeds to its end, and evaluate there."""
+
+    mixture: int
+    config: dict[str, Any]
+    seeds: tuple[int, ...]
+    recordings: str
+
+    def placed(self, threads: bool, on_own_disk: bool = False) -> Self:  # noqa: ARG002
+        """Return the task: it runs in one thread, and writes nothing."""
+        return self
+
+    def run(self, stop: Callable[[], bool]) -> Measured:
+        """Return what was measured; errors that a user can fix become a result."""
+        found: dict[int, Readings] = {}
+        seconds = 0.0
+        try:
+            config = from_mapping(self.config)
+            for seed in self.seeds:
+                began = time.perf_counter()
+                measured = measure(config, seed, Path(self.recordings), stop)
+                if measured is None:
+                    break
+                found[seed] = measured
+                seconds = time.perf_counter() - began
+        except RunnerError as error:
+            return Measured(found, seconds, str(error))
+        return Measured(found, seconds)
+
+
+def measure(
+    config: ExperimentConfig, seed: int, recordings: Path, stop: Callable[[], bool] = lambda: False
+) -> Readings | None:
+    """Train an experiment with a seed to its end, in memory, and return the readings there; None if stopped.
+
+    Args:
+        config: the experiment, with an evaluation.
+        seed: the seed.
+        recordings: the folder of the run that it takes its initial tables from.
+        stop: returns whether to stop.
+
+    Raises:
+        RunnerError: the environment cannot be used, or there is no run with the initial tables.
+    """
+    plan = config.evaluation
+    assert plan is not None
+    kwargs = json.dumps(config.to_mapping()["env"]["kwargs"], sort_keys=True)
+    mdp = _load_mdp(config.env.id, kwargs, config.rewards)
+    learner = Learner(config, mdp, seed, tables_of(config, mdp, recordings))
+    steps, episodes = (
+        blank_records(topic, topic_sizes(topic, len(learner.agents), len(mdp.event_names)), _BLOCK_STEPS)
+        for topic in (schema.TRAIN_STEP, schema.TRAIN_EPISODE)
+    )
+    while learner.episode < config.episodes:
+        if stop():
+            return None
+        learner.train(steps, episodes, config.episodes, 2**62)
+    number = -(-config.episodes // plan.every)
+    first = number * plan.trials
+    learner.begin_evaluation(first)
+    done, trials = first, []
+    while done < first + plan.trials:
+        if stop():
+            return None
+        _, ended = learner.evaluate(steps, episodes, first + plan.trials)
+        trials.append(episodes[:ended].copy())
+        done += ended
+    metrics = evaluation_metrics(learner, number, np.concatenate(trials))
+    exact = None
+    if plan.exact:
+        exact = ExactEvaluator(mdp, len(learner.agents)).measure(learner.policy, metrics["discount"])
+        exact |= {"evaluation": number, "episode": config.episodes}
+    read: Readings = finite(readings(metrics, exact, learner.agents, mdp.event_names))
+    return read
+
+
+@lru_cache(maxsize=64)
+def _load_mdp(env_id: str, kwargs: str, rewards: str) -> Mdp:
+    """Return an environment, which a process loads once."""
+    return load_mdp(env_id, json.loads(kwargs), rewards)
+
+
+@lru_cache(maxsize=64)
+def _environment_digest(env_id: str, kwargs: str, rewards: str) -> str:
+    """Return the digest of an environment's arrays, which its code determines."""
+    digest = blake3()
+    for name, array in sorted(_load_mdp(env_id, kwargs, rewards).arrays().items()):
+        digest.update(name.encode() + array.tobytes())
+    return digest.hexdigest()[:16]
+
+
+class Mixtures:
+    """The readings of mixtures, measured when they are needed.
+
+    Args:
+        mixing: the two configurations.
+        seeds: the seeds of each mixture.
+        recordings: the recordings folder.
+        folder: where the readings are kept.
+        report: called several times a second with the number of runs done, and of those known to be needed.
+    """
+
+    def __init__(
+        self,
+        mixing: Mixing,
+        seeds: Sequence[int],
+        recordings: Path,
+        folder: Path,
+        report: Callable[[int, int], None] = lambda *_: None,
+    ) -> None:
+        self._mixing, self._seeds, self._recordings = mixing, tuple(seeds), recordings
+        self._path, self._report = folder / VALUES, report
+        self._kept = dict(_kept(self._path))
+        self._found: dict[tuple[int, int], Readings] = {}
+        self._batch = 1
+        self.trained = 0
+        """Runs that were trained now, not read from the file."""
+        self.seconds = 0.0
+        """The time that one run takes of a processor; 0 if none was trained."""
+
+    def readings(self, mixture: int) -> list[Readings]:
+        """Return the readings of a mixture, by the order of the seeds; they must have been measured."""
+        return [self._found[mixture, seed] for seed in self._seeds]
+
+    def values(self, mixtures: Sequence[int], metric: str) -> NDArray[np.float64]:
+        """Return the values of a metric in mixtures, [mixtures, seeds].
+
+        Raises:
+            RunnerError: a mixture does not have it, or not as a finite number.
+        """
+        rows = []
+        for mixture in mixtures:
+            row = [read.get(metric) for read in self.readings(mixture)]
+            if None in row:
+                names = ", ".join(factor.name for factor in self._mixing.chosen(mixture)) or "none"
+                raise RunnerError(
+                    f"--metric: {metric!r} has no finite value in the mixture with these settings of B: "
+                    f"{names}. Choose a metric that every mixture has, such as success_percent."
+                )
+            rows.append(row)
+        return np.array(rows, np.float64)
+
+    def measure(
+        self, mixtures: Sequence[int], workers: Workers[Measurement, Measured], seeds: int | None = None
+    ) -> None:
+        """Measure mixtures with all seeds, or the first `seeds`, if they are not known yet.
+
+        Raises:
+            RunnerError: a mixture cannot be run, or a worker died twice at it.
+            StorageError: the readings cannot be written.
+        """
+        waiting = deque(self._tasks(mixtures, self._seeds[:seeds]))
+        left = sum(len(task.seeds) for task in waiting)
+        total, busy, died = left, 0, set[int]()
+        while waiting or busy:
+            while waiting and workers.idle:
+                workers.submit(waiting.popleft())
+                busy += 1
+            self._report(total - left, total)
+            for task, result in workers.collect(_WAIT_SECONDS):
+                busy -= 1
+                if result is None and id(task) not in died:
+                    died.add(id(task))
+                    waiting.append(task)
+                    continue
+                if result is None or result.error:
+                    raise self._failed(task, "its worker died twice" if result is None else result.error)
+                left -= len(result.readings)
+                self.trained += len(result.readings)
+                self.seconds = result.seconds or self.seconds
+                self._keep(task, result.readings)
+        self._report(total, total)
+
+    def _tasks(self, mixtures: Sequence[int], seeds: Sequence[int]) -> Iterator[Measurement]:
+        """Yield tasks for what is not known."""
+        batch = max(1, round(TASK_SECONDS / self.seconds)) if self.seconds else len(seeds)
+        for mixture in mixtures:
+            config = self._mixing.config(mixture)
+            missing = []
+            for seed in seeds:
+                known = self._kept.get(self._identity(config, seed))
+                if known is not None:
+                    self._found[mixture, seed] = known
+                elif (mixture, seed) not in self._found:
+                    missing.append(seed)
+            for start in range(0, len(missing), batch):
+                some = tuple(missing[start : start + batch])
+                yield Measurement(mixture, config.to_mapping(), some, str(self._recordings))
+
+    def _keep(self, task: Measurement, found: Mapping[int, Readings]) -> None:
+        """Append readings to the file: a line each, with the identity of the job."""
+        config = from_mapping(task.config)
+        lines = []
+        for seed, read in found.items():
+            self._found[task.mixture, seed] = read
+            line = {"job": self._identity(config, seed), "mixture": task.mixture, "seed": seed}
+            lines.append(json.dumps(line | {"readings": read}) + "\n")
+        with storage_errors(self._path), self._path.open("a", encoding="utf-8") as file:
+            file.writelines(lines)
+
+    def _identity(self, config: ExperimentConfig, seed: int) -> str:
+        """Return what determines the readings of a run: its job, and the code of its environment."""
+        values = config.to_mapping()
+        kwargs = json.dumps(values["env"]["kwargs"], sort_keys=True)
+        environment = _environment_digest(config.env.id, kwargs, config.rewards)
+        return f"{identity_of(values, seed)}-{environment}-{__version__}"
+
+    def _failed(self, task: Measurement, reason: str) -> RunnerError:
+        names = ", ".join(factor.name for factor in self._mixing.chosen(task.mixture)) or "none"
+        return RunnerError(f"the mixture with these settings of B: {names}: {reason}")
+
+
+def _kept(path: Path) -> Iterator[tuple[str, Readings]]:
+    """Yield the readings in a file by the identity of their job; a line that is cut off is left out."""
+    try:
+        with path.open("rb") as file:
+            while file.tell() < MAX_BYTES and (line := file.readline(MAX_LINE)):
+                try:
+                    values = json.loads(line)
+                    yield str(values["job"]), _checked(values["readings"])
+                except (ValueError, KeyError, TypeError, RecursionError):
+                    continue
+    except OSError:
+        return
+
+
+def _checked(values: object) -> Readings:
+    """Return readings from a file.
+
+    Raises:
+        TypeError: they are none.
+    """
+    if not isinstance(values, dict):
+        raise TypeError(values)
+    return {str(name): None if value is None else float(value) for name, value in values.items()}

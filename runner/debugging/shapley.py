@@ -1,0 +1,99 @@
+"""Shares of a difference among the settings that make it, and the smallest set of settings that makes it.
+
+A mixture is a number whose bit i is 1 if setting i has the value of B, and 0 if it has that of A: mixture 0
+is A, and mixture 2^k - 1 is B.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Values = NDArray[np.float64]
+T = TypeVar("T")
+
+
+def shapley_values(values: Values) -> Values:
+    """Return the share of each setting: its effect, averaged over all orders in which settings change.
+
+    L. S. Shapley, "A value for n-person games", 1953. The shares of all settings add up to the difference
+    between the last mixture and the first.
+
+    Args:
+        values: of every mixture, [2^k, columns].
+
+    Returns:
+        [k, columns].
+    """
+    count = len(values).bit_length() - 1
+    masks = np.arange(len(values))
+    sizes = np.bitwise_count(masks)
+    shares = np.empty((count, values.shape[1]))
+    for i in range(count):
+        without = masks[masks >> i & 1 == 0]
+        weights = _weights(count)[sizes[without]]
+        shares[i] = weights @ (values[without | 1 << i] - values[without])
+    return shares
+
+
+def shapley_interactions(values: Values) -> dict[tuple[int, int], Values]:
+    """Return for each pair of settings what both do beyond what each does, averaged over the others.
+
+    The Shapley interaction index of M. Grabisch and M. Roubens, "An axiomatic approach to the concept of
+    interaction among players in cooperative games", 1999. It is 0 for settings whose effects add up.
+
+    Args:
+        values: of every mixture, [2^k, columns].
+
+    Returns:
+        [columns] by pair (i, j), i < j.
+    """
+    count = len(values).bit_length() - 1
+    masks = np.arange(len(values))
+    sizes = np.bitwise_count(masks)
+    found = {}
+    for i, j in itertools.combinations(range(count), 2):
+        without = masks[(masks >> i | masks >> j) & 1 == 0]
+        both = values[without | 1 << i | 1 << j] + values[without]
+        beyond = both - values[without | 1 << i] - values[without | 1 << j]
+        found[i, j] = _weights(count - 1)[sizes[without]] @ beyond
+    return found
+
+
+def _weights(count: int) -> Values:
+    """Return the share of the orders of `count` settings in which s given ones come before a given one."""
+    factorial = math.factorial
+    return np.array([factorial(s) * factorial(count - s - 1) / factorial(count) for s in range(count)])
+
+
+def minimal_set(items: Sequence[T], holds: Callable[[Sequence[T]], bool]) -> list[T]:
+    """Return items for which a property holds, and of which none can be left out.
+
+    Delta debugging (A. Zeller and R. Hildebrandt, "Simplifying and isolating failure-inducing input", 2002).
+
+    Args:
+        items: for which it holds; it does not hold for no items at all.
+        holds: returns whether it holds for some of the items, in their order.
+    """
+    left, parts = list(items), 2
+    while len(left) > 1:
+        chunks = [chunk.tolist() for chunk in np.array_split(np.arange(len(left)), parts)]
+        subsets = [[left[k] for k in chunk] for chunk in chunks]
+        smaller = next((subset for subset in subsets if holds(subset)), None)
+        if smaller is not None:
+            left, parts = smaller, 2
+            continue
+        rests = [[item for k, item in enumerate(left) if k not in chunk] for chunk in chunks]
+        smaller = next((rest for rest in rests if parts > 2 and holds(rest)), None)
+        if smaller is not None:
+            left, parts = smaller, max(parts - 1, 2)
+        elif parts < len(left):
+            parts = min(2 * parts, len(left))
+        else:
+            break
+    return left
