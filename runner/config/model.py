@@ -7,11 +7,11 @@ resolves it to an `ExperimentConfig`, where every value is present.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Final, Literal, Self, TypeVar, get_args
+from typing import Annotated, Any, Final, Literal, Self, get_args
 
-from pydantic import AfterValidator, Discriminator, Field, GetCoreSchemaHandler, Tag, model_validator
-from pydantic_core import CoreSchema
+from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
+from runner.config.branches import Branch
 from runner.config.document import write_yaml
 from runner.config.schedules import Probability, StepSize
 from runner.config.sections import (
@@ -19,6 +19,7 @@ from runner.config.sections import (
     AlgorithmSection,
     Environment,
     Evaluation,
+    Exploration,
     Hysteretic,
     InitialTable,
     Log,
@@ -27,13 +28,14 @@ from runner.config.sections import (
     Snapshots,
     WolfPhc,
 )
-from runner.config.values import Section, refusal
+from runner.config.values import Optional, Section, refusal
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN
 
 Mode = Literal["cooperative", "competitive"]
 Tables = Literal["joint", "per_agent"]
 Rewards = Literal["team", "individual"]
-Exploration = Literal["shared", "independent"]
+
+MAX_BRANCHES: Final = 1000
 
 LEARNERS: Final[dict[Mode, tuple[Tables, Rewards]]] = {
     "cooperative": ("joint", "team"),
@@ -45,7 +47,6 @@ EXPLORATION: Final[dict[Tables, Exploration]] = {"joint": "shared", "per_agent":
 """The default exploration: separate learners explore independently of each other."""
 
 Name = Annotated[str, Field(pattern=NAME_PATTERN, json_schema_extra={"patternErrorMessage": NAME_EXPECTED})]
-T = TypeVar("T")
 
 
 def _unique(seeds: tuple[int, ...]) -> tuple[int, ...]:
@@ -87,17 +88,6 @@ def _seeds_kind(value: object) -> str | None:
 SeveralSeeds = Annotated[
     Annotated[Seeds, Tag("array")] | Annotated[SeedRange, Tag("SeedRange")], Discriminator(_seeds_kind)
 ]
-
-
-class _NotNull:
-    """Validates `X | None` as X: None is the default of a key that is left out, and no value of its own."""
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return handler.generate_schema(get_args(source)[0])
-
-
-Optional = Annotated[T | None, _NotNull()]
-"""A key that may be left out, but not be null."""
 
 
 def _only_with(section: type[AlgorithmSection]) -> Any:
@@ -161,6 +151,11 @@ class Settings(Section):
     recording: Recording = Field(default=Recording(), description="What is recorded and how it is packed.")
     quirks: Quirks = Field(
         default=Quirks(), description="Deviations of the published tutorial's code, to reproduce its figures."
+    )
+    branches: Annotated[tuple[Branch, ...], Field(strict=False, max_length=MAX_BRANCHES)] = Field(
+        default=(),
+        description="Steps at which training was changed, as `dualtaxi branch` writes them; the steps before "
+        "the first are those of the run that was branched.",
     )
 
 
@@ -245,12 +240,39 @@ class ExperimentConfig(Settings):
                 raise refusal((key,), message)
         return self
 
+    @model_validator(mode="after")
+    def _branches_fit(self) -> Self:
+        for position, branch in enumerate(self.branches):
+            try:
+                self.from_step(branch.step)
+            except ValidationError as error:
+                (detail, *_) = error.errors(include_url=False, include_input=False)
+                path = (*detail["loc"], *detail.get("ctx", {}).get("path", ()))
+                raise refusal(("branches", position, "settings", *path), detail["msg"]) from None
+        return self
+
+    def from_step(self, step: int) -> ExperimentConfig:
+        """Return the experiment with the settings that training has at a step, and without branches."""
+        if not self.branches:
+            return self
+        changes: dict[str, Any] = {}
+        for branch in sorted(self.branches, key=lambda branch: branch.step):
+            if branch.step <= step:
+                changes |= branch.settings.given
+        values = {key: value for key, value in self if key not in self._unused}
+        return ExperimentConfig.model_validate(values | {"branches": ()} | changes)
+
+    @property
+    def _unused(self) -> set[str]:
+        """The keys that this experiment has no value for."""
+        return {key for key in (*SECTION_OF, "branches") if not getattr(self, key)}
+
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values, fit for JSON, which `from_mapping` takes back to an equal object.
 
-        Sections of other algorithms are left out.
+        Sections of other algorithms are left out, and `branches` if there are none.
         """
-        return self.model_dump(mode="json", exclude={key for key in SECTION_OF if getattr(self, key) is None})
+        return self.model_dump(mode="json", exclude=self._unused)
 
     def to_yaml(self) -> str:
         """Return `to_mapping` as YAML, which `load` takes back to an equal object."""

@@ -234,6 +234,8 @@ class Quirks(Section):
     )
 
 
+Exploration = Literal["shared", "independent"]
+
 Algorithm = Literal[
     "q_learning",
     "sarsa",

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field
-from pydantic_core import PydanticCustomError
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic_core import CoreSchema, PydanticCustomError
 
 REFUSED = "refused"
 """The type of the errors of `refusal`; their message is shown to users unchanged."""
@@ -26,6 +26,20 @@ Count = Annotated[int, Field(ge=1, le=10**12)]
 """A number of episodes or steps, bounded so that sums and products of them fit in 64 bits."""
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+T = TypeVar("T")
+
+
+class _NotNull:
+    """Validates `X | None` as X: None is the default of a key that is left out, and no value of its own."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return handler.generate_schema(get_args(source)[0])
+
+
+Optional = Annotated[T | None, _NotNull()]
+"""A key that may be left out, but not be null."""
 
 
 class Section(BaseModel):

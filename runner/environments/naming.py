@@ -12,12 +12,17 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
 from runner.environments.scene import SceneDescription, Thing
+from runner.errors import ConfigError, nearest
+
+MAX_LISTED: Final = 8
+"""Names that an error lists."""
 
 
 def states_in_words(mdp: Mdp) -> NDArray[np.object_]:
@@ -65,6 +70,53 @@ def deeds_in_words(mdp: Mdp) -> list[str]:
 def numbered_actions(mdp: Mdp) -> list[list[str]]:
     """Return the names of each agent's actions; `action 3` where the scene does not name them."""
     return action_names(mdp) or [[f"action {i}" for i in range(count)] for count in mdp.action_counts]
+
+
+def agent_of(mdp: Mdp, name: str) -> int:
+    """Return the number of the agent with this name, written as in the environment or as people write it.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    known = {text: i for i, agent in enumerate(mdp.agents) for text in (agent, spoken(agent))}
+    if name not in known:
+        raise ConfigError(
+            f"found the agent {name[:60]!r}, expected {' or '.join(mdp.agents)}.{nearest(name, mdp.agents)}"
+        )
+    return known[name]
+
+
+def own_action(mdp: Mdp, agent: int, text: str) -> int:
+    """Return an agent's action from its name or its number.
+
+    Raises:
+        ConfigError: the agent has no such action.
+    """
+    names = numbered_actions(mdp)[agent]
+    return _numbered(text, names, f"an action of {spoken(mdp.agents[agent])}")
+
+
+def joint_action(mdp: Mdp, text: str) -> int:
+    """Return a joint action from its name, such as `pickup + east`, or its number.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    return _numbered(text, [str(name) for name in actions_in_words(mdp)], "a joint action")
+
+
+def _numbered(text: str, names: list[str], what: str) -> int:
+    """Return the number that a text is, or that it names."""
+    if text.isascii() and text.isdecimal() and int(text[:12]) < len(names):
+        return int(text)
+    wanted = spoken(text.strip())
+    if wanted in names:
+        return names.index(wanted)
+    listed = ", ".join(names[:MAX_LISTED]) + (", ..." if len(names) > MAX_LISTED else "")
+    raise ConfigError(
+        f"found {text[:60]!r}, expected {what}: {listed}; or a number from 0 to {len(names) - 1}."
+        f"{nearest(wanted, names)}"
+    )
 
 
 def agent_actions(mdp: Mdp, action: int) -> tuple[int, ...]:

@@ -127,11 +127,13 @@ def train(
     episodes: NDArray[np.void],
     until_episode: int,
     until_step: int,
+    replacement: NDArray[np.int32] | None,
 ) -> tuple[int, int]:
     """Train until a block is full, or an episode or a step is reached; return (steps, episodes) filled.
 
     `steps` and `episodes` are record arrays with the fields of the recording's messages; other fields are not
-    touched. All that a later call needs is in the cursor, tables and tally.
+    touched. All that a later call needs is in the cursor, tables and tally. `replacement` ([J], or None) is
+    the joint action that is taken instead of each one chosen, as at the step of a branch.
     """
     at = cursor[0]
     step, episode, t, state = at.step, at.episode, at.t, Index(at.state)
@@ -162,6 +164,8 @@ def train(
             action, explored = next_action, next_explored
         else:
             action, explored = choose(seed, model, tables, rules, epsilon, exploration, episode, t, state)
+        if replacement is not None:  # known when it is compiled: other jobs do not pay for it
+            action = np.int64(replacement[action])
 
         # Take it, and observe.
         outcome = _outcome(model, state * Index(joint_actions) + Index(action), chance, t)

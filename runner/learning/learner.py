@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from runner.config import ExperimentConfig
 from runner.config.model import SECTION_OF
 from runner.config.sections import RandomTable
 from runner.environments.mdp import Mdp
+from runner.environments.naming import agent_of, own_action
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.learning import algorithms, kernel
 from runner.learning.algorithms import Rules, Tables
@@ -19,8 +20,23 @@ from runner.learning.kernel import Tally
 from runner.learning.model import Model, build_model
 from runner.learning.schedules import compile_schedule, schedule_value
 
+NEVER: Final = 2**62
+"""A step that no training reaches."""
+
 Held = Mapping[str, NDArray[np.float64]]
 """The tables of one learner: its Q-table as `q`, and its algorithm's `EXTRA_TABLES` by name."""
+
+
+class Segment(NamedTuple):
+    """Training steps under the same settings, from a branch, or the beginning, up to the next branch."""
+
+    start: int
+    """The first step."""
+    stop: int
+    """The step after the last one."""
+    rules: Rules
+    replacement: NDArray[np.int32] | None
+    """[J]: the joint action that is taken at `start` instead of each one chosen; None to take the chosen."""
 
 
 class Learner:
@@ -41,7 +57,8 @@ class Learner:
         self.seed = np.uint64(seed)
         self.model: Model = build_model(mdp, config.tables)
         self.agents = ("agency",) if config.tables == "joint" and len(mdp.agents) > 1 else mdp.agents
-        self.rules = rules_of(config)
+        self._segments = _segments(config, mdp)
+        self._cursor = np.zeros(1, kernel.CURSOR)
         _check_fit(config, mdp, self.model)
         self.kinds = kinds_of(config)
         self.tables = _tables(self.model, mdp.states, self.kinds)
@@ -49,11 +66,19 @@ class Learner:
         log = config.log
         self._tally = _tally(self.model, log.window if log else 1, log.episodes if log else 50)
         self._eval_tally = _tally(self.model, 1, 1)
-        self._cursor = np.zeros(1, kernel.CURSOR)
         self._eval_cursor = np.zeros(1, kernel.CURSOR)
         self._policy = np.zeros(mdp.states, np.int32)
         self._start = _trial_start(config, mdp)
         self._success = np.array([name in mdp.success_events for name in mdp.event_names], dtype=np.bool_)
+
+    @property
+    def rules(self) -> Rules:
+        """The switches and schedules of the next training step."""
+        return self.segment_at(self.step).rules
+
+    def segment_at(self, step: int) -> Segment:
+        """Return the segment of training that a step belongs to."""
+        return next(segment for segment in reversed(self._segments) if segment.start <= step)
 
     @property
     def step(self) -> int:
@@ -92,18 +117,24 @@ class Learner:
     def train(
         self, steps: NDArray[np.void], episodes: NDArray[np.void], until_episode: int, until_step: int
     ) -> tuple[int, int]:
-        """Train until a block is full, or an episode or step is reached; return (steps, episodes) filled."""
+        """Train until a block is full, or an episode or step is reached; return (steps, episodes) filled.
+
+        A branch on the way fills a block too.
+        """
+        segment = self.segment_at(self.step)
+        replacement = segment.replacement if segment.start == self.step else None
         filled, ended = kernel.train(
             self._cursor,
             self.seed,
             self.model,
             self.tables,
-            self.rules,
+            segment.rules,
             self._tally,
-            steps,
+            steps if replacement is None else steps[:1],
             episodes,
             until_episode,
-            until_step,
+            min(until_step, segment.stop),
+            replacement,
         )
         self._mark_success(episodes[:ended])
         return filled, ended
@@ -263,6 +294,33 @@ def rules_of(config: ExperimentConfig) -> Rules:
         first_action_for_all=config.quirks.second_table_uses_first_action,
         bootstrap_after_termination=config.quirks.bootstrap_after_termination,
     )
+
+
+def _segments(config: ExperimentConfig, mdp: Mdp) -> list[Segment]:
+    """Return the segments of an experiment's training, in order."""
+    starts = sorted({0, *(branch.step for branch in config.branches)})
+    return [
+        Segment(start, stop, rules_of(config.from_step(start)), _replacement(config, mdp, start))
+        for start, stop in zip(starts, [*starts[1:], NEVER], strict=True)
+    ]
+
+
+def _replacement(config: ExperimentConfig, mdp: Mdp, step: int) -> NDArray[np.int32] | None:
+    """Return the joint action to take instead of each one, [J], where branches set actions of agents."""
+    chosen = {
+        agent: action
+        for branch in config.branches
+        if branch.step == step
+        for agent, action in branch.actions.items()
+    }
+    if not chosen:
+        return None
+    own = mdp.own_actions.copy()
+    for agent, action in chosen.items():
+        number = agent_of(mdp, agent)
+        own[:, number] = own_action(mdp, number, action)
+    replacement: NDArray[np.int32] = np.ravel_multi_index(tuple(own.T), mdp.action_counts).astype(np.int32)
+    return replacement
 
 
 def kinds_of(config: ExperimentConfig) -> tuple[str, ...]:

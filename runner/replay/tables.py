@@ -43,6 +43,11 @@ class StateProbe(NamedTuple):
     greedy: NDArray[np.int32]
     """[k, learners, n]: filled with the greedy action in each state; -1 for none."""
 
+    def between(self, start: int, stop: int) -> StateProbe:
+        """Return the part of the probe for rows `start` to `stop` of the block, as a block of their own."""
+        part = slice(*np.searchsorted(self.before, (start, stop)))
+        return StateProbe(self.before[part] - start, self.states[part], self.value[part], self.greedy[part])
+
 
 class StepReplay:
     """The tables of a run's learners, moved forward by its training steps in order.
@@ -130,13 +135,20 @@ class StepReplay:
                 f"those from {self.step} on; `dualtaxi verify` checks the whole recording."
             )
         check_steps(steps, self._mdp, self._where)
-        records = steps.view(np.recarray)
-        if probe is None:
-            kernel.replay(*self._state, records, rows)
-        else:
+        if probe is not None:
             _check_probe(probe, self._mdp)
-            kernel.replay_probed(*self._state, records, rows, *probe)
-        self.step = last + 1
+        at = 0
+        while at < len(steps):
+            segment = self._learner.segment_at(self.step)
+            stop = min(len(steps), at + segment.stop - self.step)
+            state = (self._learner.seed, self._learner.model, self._learner.tables, segment.rules)
+            records = steps[at:stop].view(np.recarray)
+            if probe is None:
+                kernel.replay(*state, records, rows[at:stop])
+            else:
+                kernel.replay_probed(*state, records, rows[at:stop], *probe.between(at, stop))
+            self.step += stop - at
+            at = stop
 
     def values_in(self, states: NDArray[Any]) -> NDArray[np.float64]:
         """Return each learner's values in these states now, [states, learners, most actions]."""
@@ -150,10 +162,6 @@ class StepReplay:
         _check_probe(probe, self._mdp)
         for k in range(len(probe.states)):
             kernel.read_states(self._learner.tables, probe.states[k], probe.value[k], probe.greedy[k])
-
-    @property
-    def _state(self) -> tuple[Any, ...]:
-        return self._learner.seed, self._learner.model, self._learner.tables, self._learner.rules
 
     def _lost(self, found: int) -> RecordingError:
         return RecordingError(

@@ -96,6 +96,9 @@ SEEDS = st.one_of(
         st.integers(1, 9),
     ),
 )
+QUIRKS = st.fixed_dictionaries(
+    {}, optional={"epsilon_exploits": st.booleans(), "bootstrap_after_termination": st.booleans()}
+)
 REST = st.fixed_dictionaries(
     {"episodes": COUNT},
     optional={
@@ -129,8 +132,18 @@ REST = st.fixed_dictionaries(
             {}, optional={**RECORDING, "compression": st.sampled_from(["zstd", "lz4", "none"])}
         )
         | st.fixed_dictionaries({"level": st.integers(-7, 19)}, optional=RECORDING),
-        "quirks": st.fixed_dictionaries(
-            {}, optional={"epsilon_exploits": st.booleans(), "bootstrap_after_termination": st.booleans()}
+        "quirks": QUIRKS,
+        "branches": st.lists(
+            st.fixed_dictionaries(
+                {"run": st.text("abcdefgh", min_size=1), "step": st.integers(0, 10**12)},
+                optional={
+                    "actions": st.dictionaries(st.sampled_from(["taxi_1", "taxi_2"]), st.just("north")),
+                    "settings": st.fixed_dictionaries(
+                        {}, optional={"epsilon": st.floats(0, 1), "quirks": QUIRKS}
+                    ),
+                },
+            ),
+            max_size=3,
         ),
     },
 )

@@ -34,6 +34,7 @@ OTHER = {
     "log": {"log": {"every_steps": 10}},
     "snapshots": {"snapshots": {"every": 10}},
     "a quirk": {"quirks": {"bootstrap_after_termination": True}},
+    "a branch": {"branches": [{"run": "k3v9m2xq", "step": 7, "settings": {"epsilon": 0.5}}]},
 }
 OF_ONE_ALGORITHM = {
     "hysteretic": ("hysteretic_q_learning", {"decrease": 0.01}, {"decrease": 0.02}),
