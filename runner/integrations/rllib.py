@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
-from typing import Any, Final
+from typing import Any, Final, Unpack
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from runner.integrations.libraries import require_tested
 from runner.loops.description import Described
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, vector_maker_of
-from runner.loops.options import options_of
+from runner.loops.options import PackingOptions, options_of
 from runner.loops.recorded import Recorded
 from runner.loops.rows import Rows
 from runner.loops.single_rows import ROWS
@@ -95,9 +95,11 @@ class Recording:
         info: Sequence[str] = (),
         make: str | Callable[[], Any] | None = None,
         checkpoint_every: int = 0,
-        **packing: Any,
+        **packing: Unpack[PackingOptions],
     ) -> None:
-        options_of(recordings, name, seed, config, info, packing)  # are valid
+        given = {"name": name, "seed": seed, "config": config, "info": info}
+        options_of(recordings, {**given, **packing}, valid=(*PackingOptions.__annotations__, *given))
+        self.make, self.options = make, {"info": tuple(info), **packing}
         if not is_whole(checkpoint_every, 0, 2**62):
             raise ConfigError(f"checkpoint_every: found {checkpoint_every!r}, expected a whole number from 0")
         folder = recordings if recordings is None else os.fspath(recordings)
@@ -105,8 +107,6 @@ class Recording:
         """Ray runs some of the processes in folders of its own."""
         self.name, self.seed, self.config = name, seed, dict(as_mapping(config) or {})
         self.checkpoint_every = checkpoint_every
-        self.options = {"info": tuple(info), "make": make, **packing}
-        self.packing = packing
 
     def __call__(self) -> RLlibCallback:
         """Return the callbacks; called by RLlib, once in each process."""
@@ -159,7 +159,7 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
             EnvironmentNotUsable: they cannot be recorded.
         """
         recording, config = self._recording, algorithm.config
-        describe = partial(_described, checked_make(recording.options["make"]))
+        describe = partial(_described, checked_make(recording.make))
         found = [each for each in algorithm.env_runner_group.foreach_env_runner(describe) if each]
         if not found:
             raise EnvironmentNotUsable(
@@ -171,11 +171,12 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
             name = re.sub(r"_[\d-]{10}_[\d-]{8}$", "", trial)  # RLlib keeps no other name of a trial
         options = options_of(
             recording.recordings,
-            recording.name or re.sub(r"[^A-Za-z0-9_.+/-]", "-", name)[:100],
-            config.seed if recording.seed is None else recording.seed,
-            {**_settings(algorithm), **recording.config},
-            recording.options["info"],
-            recording.packing,
+            {
+                "name": recording.name or re.sub(r"[^A-Za-z0-9_.+/-]", "-", name)[:100],
+                "seed": config.seed if recording.seed is None else recording.seed,
+                "config": {**_settings(algorithm), **recording.config},
+                **recording.options,
+            },
         )
         return _Run(Loop(described, options, maker, ROWS[described.kind]))
 
@@ -183,7 +184,9 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
         """Return what has an env runner record its environments; it is sent to the process of each."""
         assert self._run is not None
         phase = "eval" if is_evaluation else "train"
-        return partial(_join, _Join(self._run.run, phase, self._recording.options))
+        return partial(
+            _join, _Join(self._run.run, phase, {"make": self._recording.make, **self._recording.options})
+        )
 
     def on_env_runners_recreated(
         self, *, env_runner_group: Any, env_runner_indices: list[int], is_evaluation: bool, **_: Any

@@ -10,13 +10,13 @@ import functools
 import inspect
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Literal, Self, Unpack
 
 import numpy as np
 
 from runner.errors import ConfigError, EnvironmentNotUsable, RunnerError
 from runner.integrations.libraries import require_tested
-from runner.loops.options import options_of
+from runner.loops.options import PackingOptions, RecordOptions, options_of
 from runner.loops.recorded import ending_of
 from runner.loops.values import warn_user
 from runner.loops.vector import RecordedVector
@@ -86,16 +86,16 @@ class Recording(BaseCallback):  # type: ignore[misc]
         make: str | Callable[[], Any] | None = None,
         checkpoint_every: int = 0,
         on_error: Literal["raise", "warn"] = "raise",
-        **packing: Any,
+        **packing: Unpack[PackingOptions],
     ) -> None:
         super().__init__()
-        valid = recordings, name, seed, config, info, packing, frames_every, frame_format
-        options_of(*valid, on_error=on_error)
+        options: dict[str, Any] = {"name": name, "info": info, "on_error": on_error, **packing}
+        options |= {"frames_every": frames_every, "frame_format": frame_format}
+        valid = [one for one in RecordOptions.__annotations__ if one not in ("join", "shard")]
+        options_of(recordings, {**options, "seed": seed, "config": config}, valid=valid)
         if not is_whole(checkpoint_every, 0, 2**62):
             raise ConfigError(f"checkpoint_every: found {checkpoint_every!r}, expected a whole number from 0")
-        self._options = {"recordings": recordings, "name": name, "info": info, "make": make, **packing}
-        self._options |= {"frames_every": frames_every, "frame_format": frame_format, "frames_of": frames_of}
-        self._options["on_error"] = on_error
+        self._options = {"recordings": recordings, "make": make, "frames_of": frames_of, **options}
         self._seed, self._config, self._checkpoint_every = seed, config, checkpoint_every
         self._has_options = bool(config or frames_every or packing or info)
         self._has_options |= any(one is not None for one in (recordings, name, seed, frames_of, make))

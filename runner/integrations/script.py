@@ -267,12 +267,9 @@ class ScriptRun:
         """Begin a recording without an environment."""
         nothing = Discrete(1)
         described = Described("step", nothing, nothing, env_id="none")
-        given = self._arguments()
-        name = given.pop("name") or script_name()
-        packing = {key: value for key, value in self._options.items() if key in PACKING}
-        options = options_of(
-            self._recordings, name, info=(), packing=packing | {"run_id": self.run_id}, **given
-        )
+        packing: Any = {key: value for key, value in self._options.items() if key in PACKING}
+        given = self._arguments() | {"name": self.name or script_name(), "run_id": self.run_id}
+        options = options_of(self._recordings, given | packing)
         maker = EnvironmentMaker("gymnasium", reason="values were logged, and no environment was recorded")
         self._values = rows = ValueRows()
         loop: Loop[Any] = Loop(described, options, maker, lambda *_: rows)

@@ -11,7 +11,7 @@ import os
 import weakref
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from gymnasium import spaces
@@ -23,6 +23,7 @@ from runner.integrations.tensorboard import SummaryWriter
 from runner.loops.batches import RecordedBatches, record_batches
 from runner.loops.env import record as record_env
 from runner.loops.loop import Loop
+from runner.loops.options import RunOptions
 from runner.loops.recorded import Recorded
 from runner.loops.values import as_array
 from runner.loops.vector import record_vector
@@ -90,11 +91,7 @@ def _close(made: Recorded[Any], **arguments: Any) -> None:
 def recorded(
     collector: Any,
     recordings: str | os.PathLike[str] | None = None,
-    *,
-    name: str | None = None,
-    seed: int | None = None,
-    config: object = None,
-    **packing: Any,
+    **options: Unpack[RunOptions],
 ) -> Iterator[Any]:
     """Yield what a collector yields, and record its steps.
 
@@ -105,11 +102,8 @@ def recorded(
 
     Args:
         collector: a collector that steps its environments, also several of them, in this process.
-        recordings: as for `runner.record`, as are the others.
-        name: the name of the run; that of the environment unless given.
-        seed: the seed that the run is listed with.
-        config: your own settings.
-        packing: as for `runner.record`.
+        recordings: as for `runner.record`.
+        options: the arguments that `runner.record` has too, except those of infos and frames.
 
     Raises:
         ConfigError: the collector is of another kind, or an argument cannot be used.
@@ -125,12 +119,9 @@ def recorded(
     rec = record_batches(
         _name_of(env),
         recordings,
-        name=name,
-        seed=seed,
-        config=config,
         action_space=_action_space(env),
         autoreset_mode="SameStep",
-        **packing,
+        **options,
     )
     return _recorded(collector, env, rec)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
 import numpy as np
 from gymnasium import spaces
@@ -19,13 +19,12 @@ from runner.errors import ConfigError, RunnerError
 from runner.loops.batch_rows import BatchRows
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, vector_maker_of
-from runner.loops.options import Options, options_of
+from runner.loops.options import Options, RunOptions, options_of
 from runner.loops.recorded import Recorded
 from runner.loops.values import as_array, check_phase
 from runner.loops.vector import autoreset_mode_of, described_vector, first_of, require_fixed
 from runner.loops.vector_counts import Flags
 from runner.recording.gym_values import element_of
-from runner.runs.run import Run
 
 
 class NamedEnvironments(AnyVectorEnv):
@@ -237,14 +236,8 @@ def record_batches(
     observation_space: Any = None,
     action_space: Any = None,
     autoreset_mode: AutoresetMode | str | None = None,
-    name: str | None = None,
-    seed: int | None = None,
-    config: object = None,
     make: str | Callable[[], Any] | None = None,
-    join: Run | str | os.PathLike[str] | Literal[True] | None = None,
-    shard: str | None = None,
-    on_error: Literal["raise", "warn"] = "raise",
-    **packing: Any,
+    **options: Unpack[RunOptions],
 ) -> RecordedBatches:
     """Return a recording of N environments that takes their steps in batches, without an object a step.
 
@@ -266,14 +259,8 @@ def record_batches(
             action and returns the first observation of the next episode. "SameStep" (gymnax, Brax): the step
             that ends an episode returns the first observation of the next one. "Disabled": none, until
             `reset`. A vector environment may state it itself.
-        name: as for `record`.
-        seed: as for `record`.
-        config: as for `record`.
         make: as for `record`; the function makes the vector environment.
-        join: as for `record`.
-        shard: as for `record`.
-        on_error: as for `record`.
-        packing: as for `record`.
+        options: the arguments that `record` has too, except those of infos and frames.
 
     Raises:
         EnvironmentNotUsable: a space cannot be recorded, or has values of varying size.
@@ -285,11 +272,9 @@ def record_batches(
     if isinstance(envs, VectorEnv) and not observation_space is action_space is None:
         raise ConfigError("found spaces next to a vector environment, which has its own")
     mode = autoreset_mode_of(None if isinstance(envs, str) else envs, autoreset_mode)
-    options = options_of(
-        recordings, name, seed, config, (), packing, join=join, shard=shard, on_error=on_error
-    )
     own_spaces = _as_space(observation_space), _as_space(action_space)
-    return RecordedBatches(envs, mode, own_spaces, options, checked_make(make))
+    valid = options_of(recordings, options, valid=RunOptions.__annotations__)
+    return RecordedBatches(envs, mode, own_spaces, valid, checked_make(make))
 
 
 def _numpy(values: Any) -> Any:

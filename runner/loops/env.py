@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
 import gymnasium
 from gymnasium.vector import VectorEnv
@@ -16,7 +16,7 @@ from runner.loops.description import describe
 from runner.loops.generators import GeneratorWatch
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, maker_of
-from runner.loops.options import options_of
+from runner.loops.options import PackingOptions, options_of
 from runner.loops.recorded import RecordedAlone, require_pictures
 from runner.loops.rows import Rows
 from runner.loops.single_rows import ROWS
@@ -103,7 +103,7 @@ def record(
     join: Run | str | os.PathLike[str] | Literal[True] | None = None,
     shard: str | None = None,
     on_error: Literal["raise", "warn"] = "raise",
-    **packing: Any,
+    **packing: Unpack[PackingOptions],
 ) -> RecordedEnv:
     """Return the environment, with everything that a loop does with it recorded.
 
@@ -151,15 +151,15 @@ def record(
         RunnerError: the run to join is over, or a job, or there is none.
         StorageError: the recordings folder cannot be written.
     """
+    options = {"name": name, "seed": seed, "config": config, "info": info, "frames_every": frames_every}
+    options |= {"frame_format": frame_format, "join": join, "shard": shard, "on_error": on_error, **packing}
     if _is_vec_env(env):
         if into is not None:
             raise ConfigError("into: found it with a VecEnv, expected join=RUN")
         from runner.loops.recorded_vec_env import record_vec_env  # imports Stable-Baselines3
 
-        given = {"recordings": recordings, "name": name, "seed": seed, "config": config, "info": info}
-        given |= {"frames_every": frames_every, "frame_format": frame_format, "phase": phase, "make": make}
-        given |= {"join": join, "shard": shard, "on_error": on_error}
-        recorded: RecordedEnv = record_vec_env(env, given | packing)  # a VecEnv, whose type is not known here
+        given = {"recordings": recordings, "phase": phase, "make": make, **options}
+        recorded: RecordedEnv = record_vec_env(env, given)  # a VecEnv, whose type is not known here
         return recorded
     if not isinstance(env, gymnasium.Env) or issubclass(type(env), VectorEnv):  # EnvPool's are both
         raise ConfigError(
@@ -175,23 +175,10 @@ def record(
             )
         return _record_into_run(env, into, phase, checked_make(make))
     described = describe(env, env.observation_space, env.action_space)
-    options = options_of(
-        recordings,
-        name,
-        seed,
-        config,
-        info,
-        packing,
-        frames_every,
-        frame_format,
-        join=join,
-        shard=shard,
-        on_error=on_error,
-    )
     if frames_every:
         require_pictures(env)
     maker = maker_of(env, checked_make(make))
-    loop: Loop[Rows] = Loop(described, options, maker, ROWS[described.kind])
+    loop: Loop[Rows] = Loop(described, options_of(recordings, options), maker, ROWS[described.kind])
     return RecordedEnv(env, loop, phase)
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Literal, TypedDict
 
 import numpy as np
 
@@ -24,12 +24,43 @@ MADE_BY: Final = "runner.record"
 ALL_INFO: Final = "*"
 """Among the names of info fields: all of them."""
 PACKING: Final = ("compression", "level", "index", "chunk_steps", "code", "system", "console")
-_ARGUMENTS: Final = (
-    *("recordings", "name", "seed", "config", "info", "make", "frames_every", "frame_format", "frames_of"),
-    *("join", "phase", "shard", "on_error"),
-)
-"""The other arguments of `record`, of which a misspelt one may be meant."""
+_ARGUMENTS: Final = ("recordings", "make", "frames_of", "phase", "autoreset_mode")
+"""The other arguments of functions that record, of which a misspelt one may be meant."""
+_AS_GIVEN: Final = ("name", "frames_every", "frame_format", "shard", "steps", "on_error", "run_id")
 _STEPS: Final = ("all", "actions", "none")
+
+
+class PackingOptions(TypedDict, total=False):
+    """What is recorded of steps and of the code, and how it is packed, as `runner.record` explains."""
+
+    steps: Literal["all", "actions", "none"]
+    compression: str
+    level: int | None
+    index: str
+    chunk_steps: int
+    code: bool
+    system: bool
+    console: bool
+    run_id: str
+
+
+class RunOptions(PackingOptions, total=False):
+    """The arguments of `runner.record` that serve every way to record."""
+
+    name: str | None
+    seed: int | None
+    config: object
+    join: Run | str | os.PathLike[str] | Literal[True] | None
+    shard: str | None
+    on_error: Literal["raise", "warn"]
+
+
+class RecordOptions(RunOptions, total=False):
+    """Those and the ones that an environment needs which is called."""
+
+    info: Sequence[str]
+    frames_every: int
+    frame_format: str
 
 
 @dataclass(frozen=True)
@@ -41,13 +72,13 @@ class Options:
     """
 
     recordings: str | os.PathLike[str] | None
-    name: str | None
     seed: int | None
     settings: Any
     """The user's own settings as JSON holds them."""
     info: tuple[str, ...]
-    frames_every: int
-    frame_format: str
+    name: str | None = None
+    frames_every: int = 0
+    frame_format: str = "png"
     frames_of: tuple[int, ...] | None = None
     """The environments of a vector of which frames are recorded; None for all."""
     packing: Recording = field(default_factory=Recording)
@@ -103,34 +134,32 @@ class Options:
 
 def options_of(
     recordings: str | os.PathLike[str] | None,
-    name: str | None,
-    seed: int | None,
-    config: object,
-    info: Sequence[str],
-    packing: Mapping[str, Any],
-    frames_every: int = 0,
-    frame_format: str = "png",
+    given: Mapping[str, object],
     frames_of: tuple[int, ...] | None = None,
-    join: object = None,
-    shard: str | None = None,
-    on_error: str = "raise",
+    valid: Iterable[str] = RecordOptions.__annotations__,
 ) -> Options:
     """Return the options for the arguments of `record`.
+
+    Args:
+        recordings: the argument of that name.
+        given: the other arguments.
+        frames_of: the environments of a vector of which frames are recorded.
+        valid: the names of the arguments that the function has.
 
     Raises:
         ConfigError: an argument is unknown or cannot be used.
         RunnerError: the run to join is over, or there is none.
         MissingExtra: frames need Pillow, which is not installed.
     """
-    packing = dict(packing)
-    steps = packing.pop("steps", "all")
-    if steps == "actions":  # an index of messages would take more than they do
+    options: dict[str, Any] = dict(given)
+    if unknown := sorted(set(options) - {*valid}):
+        names = [name for name in valid if name != "run_id"]
+        hint = nearest(unknown[0], (*names, *_ARGUMENTS))
+        raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {', '.join(names)}.{hint}")
+    packing: dict[str, Any] = {name: options[name] for name in PACKING if name in options}
+    if options.get("steps") == "actions":  # an index of messages would take more than they do
         packing = {"index": "chunk"} | packing
-    run_id = packing.pop("run_id", None)
-    if unknown := sorted(set(packing) - set(PACKING)):
-        expected = ", ".join(("steps", *PACKING))
-        hint = nearest(unknown[0], ("steps", *PACKING, *_ARGUMENTS))
-        raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {expected}.{hint}")
+    info, config, seed = options.get("info", ()), options.get("config"), options.get("seed")
     if isinstance(info, str) and info != ALL_INFO:
         raise ConfigError(f"info: found {info!r}, expected a list of names, such as [{info!r}]")
     mapping = as_mapping({} if config is None else config)
@@ -145,30 +174,26 @@ def options_of(
         raise ConfigError(
             f"config: found what JSON cannot hold ({error}), expected text, numbers, lists and mappings."
         ) from error
-    if frames_every:
+    if options.get("frames_every"):
         pillow()
+    join, shard = options.pop("join", None), options.get("shard")
     if join is None and shard is not None:
         raise ConfigError(f"shard: found {shard!r} without join, expected the run to join: join=RUN")
-    if join is not None and (name is not None or seed is not None or settings):
+    if join is not None and (options.get("name") is not None or seed is not None or settings):
         raise ConfigError(
             "join: found name, seed or config, expected none of them: the run has them already. The process "
             "is named by shard."
         )
+    given_as_is = {name: options[name] for name in _AS_GIVEN if name in options}
     return Options(
         recordings=recordings,
-        name=name,
         seed=seed.item() if isinstance(seed, np.integer) else seed,
         settings=settings,
         info=tuple(info),
-        frames_every=frames_every,
-        frame_format=frame_format,
         frames_of=frames_of,
         packing=packing_from(packing),
         join=None if join is None else find_joined(join, recordings),
-        shard=shard,
-        steps=steps,
-        on_error=on_error,
-        run_id=run_id,
+        **given_as_is,
     )
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from numbers import Integral
-from typing import Any, Literal
+from typing import Any, Unpack
 
 from gymnasium import spaces
 
@@ -15,13 +15,12 @@ from runner.loops.description import Described, kind_of
 from runner.loops.generators import GeneratorWatch
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, game_maker_of
-from runner.loops.options import options_of
+from runner.loops.options import RecordOptions, options_of
 from runner.loops.recorded import RecordedAlone, require_pictures
 from runner.loops.single_rows import AgentRows
 from runner.loops.values import check_phase
 from runner.loops.vector import by_field, require_fixed
 from runner.replay.turns import Turns, is_in_turns
-from runner.runs.run import Run
 
 
 class RecordedParallel(RecordedAlone[AgentRows]):
@@ -121,18 +120,9 @@ def record_parallel(
     env: Any,
     recordings: str | os.PathLike[str] | None = None,
     *,
-    name: str | None = None,
-    seed: int | None = None,
-    config: object = None,
-    info: Sequence[str] = (),
-    frames_every: int = 0,
-    frame_format: str = "png",
     phase: str = "train",
     make: str | Callable[[], Any] | None = None,
-    join: Run | str | os.PathLike[str] | Literal[True] | None = None,
-    shard: str | None = None,
-    on_error: Literal["raise", "warn"] = "raise",
-    **packing: Any,
+    **options: Unpack[RecordOptions],
 ) -> RecordedParallel:
     """Return a PettingZoo parallel environment, with everything that a loop does with it recorded.
 
@@ -142,18 +132,10 @@ def record_parallel(
     Args:
         env: a `pettingzoo.ParallelEnv`.
         recordings: as for `record`.
-        name: as for `record`.
-        seed: as for `record`.
-        config: as for `record`.
-        info: names of fields of the agents' infos to record, where they occur.
-        frames_every: as for `record`; a frame shows the whole game.
-        frame_format: as for `record`.
         phase: `train` or `eval`.
         make: as for `record`.
-        join: as for `record`.
-        shard: as for `record`.
-        on_error: as for `record`.
-        packing: as for `record`.
+        options: the arguments that `record` has too; a frame shows the whole game, and `info` names fields
+            of the agents' infos.
 
     Raises:
         EnvironmentNotUsable: a space cannot be recorded, or there are more than 31 agents.
@@ -172,24 +154,11 @@ def record_parallel(
     check_phase(phase)
     described = _game(env)
     require_fixed(described)
-    if frames_every:
+    if options.get("frames_every"):
         require_pictures(env)
-    options = options_of(
-        recordings,
-        name,
-        seed,
-        config,
-        info,
-        packing,
-        frames_every,
-        frame_format,
-        join=join,
-        shard=shard,
-        on_error=on_error,
-    )
     maker = game_maker_of(env, checked_make(make))
     kind = RecordedAec if isinstance(env, Turns) and not env.removes else RecordedParallel
-    return kind(env, Loop(described, options, maker, AgentRows), phase)
+    return kind(env, Loop(described, options_of(recordings, options), maker, AgentRows), phase)
 
 
 def record_aec(env: Any, recordings: str | os.PathLike[str] | None = None, **options: Any) -> RecordedAec:

@@ -8,7 +8,7 @@ import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
@@ -20,12 +20,11 @@ from runner.loops.description import Described, describe
 from runner.loops.generators import States, VectorWatch
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, vector_maker_of
-from runner.loops.options import options_of
+from runner.loops.options import RecordOptions, options_of
 from runner.loops.recorded import Recorded, given, require_pictures
 from runner.loops.values import check_phase, frozen_options
 from runner.loops.vector_rows import VectorRows
 from runner.replay.stepping_vector import final_observations, spaces_of_one
-from runner.runs.run import Run
 
 if TYPE_CHECKING:
     _Wrapper = VectorWrapper[Any, Any, Any, Any, Any]
@@ -179,20 +178,11 @@ def record_vector(
     envs: AnyVectorEnv,
     recordings: str | os.PathLike[str] | None = None,
     *,
-    name: str | None = None,
-    seed: int | None = None,
-    config: object = None,
-    info: Sequence[str] = (),
-    frames_every: int = 0,
-    frame_format: str = "png",
     frames_of: int | Sequence[int] | None = None,
     autoreset_mode: AutoresetMode | str | None = None,
     phase: str = "train",
     make: str | Callable[[], Any] | None = None,
-    join: Run | str | os.PathLike[str] | Literal[True] | None = None,
-    shard: str | None = None,
-    on_error: Literal["raise", "warn"] = "raise",
-    **packing: Any,
+    **options: Unpack[RecordOptions],
 ) -> RecordedVector:
     """Return a vector environment, with everything that a loop does with it recorded.
 
@@ -205,23 +195,13 @@ def record_vector(
     Args:
         envs: a vector environment.
         recordings: as for `record`.
-        name: as for `record`.
-        seed: as for `record`.
-        config: as for `record`.
-        info: names of fields of the vector's infos to record.
-        frames_every: render a frame of each environment after this many steps, at its resets, and at the ends
-            of its episodes; "SameStep" environments show the next episode there. The environments must be
-            made with render_mode="rgb_array".
-        frame_format: as for `record`.
         frames_of: the number of the environment to render, or several; all unless given.
         autoreset_mode: how the environments reset themselves, if their metadata does not state it:
             "NextStep", "SameStep" or "Disabled"; "SameStep" for SuperSuit.
         phase: `train` or `eval`.
         make: as for `record`; the function makes the vector environment.
-        join: as for `record`.
-        shard: as for `record`.
-        on_error: as for `record`.
-        packing: as for `record`.
+        options: the arguments that `record` has too. Frames are of each environment; "SameStep" environments
+            show the next episode at the ends of episodes.
 
     Raises:
         EnvironmentNotUsable: a space cannot be recorded, or has values of varying size.
@@ -238,7 +218,8 @@ def record_vector(
         described = described_vector(envs, first)
         require_fixed(described)
         maker = vector_maker_of(envs, first, mode, checked_make(make))
-        watch = VectorWatch(envs, first, mode, sparse=packing.get("steps") == "actions")
+        watch = VectorWatch(envs, first, mode, sparse=options.get("steps") == "actions")
+    frames_every = options.get("frames_every", 0)
     if frames_every:
         require_pictures(envs)
     chosen = None if frames_of is None else tuple(sorted(set(np.atleast_1d(frames_of).tolist())))
@@ -247,22 +228,8 @@ def record_vector(
             f"frames_of: found {frames_of!r} with frames_every={frames_every}, expected numbers from 0 to "
             f"{envs.num_envs - 1}, and frames_every"
         )
-    options = options_of(
-        recordings,
-        name,
-        seed,
-        config,
-        info,
-        packing,
-        frames_every,
-        frame_format,
-        chosen,
-        join=join,
-        shard=shard,
-        on_error=on_error,
-    )
     rows = partial(VectorRows, next_step=mode == AutoresetMode.NEXT_STEP)
-    loop = Loop(described, options, maker, rows, (described.environments,))
+    loop = Loop(described, options_of(recordings, options, chosen), maker, rows, (described.environments,))
     return RecordedVector(envs, loop, mode, watch, phase)
 
 
