@@ -13,6 +13,7 @@ from runner.service.pages import (
     rerun,
     run,
     runs,
+    setup,
     static,
     submit,
     sweeps,
@@ -22,5 +23,5 @@ from runner.service.pages.rendering import add_error_handlers, refused
 __all__ = ["add_error_handlers", "refused", "router"]
 
 router = APIRouter(include_in_schema=False)
-for _module in (runs, rerun, run, replay, episodes, compare, machine, submit, jobs, sweeps, static):
+for _module in (runs, rerun, run, setup, replay, episodes, compare, machine, submit, jobs, sweeps, static):
     router.include_router(_module.router)

@@ -1,4 +1,4 @@
-"""The pages of a run: its status and metrics, its evaluations, its maps, its configuration and log."""
+"""The pages of a run: its status and metrics, its evaluations, its maps."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from http import HTTPStatus
 from itertools import islice
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
@@ -17,17 +17,13 @@ from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.axes import EPISODES
 from runner.analysis.evaluations import evaluation_record, evaluation_records
-from runner.analysis.summary import brief_provenance
 from runner.client.jobs import RunProgress
-from runner.config.document import write_yaml
 from runner.errors import RecordingError, RunnerError
 from runner.export.reports.evaluations import EvaluationTable, evaluation_table
 from runner.export.reports.rendering import View
-from runner.recording import schema
-from runner.recording.code import Code
 from runner.recording.labels import MAX_NOTE
 from runner.recording.metrics import METRICS
-from runner.recording.reader import Recording, open_recording
+from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics, RecentTraining
 from runner.runs.run import Run
 from runner.runs.shards import shards_in_words
@@ -58,25 +54,9 @@ if TYPE_CHECKING:
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 
-MAX_LINES: Final = 500
-"""Lines at the end of a run's log that its page shows."""
 MAX_EVALUATIONS: Final = 500
-MAX_PATCH_LINES: Final = 5000
-MAX_CODE_FILES: Final = 100
-"""Lines of the changes, and files, on the page of a run's code."""
-CODE_FACTS: Final = {
-    "git": "Commit",
-    "git.branch": "Branch",
-    "git.remote": "Remote",
-    "git.not_recorded": "Git",
-    "command": "Command",
-    "code.script": "Script",
-    "code.not_recorded": "Not recorded",
-    "code.left_out": "Left out",
-}
 MAX_LOGGED: Final = 8
 """Logged values on the first page of a run."""
-_LEVELS: Final = {1: "debug", 2: "info", 3: "warning", 4: "error", 5: "fatal"}
 
 
 @dataclass(frozen=True)
@@ -126,44 +106,6 @@ class _EvaluationsView(RunView):
 class _LearnedView(RunView):
     TEMPLATE: ClassVar = "run_learned.html"
     maps: str
-
-
-class CodeFile(NamedTuple):
-    """A recorded source."""
-
-    path: str
-    state: str
-    """How it relates to the commit, if it is not as the commit has it."""
-    text: str
-
-
-@dataclass(frozen=True)
-class _CodeView(RunView):
-    TEMPLATE: ClassVar = "run_code.html"
-    facts: Mapping[str, str]
-    packages: Mapping[str, str]
-    patch: list[str]
-    patch_left_out: int
-    files: list[CodeFile]
-    files_left_out: int
-    problem: str
-
-
-class LogLine(NamedTuple):
-    """A line of a run's log."""
-
-    step: int
-    level: str
-    message: str
-
-
-@dataclass(frozen=True)
-class _ConfigView(RunView):
-    TEMPLATE: ClassVar = "run_config.html"
-    yaml: str
-    facts: Mapping[str, str]
-    provenance: Mapping[str, str]
-    log: list[LogLine]
 
 
 @router.get("")
@@ -264,67 +206,6 @@ async def learned(request: Request, run: RecordedRun, cache: CacheOf, processes:
     key = ("maps", recording_state(run))
     maps = await cache.get_or_await(key, lambda: processes(fragments.maps, run.recording), LONG)
     return await run_in_threadpool(page, request, _LearnedView(head_of(run), "learned", maps.decode()))
-
-
-@router.get("/config")
-def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
-    """Show configuration, provenance and log."""
-    steps = [humanize.number(run.summary.get(name), 0) for name in ("train_steps", "eval_steps")]
-    facts = {
-        "Run": run.run_id,
-        "Begun": f"{run.created:%Y-%m-%d %H:%M:%S} UTC",
-        "Content digest": run.summary.content_digest or "none: computed when a run ends properly",
-        "Steps": f"{steps[0]} of training, {steps[1]} of evaluation",
-    }
-    provenance: Mapping[str, str] = {}
-    log: list[LogLine] = []
-    try:
-        with open_recording(run.recording) as recording:
-            facts |= {"Job hash": recording.job, "Size": humanize.size(recording.size)}
-            provenance, log = brief_provenance(recording.provenance), _log(recording)
-    except RecordingError as error:
-        facts["Recording"] = settings.without_folders(str(error))
-    return page(
-        request, _ConfigView(head_of(run), "config", write_yaml(run.file.config), facts, provenance, log)
-    )
-
-
-@router.get("/code")
-def code(request: Request, run: RecordedRun, recording: OpenRecording) -> Response:
-    """Show the user's code and the installed packages."""
-    provenance, problem, found = recording.provenance, "", Code()
-    try:
-        found = recording.code
-    except RecordingError as error:
-        problem = message_of(error, request)
-    patch = found.patch.splitlines()
-    files = [
-        CodeFile(path, "not in the commit" if path in found.new else "", text)
-        for path, text in sorted(
-            found.files.items(), key=lambda file: file[0] != provenance.get("code.script")
-        )
-    ]
-    is_code = ("git", "code.")
-    view = _CodeView(
-        head_of(run),
-        "code",
-        facts={
-            CODE_FACTS.get(key, key): text
-            for key, text in provenance.items()
-            if key.startswith(is_code) or key == "command"
-        },
-        packages={
-            key.removeprefix("package."): text
-            for key, text in provenance.items()
-            if key.startswith("package.")
-        },
-        patch=patch[:MAX_PATCH_LINES],
-        patch_left_out=max(0, len(patch) - MAX_PATCH_LINES),
-        files=files[:MAX_CODE_FILES],
-        files_left_out=max(0, len(files) - MAX_CODE_FILES),
-        problem=problem,
-    )
-    return page(request, view)
 
 
 async def _random_policy(run: Run, cache: ResponseCache, processes: ProcessPool) -> str:
@@ -428,14 +309,3 @@ def _duration(run: Run) -> str:
         return f"{humanize.duration((datetime.now(UTC) - run.created).total_seconds())} so far"
     seconds = run.summary.seconds
     return humanize.UNKNOWN if seconds is None else humanize.duration(seconds)
-
-
-def _log(recording: Recording) -> list[LogLine]:
-    return [
-        LogLine(
-            line["log_time"] // schema.STEP_NANOSECONDS,
-            _LEVELS.get(line["level"], str(line["level"])),
-            line["message"],
-        )
-        for line in deque(recording.decoded(schema.LOG_TOPIC), MAX_LINES)
-    ]

@@ -1,0 +1,155 @@
+"""The pages of how a run was made: its configuration, provenance and log, its code and packages."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Final, NamedTuple
+
+from fastapi import APIRouter, Request, Response
+
+from runner.analysis.summary import brief_provenance
+from runner.config.document import write_yaml
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.code import Code
+from runner.recording.messages import log_level
+from runner.recording.reader import Recording, open_recording
+from runner.service.dependencies import (
+    FoundRun,
+    OpenRecording,
+    RecordedRun,
+    SettingsOf,
+)
+from runner.service.pages.frame import RunView, head_of
+from runner.service.pages.rendering import message_of, page
+from runner.util import humanize
+
+router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
+
+MAX_LINES: Final = 500
+"""Lines at the end of a run's log that its page shows."""
+MAX_PATCH_LINES: Final = 5000
+MAX_CODE_FILES: Final = 100
+"""Lines of the changes, and files, on the page of a run's code."""
+CODE_FACTS: Final = {
+    "git": "Commit",
+    "git.branch": "Branch",
+    "git.remote": "Remote",
+    "git.not_recorded": "Git",
+    "command": "Command",
+    "code.script": "Script",
+    "code.not_recorded": "Not recorded",
+    "code.left_out": "Left out",
+}
+
+
+class CodeFile(NamedTuple):
+    """A recorded source."""
+
+    path: str
+    state: str
+    """How it relates to the commit, if it is not as the commit has it."""
+    text: str
+
+
+@dataclass(frozen=True)
+class _CodeView(RunView):
+    TEMPLATE: ClassVar = "run_code.html"
+    facts: Mapping[str, str]
+    packages: Mapping[str, str]
+    patch: list[str]
+    patch_left_out: int
+    files: list[CodeFile]
+    files_left_out: int
+    problem: str
+
+
+class LogLine(NamedTuple):
+    """A line of a run's log."""
+
+    step: int
+    level: str
+    message: str
+
+
+@dataclass(frozen=True)
+class _ConfigView(RunView):
+    TEMPLATE: ClassVar = "run_config.html"
+    yaml: str
+    facts: Mapping[str, str]
+    provenance: Mapping[str, str]
+    log: list[LogLine]
+
+
+@router.get("/config")
+def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
+    """Show configuration, provenance and log."""
+    steps = [humanize.number(run.summary.get(name), 0) for name in ("train_steps", "eval_steps")]
+    facts = {
+        "Run": run.run_id,
+        "Begun": f"{run.created:%Y-%m-%d %H:%M:%S} UTC",
+        "Content digest": run.summary.content_digest or "none: computed when a run ends properly",
+        "Steps": f"{steps[0]} of training, {steps[1]} of evaluation",
+    }
+    provenance: Mapping[str, str] = {}
+    log: list[LogLine] = []
+    try:
+        with open_recording(run.recording) as recording:
+            facts |= {"Job hash": recording.job, "Size": humanize.size(recording.size)}
+            provenance, log = brief_provenance(recording.provenance), _log(recording)
+    except RecordingError as error:
+        facts["Recording"] = settings.without_folders(str(error))
+    return page(
+        request, _ConfigView(head_of(run), "config", write_yaml(run.file.config), facts, provenance, log)
+    )
+
+
+@router.get("/code")
+def code(request: Request, run: RecordedRun, recording: OpenRecording) -> Response:
+    """Show the user's code and the installed packages."""
+    provenance, problem, found = recording.provenance, "", Code()
+    try:
+        found = recording.code
+    except RecordingError as error:
+        problem = message_of(error, request)
+    patch = found.patch.splitlines()
+    files = [
+        CodeFile(path, "not in the commit" if path in found.new else "", text)
+        for path, text in sorted(
+            found.files.items(), key=lambda file: file[0] != provenance.get("code.script")
+        )
+    ]
+    is_code = ("git", "code.")
+    view = _CodeView(
+        head_of(run),
+        "code",
+        facts={
+            CODE_FACTS.get(key, key): text
+            for key, text in provenance.items()
+            if key.startswith(is_code) or key == "command"
+        },
+        packages={
+            key.removeprefix("package."): text
+            for key, text in provenance.items()
+            if key.startswith("package.")
+        },
+        patch=patch[:MAX_PATCH_LINES],
+        patch_left_out=max(0, len(patch) - MAX_PATCH_LINES),
+        files=files[:MAX_CODE_FILES],
+        files_left_out=max(0, len(files) - MAX_CODE_FILES),
+        problem=problem,
+    )
+    return page(request, view)
+
+
+def _log(recording: Recording) -> list[LogLine]:
+    return [
+        LogLine(
+            line["log_time"] // schema.STEP_NANOSECONDS,
+            log_level(line["level"]).lower(),
+            line["message"],
+        )
+        for line in deque(recording.decoded(schema.LOG_TOPIC), MAX_LINES)
+    ]
