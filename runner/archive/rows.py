@@ -11,7 +11,7 @@ from blake3 import blake3
 from runner.archive import layout
 from runner.archive.columns import Shape
 from runner.recording import schema
-from runner.recording.messages import QTable, decode, encode, encode_image, encode_log
+from runner.recording.messages import QTable, decode, encode, encode_image, encode_log, log_level
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 
 _WITH_SPACES: Final = (schema.TRANSITION, schema.RESET)
@@ -40,8 +40,7 @@ def message_row(topic: Topic, payload: bytes, shape: Shape) -> dict[str, Any]:
     """
     values = decode(topic.message, payload)
     if topic.message is schema.LOG:
-        number = values["level"] if values["level"] in range(len(schema.LOG_LEVELS)) else 0
-        return {"name": values["name"], "level": schema.LOG_LEVELS[number], "message": values["message"]}
+        return {"name": values["name"], "level": log_level(values["level"]), "message": values["message"]}
     if topic.message is schema.IMAGE:
         return {"phase": topic.phase, **{name: values[name] for name in ("format", "data", layout.FRAME_ID)}}
     if topic.message in _WITH_SPACES:

@@ -30,7 +30,15 @@ from runner.loops.outcomes import Outcomes
 from runner.loops.shard_sources import PHASES, Source
 from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
-from runner.recording.messages import decode, encode, encode_image, encode_log, frame_id, frame_place
+from runner.recording.messages import (
+    decode,
+    encode,
+    encode_image,
+    encode_log,
+    frame_id,
+    frame_place,
+    log_level,
+)
 from runner.recording.metadata import json_object, sizes_of, write_result
 from runner.recording.reader import open_recording
 from runner.recording.recorder import Recorder
@@ -396,8 +404,7 @@ class _Fold:
         """Yield a message that belongs to a moment: a logged number, a text, an array, a checkpoint."""
         key, place = self._place(source, position)
         if topic.message == schema.LOG:
-            level = schema.LOG_LEVELS[fields["level"]]
-            seconds = place * STEP_NANOSECONDS / 1e9
+            seconds, level = place * STEP_NANOSECONDS / 1e9, log_level(fields["level"])
             yield place, encode_log(fields["message"], seconds, level, fields["name"])
         elif {"phase", "step", "episode"} <= fields.keys():
             keys, episodes = self._begun[fields["phase"]]

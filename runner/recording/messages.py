@@ -232,6 +232,11 @@ def encode_log(text: str, seconds: float, level: str = "INFO", name: str = "dual
     )
 
 
+def log_level(number: int) -> str:
+    """Return the name of a level of `foxglove.Log`; UNKNOWN for a number that it does not have."""
+    return LOG_LEVELS[number] if number in range(len(LOG_LEVELS)) else LOG_LEVELS[0]
+
+
 def encode_image(data: bytes, kind: str, position: int, frame_id: str) -> bytes:
     """Return a `foxglove.CompressedImage` logged after `position` steps; `kind` is `png` or `jpeg`."""
     seconds, nanos = divmod(position * STEP_NANOSECONDS, 10**9)
