@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import yaml
@@ -14,6 +16,9 @@ from starlette.testclient import TestClient
 import runner
 from runner.service.app import create_app
 from runner.service.settings import Settings
+
+if TYPE_CHECKING:
+    from selenium import webdriver
 
 ROOT = Path(__file__).parents[3]
 
@@ -79,3 +84,23 @@ def connect() -> Iterator[Callable[..., TestClient]]:
 def client(connect: Callable[..., TestClient], settings: Settings) -> TestClient:
     """Return a client of a service over those runs."""
     return connect(settings)
+
+
+@pytest.fixture
+def page(browser: webdriver.Chrome, served: str) -> Iterator[Callable[[str], webdriver.Chrome]]:
+    """Return a function that opens a page of the service `served`.
+
+    Afterwards there must be no error but the answers to a wrong configuration, and no request elsewhere.
+    """
+    browser.get_log("browser")
+
+    def open_page(address: str) -> webdriver.Chrome:
+        browser.get(served + address)
+        return browser
+
+    yield open_page
+    wrong = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+    assert [each for each in wrong if not ("/jobs/check" in each and " 422 " in each)] == []
+    log = " ".join(entry["message"] for entry in browser.get_log("performance"))
+    requested = set(re.findall(r'"url":"(\w+://[^"/]+)', log))
+    assert {address for address in requested if address.startswith(("http", "ws"))} <= {served}

@@ -60,24 +60,6 @@ def served(folder):
     assert "Traceback" not in server.log.read_text()
 
 
-@pytest.fixture
-def page(browser, served):
-    """Return a function that opens a page; afterwards there must be no error."""
-    browser.get_log("browser")
-
-    def open_page(address):
-        browser.get(served + address)
-        return browser
-
-    yield open_page
-    wrong = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
-    assert [message for message in wrong if " 422 " not in message] == []
-    requested = re.findall(
-        r'"url":"(\w+://[^"/]+)', " ".join(e["message"] for e in browser.get_log("performance"))
-    )
-    assert {address for address in requested if address.startswith(("http", "ws"))} <= {served}
-
-
 def text_of(browser, selector):
     return browser.find_element(By.CSS_SELECTOR, selector).text
 

@@ -25,18 +25,6 @@ def served(loops, tmp_path_factory):
     assert "Traceback" not in server.log.read_text()
 
 
-@pytest.fixture
-def opened(browser, served):
-    browser.get_log("browser")
-
-    def open_page(address):
-        browser.get(served + address)
-        return browser
-
-    yield open_page
-    assert [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
-
-
 def shown_pictures(browser):
     """Return the address of each picture that is shown."""
     return browser.execute_script(
@@ -46,8 +34,8 @@ def shown_pictures(browser):
 
 
 @pytest.mark.parametrize("name", ["pole", "framed", "game", "poles"])
-def test_pictures_appear_and_follow_the_slider(opened, name):
-    browser = opened(f"/runs/{name}/replay/train/1?t=3")
+def test_pictures_appear_and_follow_the_slider(page, name):
+    browser = page(f"/runs/{name}/replay/train/1?t=3")
     wait(browser, lambda: shown_pictures(browser))
     wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, ".series b"))
     slider = browser.find_element(By.CSS_SELECTOR, ".step")
@@ -66,8 +54,8 @@ def test_pictures_appear_and_follow_the_slider(opened, name):
     wait(browser, lambda: browser.current_url.endswith("?t=1"))
 
 
-def test_two_loops_are_played_in_step(opened):
-    browser = opened("/compare/replay?run=pole&run=framed&at=2:1")
+def test_two_loops_are_played_in_step(page):
+    browser = page("/compare/replay?run=pole&run=framed&at=2:1")
     wait(browser, lambda: len(shown_pictures(browser)) == 2)
     slider = browser.find_element(By.CSS_SELECTOR, ".both")
     before = shown_pictures(browser)
@@ -76,8 +64,8 @@ def test_two_loops_are_played_in_step(opened):
     assert browser.find_element(By.CSS_SELECTOR, ".both-count").text.startswith("step 4 of")
 
 
-def test_the_environments_of_a_vector_are_played_in_step(opened):
-    browser = opened("/runs/poles/replay/train/1")
+def test_the_environments_of_a_vector_are_played_in_step(page):
+    browser = page("/runs/poles/replay/train/1")
     browser.find_element(By.PARTIAL_LINK_TEXT, "side by side").click()
     wait(browser, lambda: len(shown_pictures(browser)) == 3)
     slider = browser.find_element(By.CSS_SELECTOR, ".both")
@@ -106,8 +94,8 @@ def test_the_report_contains_pictures(browser, loops, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["pole", "game", "rooms"])
-def test_nothing_sticks_out_of_a_narrow_page(opened, name):
-    browser = opened(f"/runs/{name}/replay/train/0")
+def test_nothing_sticks_out_of_a_narrow_page(page, name):
+    browser = page(f"/runs/{name}/replay/train/0")
     size = {"width": 380, "height": 800, "deviceScaleFactor": 1, "mobile": True}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     try:
