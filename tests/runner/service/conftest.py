@@ -90,7 +90,7 @@ def client(connect: Callable[..., TestClient], settings: Settings) -> TestClient
 def page(browser: webdriver.Chrome, served: str) -> Iterator[Callable[[str], webdriver.Chrome]]:
     """Return a function that opens a page of the service `served`.
 
-    Afterwards there must be no error but the answers to a wrong configuration, and no request elsewhere.
+    Afterwards there must be no error, except for a configuration that is wrong, and no request elsewhere.
     """
     browser.get_log("browser")
 
