@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import runner.integrations as integrations  # noqa: PLR0402
     from runner.api import run, run_all
     from runner.config import ExperimentConfig
+    from runner.debugging.what_if import what_if
     from runner.errors import RunnerError
     from runner.execution.rerecord import evaluate, rerecord
     from runner.execution.resume import resume
@@ -63,6 +64,7 @@ __all__ = [
     "run",
     "run_all",
     "verify",
+    "what_if",
 ]
 
 _HOME = {
@@ -87,6 +89,7 @@ _HOME = {
     "run": "runner.api",
     "run_all": "runner.api",
     "verify": "runner.execution.verify",
+    "what_if": "runner.debugging.what_if",
 }
 """The module of each public name that is not a module itself."""
 

@@ -152,6 +152,11 @@ class Learner:
         self._policy[:] = (self.tables.greedy.T * np.array(self.model.stride)).sum(axis=1)
 
     @property
+    def trial_actions(self) -> NDArray[np.int32]:
+        """The joint action of each state in the present evaluation, [S], or how it is drawn: see `kernel`."""
+        return self._policy
+
+    @property
     def policy(self) -> NDArray[np.int32] | list[NDArray[np.float64]]:
         """The policy of the present evaluation.
 

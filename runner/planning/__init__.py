@@ -9,8 +9,10 @@ from runner.planning.baseline import RandomBaseline, random_baseline
 from runner.planning.evaluation import (
     Cycle,
     Outcome,
+    action_values,
     evaluate_policy,
     evaluate_stochastic_policy,
+    policy_values,
     random_policy,
 )
 from runner.planning.optimality import ExactEvaluator
@@ -26,12 +28,14 @@ __all__ = [
     "ExactEvaluator",
     "Outcome",
     "RandomBaseline",
+    "action_values",
     "best_response",
     "best_response_to_stochastic",
     "evaluate_policy",
     "evaluate_stochastic_policy",
     "greedy_policy",
     "optimal_values",
+    "policy_values",
     "random_baseline",
     "random_policy",
 ]

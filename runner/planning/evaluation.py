@@ -15,7 +15,7 @@ from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
 from runner.planning import kernel
 from runner.planning.kernel import Chain, Paths
-from runner.planning.optimum import sweep_tolerance
+from runner.planning.optimum import require_discount, sweep_tolerance
 
 
 @dataclass(frozen=True)
@@ -90,16 +90,7 @@ def evaluate_policy(mdp: Mdp, policy: NDArray[np.int32], learners: int, discount
     Raises:
         EnvironmentNotUsable: it has no step limit.
     """
-    rows = np.arange(mdp.states)
-    chosen = _Chosen(
-        mdp.next_state[rows, policy],
-        mdp.probability[rows, policy],
-        mdp.rewards_of(learners)[rows, policy],
-        mdp.terminated[rows, policy],
-        (mdp.events[rows, policy] & mdp.success_mask) != 0,
-        mdp.summed_rewards[rows, policy] < mdp.penalty_below,
-    )
-    return _measured(mdp, chosen, discount)
+    return _measured(mdp, _chosen(mdp, policy, learners), discount)
 
 
 def evaluate_stochastic_policy(
@@ -117,11 +108,47 @@ def evaluate_stochastic_policy(
     Raises:
         EnvironmentNotUsable: it has no step limit.
     """
-    joint = joint_probabilities(policies)
-    if ((joint > 0).sum(axis=1) == 1).all():
-        return evaluate_policy(mdp, joint.argmax(axis=1).astype(np.int32), learners, discount)
-    chosen = _merged(mdp, joint[..., None] * mdp.probability, learners)
-    return _measured(mdp, chosen, discount)
+    return _measured(mdp, _drawn(mdp, joint_probabilities(policies), learners), discount)
+
+
+def policy_values(
+    mdp: Mdp, joint: NDArray[np.float64], learners: int, discount: float
+) -> NDArray[np.float64]:
+    """Return the discounted value of each state under a policy for each learner, [S, learners].
+
+    The horizon is infinite: an episode that the environment cuts off counts as if it went on.
+
+    Args:
+        mdp: the environment.
+        joint: [S, J]: the probability of each joint action.
+        learners: 1, or the number of agents; each has its own reward.
+        discount: below 1.
+
+    Raises:
+        EnvironmentNotUsable: the discount is not below 1.
+    """
+    require_discount(discount)
+    chosen = _drawn(mdp, joint, learners)
+    if not _is_certain(chosen):
+        return _stochastic_values(chosen, discount)
+    chain = _chain(chosen)
+    return _chain_values(chain, kernel.find_paths(chain), discount)
+
+
+def action_values(
+    mdp: Mdp, state: int, values: NDArray[np.float64], rewards: NDArray[np.float64], discount: float
+) -> NDArray[np.float64]:
+    """Return what each joint action in a state is worth if later steps are worth `values`, [J, n].
+
+    Args:
+        mdp: the environment.
+        state: in which the actions are taken.
+        values: [S, n]: the values of the states.
+        rewards: [S, J, K, n]: those that count.
+        discount: of the values.
+    """
+    outcome = rewards[state] + discount * (~mdp.terminated[state])[..., None] * values[mdp.next_state[state]]
+    return np.asarray((mdp.probability[state][..., None] * outcome).sum(axis=1))
 
 
 def random_policy(mdp: Mdp) -> list[NDArray[np.float64]]:
@@ -144,9 +171,7 @@ def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> Outcome:
         )
     starts = np.flatnonzero(mdp.start > 0)
     weights = mdp.start[starts]
-    certain = ((chosen.probability > 0).sum(axis=1) == 1).all()
-    certain &= np.isin(chosen.penalty, (0, 1)).all()  # merged outcomes may be penalties by chance
-    measure = _deterministic if certain else _stochastic
+    measure = _deterministic if _is_certain(chosen) else _stochastic
     found = measure(chosen, starts, weights, mdp.step_limit, discount)
     length, penalties, *returns = _means(found.totals, weights)
     return Outcome(
@@ -159,6 +184,32 @@ def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> Outcome:
         values=_means(found.values, weights),
         cycles=found.cycles,
     )
+
+
+def _is_certain(chosen: _Chosen) -> bool:
+    """Return whether each state has one outcome; merged outcomes may be penalties by chance."""
+    only_one = ((chosen.probability > 0).sum(axis=1) == 1).all()
+    return bool(only_one and np.isin(chosen.penalty, (0, 1)).all())
+
+
+def _chosen(mdp: Mdp, policy: NDArray[np.int32], learners: int) -> _Chosen:
+    """Return the outcomes of each state under a deterministic policy."""
+    rows = np.arange(mdp.states)
+    return _Chosen(
+        mdp.next_state[rows, policy],
+        mdp.probability[rows, policy],
+        mdp.rewards_of(learners)[rows, policy],
+        mdp.terminated[rows, policy],
+        (mdp.events[rows, policy] & mdp.success_mask) != 0,
+        mdp.summed_rewards[rows, policy] < mdp.penalty_below,
+    )
+
+
+def _drawn(mdp: Mdp, joint: NDArray[np.float64], learners: int) -> _Chosen:
+    """Return the outcomes of each state under a policy that draws, [S, J]."""
+    if ((joint > 0).sum(axis=1) == 1).all():
+        return _chosen(mdp, joint.argmax(axis=1).astype(np.int32), learners)
+    return _merged(mdp, joint[..., None] * mdp.probability, learners)
 
 
 def _merged(mdp: Mdp, probability: NDArray[np.float64], learners: int) -> _Chosen:
@@ -198,27 +249,15 @@ def _merged(mdp: Mdp, probability: NDArray[np.float64], learners: int) -> _Chose
 def _deterministic(
     chosen: _Chosen, starts: NDArray[np.int64], weights: NDArray[np.float64], limit: int, discount: float
 ) -> _AtStarts:
-    only = np.arange(len(chosen.next_state)), chosen.probability.argmax(axis=1)
-    chain = Chain(
-        chosen.next_state[only].astype(np.int64),
-        np.ascontiguousarray(chosen.rewards[only]),
-        chosen.terminated[only],
-        chosen.success[only],
-        chosen.penalty[only],
-    )
+    chain = _chain(chosen)
     paths = kernel.find_paths(chain)
     lengths, returns, counts = kernel.play_all(chain, paths, starts, limit)
-    values = np.full_like(chain.rewards, np.nan)
-    if discount < 1:
-        steps = paths.length + paths.away  # to the end of the episode, or to its cycle
-        order = np.argsort(steps, kind="stable")
-        kernel.discounted_paths(chain, paths, order[steps[order] > 0], discount, values)
     timed_out = (paths.cycle[starts] >= 0) | (paths.length[starts] > limit)
     return _AtStarts(
         success_percent=_mean(100.0 * (counts[:, 0] > 0), weights),
         timeout_percent=_mean(100.0 * timed_out, weights),
         totals=np.column_stack([lengths, counts[:, 1], returns]),
-        values=values[starts],
+        values=_chain_values(chain, paths, discount)[starts],
         cycles=_cycles(paths, starts, weights),
     )
 
@@ -227,16 +266,47 @@ def _stochastic(
     chosen: _Chosen, starts: NDArray[np.int64], weights: NDArray[np.float64], limit: int, discount: float
 ) -> _AtStarts:
     p = chosen.probability
-    expected = (p[..., None] * chosen.rewards).sum(axis=1)
-    gains = np.column_stack([np.ones(len(p)), (p * chosen.penalty).sum(axis=1), expected])
+    gains = np.column_stack([np.ones(len(p)), (p * chosen.penalty).sum(axis=1), _expected_rewards(chosen)])
     chances, totals = kernel.expect(chosen.next_state, p, chosen.terminated, chosen.success, gains, limit)
-    values = np.full_like(expected, np.nan)
+    succeeded, ended = _means(chances[starts], weights)
+    values = _stochastic_values(chosen, discount)
+    return _AtStarts(100 * succeeded, 100 * (1 - ended), totals[starts], values[starts])
+
+
+def _chain(chosen: _Chosen) -> Chain:
+    only = np.arange(len(chosen.next_state)), chosen.probability.argmax(axis=1)
+    return Chain(
+        chosen.next_state[only].astype(np.int64),
+        np.ascontiguousarray(chosen.rewards[only]),
+        chosen.terminated[only],
+        chosen.success[only],
+        chosen.penalty[only],
+    )
+
+
+def _chain_values(chain: Chain, paths: Paths, discount: float) -> NDArray[np.float64]:
+    """Return the discounted values of a chain, [S, L]; nan for a discount of 1."""
+    values = np.full_like(chain.rewards, np.nan)
+    if discount < 1:
+        steps = paths.length + paths.away  # to the end of the episode, or to its cycle
+        order = np.argsort(steps, kind="stable")
+        kernel.discounted_paths(chain, paths, order[steps[order] > 0], discount, values)
+    return values
+
+
+def _stochastic_values(chosen: _Chosen, discount: float) -> NDArray[np.float64]:
+    """Return the discounted values of outcomes by chance, [S, L]; nan for a discount of 1."""
+    rewards = _expected_rewards(chosen)
+    values = np.full_like(rewards, np.nan)
     if discount < 1:
         values[:] = 0.0
-        weight = discount * p * ~chosen.terminated
-        kernel.discounted(chosen.next_state, weight, expected, values, sweep_tolerance(discount))
-    succeeded, ended = _means(chances[starts], weights)
-    return _AtStarts(100 * succeeded, 100 * (1 - ended), totals[starts], values[starts])
+        weight = discount * chosen.probability * ~chosen.terminated
+        kernel.discounted(chosen.next_state, weight, rewards, values, sweep_tolerance(discount))
+    return values
+
+
+def _expected_rewards(chosen: _Chosen) -> NDArray[np.float64]:
+    return np.asarray((chosen.probability[..., None] * chosen.rewards).sum(axis=1))
 
 
 def _cycles(paths: Paths, starts: NDArray[np.int64], weights: NDArray[np.float64]) -> tuple[Cycle, ...]:

@@ -99,6 +99,19 @@ def best_response_to_stochastic(
     return _iterated(by_own_action(mdp.next_state), weight, reward.sum(axis=-1), discount)
 
 
+def require_discount(discount: float) -> None:
+    """Refuse a discount with which an infinite process may have no value.
+
+    Raises:
+        EnvironmentNotUsable: it is not below 1.
+    """
+    if not 0 <= discount < 1:
+        raise EnvironmentNotUsable(
+            f"found discount {discount}, expected one from 0 up to below 1: "
+            "else a process without an end has no value."
+        )
+
+
 def sweep_tolerance(discount: float) -> float:
     """Return by how much the last sweep may change a value so that all are within the tolerance."""
     return TOLERANCE * (1 - discount) / max(discount, 0.5)
@@ -106,11 +119,7 @@ def sweep_tolerance(discount: float) -> float:
 
 def _weight(mdp: Mdp, discount: float) -> NDArray[np.float64]:
     """Return the discounted probability [S, J, K] that an outcome comes and the episode goes on."""
-    if not 0 <= discount < 1:
-        raise EnvironmentNotUsable(
-            f"found discount {discount}, expected one from 0 up to below 1: "
-            "else a process without an end has no value."
-        )
+    require_discount(discount)
     return np.asarray(discount * mdp.probability * ~mdp.terminated)
 
 

@@ -67,6 +67,11 @@ class StepReplay:
         """Training steps that the tables have learned from."""
 
     @property
+    def learner(self) -> Learner:
+        """The learner with the tables at `step`."""
+        return self._learner
+
+    @property
     def agents(self) -> tuple[str, ...]:
         """The names of the learners."""
         return self._learner.agents

@@ -76,6 +76,14 @@ def branch_command(
       dualtaxi branch lander --at 4:100 --action 0.5,-0.2 --policy agent:act
       dualtaxi branch spread --at 0:10 --action agent_0=1 --action agent_2=4
     """
+    run = find_recorded(run_name, recordings)
+    if at is None:
+        raise click.UsageError("expected --at EPISODE:T or --at eval:N:TRIAL:T, the step to branch at")
+    if run.can_train_again:
+        from runner.cli.what_if import print_what_if
+
+        print_what_if(run, at, actions, as_json)
+        return
     from runner.loops.branch import Outcome, branch
 
     action: Any = actions[0] if len(actions) == 1 else None
@@ -84,9 +92,6 @@ def branch_command(
         if not all(equals for _, equals, _ in pairs):
             raise click.UsageError("--action: several are for the agents of a game: AGENT=VALUE each.")
         action = {agent: value for agent, _, value in pairs}
-    run = find_recorded(run_name, recordings)
-    if at is None:
-        raise click.UsageError("expected --at EPISODE:T or --at eval:N:TRIAL:T, the step to branch at")
     with steps_line("branching") as report:
         found = branch(
             run,

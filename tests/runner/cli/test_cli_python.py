@@ -42,6 +42,7 @@ def test_the_public_names():
         "run",
         "run_all",
         "verify",
+        "what_if",
     ]
     for name in runner.__all__:
         assert getattr(runner, name) is not None

@@ -1,0 +1,175 @@
+"""An episode played on from one of its steps with the tables of that moment: the same draws, no learning."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.learning import algorithms, kernel
+from runner.learning.kernel import Tally
+from runner.learning.learner import Learner
+from runner.learning.schedules import compile_schedule, schedule_value
+from runner.planning.evaluation import joint_probabilities
+
+
+class Moment(NamedTuple):
+    """The step of an episode from which it is played on."""
+
+    phase: Literal["train", "eval"]
+    episode: int
+    """Counted over the phase."""
+    step: int
+    """Counted over the phase."""
+    t: int
+    state: int
+    trained_episode: int
+    """Of training, at which schedules are read: that of a trial is the one after its evaluation."""
+    trained_step: int
+
+
+class Continuation:
+    """An episode played on, by the kernels that record episodes.
+
+    Args:
+        learner: its tables are those of the moment; they do not change.
+        moment: the step.
+    """
+
+    def __init__(self, learner: Learner, moment: Moment) -> None:
+        self._learner, self._moment = learner, moment
+        learner.begin_evaluation()
+        rules = learner.rules
+        draws_actions = len(rules.algorithm) == algorithms.WOLF_PHC
+        # Without learning all others act alike; SARSA would expect that its next action is chosen already.
+        algorithm = rules.algorithm if draws_actions else (0,) * algorithms.Q_LEARNING
+        self._rules = rules._replace(learns=False, algorithm=algorithm)
+
+    @property
+    def discount(self) -> float:
+        """The discount at the moment."""
+        return self._scheduled(self._learner.rules.discount)
+
+    @property
+    def epsilon(self) -> float:
+        """The probability of exploring at the moment; 1 of random agents."""
+        rules = self._learner.rules
+        if self._moment.phase == "eval":
+            return 0.0 if rules.learns else 1.0
+        epsilon = self._scheduled(rules.epsilon)
+        return 1.0 - epsilon if rules.epsilon_exploits else epsilon
+
+    @property
+    def policy_in_words(self) -> str:
+        """What acts from the moment on."""
+        if not self._learner.rules.learns:
+            return "random"
+        own = "greedy"
+        if len(self._rules.algorithm) == algorithms.WOLF_PHC:
+            own = "drawn from the learned policies"
+        return own if self._moment.phase == "eval" else f"{own}, exploring with probability {self.epsilon:g}"
+
+    @property
+    def policy(self) -> NDArray[np.float64]:
+        """The probability of each joint action in each state, [S, J], with the epsilon of the moment."""
+        learner, epsilon = self._learner, self.epsilon
+        width, policy = learner.model.width, learner.policy
+        if isinstance(policy, np.ndarray):
+            own = [np.eye(n)[learner.tables.greedy[i]] for i, n in enumerate(width)]
+        else:
+            own = policy
+        if self._rules.independent:
+            return joint_probabilities(
+                [epsilon / n + (1 - epsilon) * table for n, table in zip(width, own, strict=True)]
+            )
+        joint = joint_probabilities(own)
+        return epsilon / math.prod(width) + (1 - epsilon) * joint
+
+    def play(self, action: int, steps: NDArray[np.void], episodes: NDArray[np.void]) -> int:
+        """Take a joint action, play on until the episode ends or `steps` is full, and return the steps taken.
+
+        Args:
+            action: the first one, whatever the policy would choose.
+            steps: step records of the phase, filled.
+            episodes: one episode record of the phase, overwritten.
+        """
+        moment, learner = self._moment, self._learner
+        cursor = np.zeros(1, kernel.CURSOR)
+        for name in ("step", "episode", "t", "state"):
+            cursor[name] = getattr(moment, name)
+        tally = Tally(
+            np.zeros(len(learner.agents)),
+            np.zeros(len(learner.model.event_mask), np.int64),
+            np.zeros(1, np.int32),
+            np.zeros(1, np.int64),
+        )
+        play = self._train if moment.phase == "train" else self._evaluate
+        filled, ended = play(cursor, tally, steps[:1], episodes, action)
+        if not ended and len(steps) > 1:
+            filled += play(cursor, tally, steps[1:], episodes, None)[0]
+        return filled
+
+    def _train(
+        self,
+        cursor: NDArray[np.void],
+        tally: Tally,
+        steps: NDArray[np.void],
+        episodes: NDArray[np.void],
+        action: int | None,
+    ) -> tuple[int, int]:
+        learner, rules = self._learner, self._rules
+        tables = learner.tables
+        if action is not None:  # greedy agents that prefer it take it
+            state, own = self._moment.state, learner.model.own_action[action]
+            rules = rules._replace(epsilon=compile_schedule(0.0), epsilon_exploits=False)
+            tables = tables._replace(greedy=tables.greedy.copy(), extra=tables.extra.copy())
+            tables.greedy[:, state] = own
+            if len(rules.algorithm) == algorithms.WOLF_PHC:
+                for offset, width, choice in zip(tables.offset, learner.model.width, own, strict=True):
+                    row = tables.extra[algorithms.POLICY, offset + state * width :][:width]
+                    row[:] = np.arange(width) == choice
+        filled, ended = kernel.train(
+            cursor,
+            learner.seed,
+            learner.model,
+            tables,
+            rules,
+            tally,
+            steps,
+            episodes,
+            self._moment.episode + 1,
+            2**62,
+        )
+        return int(filled), int(ended)
+
+    def _evaluate(
+        self,
+        cursor: NDArray[np.void],
+        tally: Tally,
+        steps: NDArray[np.void],
+        episodes: NDArray[np.void],
+        action: int | None,
+    ) -> tuple[int, int]:
+        learner, state = self._learner, self._moment.state
+        policy = learner.trial_actions
+        if action is not None:
+            policy = policy.copy()
+            policy[state] = action
+        filled, ended = kernel.evaluate(
+            cursor,
+            learner.seed,
+            learner.model,
+            learner.tables,
+            policy,
+            tally,
+            steps,
+            episodes,
+            self._moment.episode + 1,
+            state,
+        )
+        return int(filled), int(ended)
+
+    def _scheduled(self, schedule: NDArray[np.float64]) -> float:
+        return float(schedule_value(schedule, self._moment.trained_episode, self._moment.trained_step))

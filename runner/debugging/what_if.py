@@ -1,0 +1,376 @@
+"""What if another action had been taken? Each joint action at a recorded step, played on without learning.
+
+    found = runner.what_if(run, at="eval:3000:17:5")
+    for action in found.actions:
+        print(action.name, action.returns, action.length, action.end, action.values, action.regret)
+
+The tables are those of that moment and the draws those of the episode, so the recorded action of a trial
+leads exactly where it did. The exact value of each action follows from the environment's arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.analysis.sections import Grid
+from runner.analysis.step_reference import StepRef
+from runner.debugging.continuation import Continuation, Moment
+from runner.environments.mdp import Mdp, events_of
+from runner.environments.naming import actions_in_words, spoken, states_in_words
+from runner.errors import ConfigError, RecordingError, nearest
+from runner.export.contents import ending_of, require_steps
+from runner.export.episodes import EpisodePlace, place_of
+from runner.planning.evaluation import action_values, policy_values
+from runner.planning.optimum import optimal_values
+from runner.recording import schema
+from runner.recording.blocks import blank_records
+from runner.recording.metadata import sizes_of
+from runner.recording.reader import Recording, open_recording
+from runner.replay.steps import check_steps, episode_blocks
+from runner.replay.tables import TableReplay
+from runner.runs.run import Run
+from runner.util.humanize import number
+from runner.util.values import finite
+
+ALL: Final = "all"
+"""Stands for every joint action."""
+MAX_STEPS: Final = 100_000
+"""Steps that an action is played on for where the environment has no step limit."""
+ENDS: Final = {
+    "success": "success",
+    "terminated": "terminated",
+    "truncated": "step limit",
+    "reset": "reset",
+    "cut off": "not over",
+}
+"""How an episode ends, by the keys of `ENDINGS`, in the words of a table."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Where an episode led, from its beginning to its end."""
+
+    returns: tuple[float, ...]
+    """The sum of each learner's rewards."""
+    length: int
+    end: str
+    """A key of `ENDS`."""
+
+
+@dataclass(frozen=True)
+class ActionOutcome(Outcome):
+    """Where an action leads, and what it is worth."""
+
+    action: int
+    """The number of the joint action."""
+    name: str
+    is_recorded: bool
+    probability: float
+    """With which the policy takes it in this state."""
+    learned: tuple[float, ...]
+    """Its Q-value in each learner's table; empty if nothing is learned."""
+    values: tuple[float | None, ...]
+    """Its exact value for each learner if the policy acts from there on; None with a discount of 1."""
+    optimal_value: float | None
+    """Its exact value for all together if they act optimally from there on; None with a discount of 1."""
+    regret: float | None
+    """By how much `optimal_value` is below that of the best action."""
+
+
+@dataclass(frozen=True)
+class WhatIf:
+    """The actions at a step of an episode, and where each leads."""
+
+    run_id: str
+    at: str
+    """The step, as a reference."""
+    title: str
+    """The name of the episode."""
+    state: int
+    state_in_words: str
+    tables_step: int
+    """Training steps that the tables have learned from."""
+    learners: tuple[str, ...]
+    policy: str
+    """What acts from the step on, in words."""
+    epsilon: float
+    discount: float
+    recorded: Outcome
+    """Where the episode led."""
+    actions: tuple[ActionOutcome, ...]
+    """Those of the highest value first, summed over learners."""
+    notes: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all fields as JSON can hold them."""
+        plain = {name: value for name, value in vars(self).items() if name not in ("recorded", "actions")}
+        fields: dict[str, Any] = finite(
+            plain | {"recorded": vars(self.recorded), "actions": [vars(action) for action in self.actions]}
+        )
+        return fields
+
+
+@dataclass(frozen=True)
+class Branched:
+    """An action's episode from the step on."""
+
+    place: EpisodePlace
+    steps: NDArray[np.void]
+    outcome: Outcome
+
+
+def what_if(run: Run, *, at: str | StepRef, actions: Sequence[str | int] = ()) -> WhatIf:
+    """Return where each joint action at a step of a job's episode leads, or some of them.
+
+    Args:
+        run: a run that was trained here, with its steps.
+        at: the step: `EPISODE:T` of training, or `eval:N:TRIAL:T`.
+        actions: numbers or names of joint actions, such as `north + east`; all if there are none.
+
+    Raises:
+        ConfigError: there is no such action.
+        RecordingError: there is no such episode or step, its steps were not recorded, or it is damaged.
+        RunnerError: the run was recorded from a loop.
+    """
+    with open_recording(run.recording) as recording:
+        return what_if_in(recording, StepRef.parse(at) if isinstance(at, str) else at, actions)
+
+
+def what_if_in(recording: Recording, at: StepRef, actions: Sequence[str | int] = ()) -> WhatIf:
+    """Return where actions lead, as `what_if` does, from an open recording."""
+    branches, mdp = _Branches(recording, at), recording.mdp
+    chosen = (
+        range(mdp.joint_actions)
+        if not actions or ALL in actions
+        else [parse_action(mdp, each) for each in actions]
+    )
+    return branches.compare(dict.fromkeys(chosen))
+
+
+def branched(recording: Recording, at: StepRef, action: str | int) -> Branched:
+    """Return the episode of one action, from the step on; errors as for `what_if`."""
+    branches = _Branches(recording, at)
+    return branches.play(parse_action(recording.mdp, action))
+
+
+def parse_action(mdp: Mdp, given: str | int) -> int:
+    """Return a joint action from its number or name, `north + east` or `north+east`.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    names = [str(name) for name in actions_in_words(mdp)]
+    compact = {_compact(name): action for action, name in enumerate(names)}
+    if (found := compact.get(_compact(str(given)))) is not None:
+        return found
+    if str(given).strip().isdecimal() and int(given) < len(names):
+        return int(given)
+    raise ConfigError(
+        f"action: found {str(given)[:60]!r}, expected a joint action, 0 to {len(names) - 1} or a name "
+        f"such as {names[0]!r}, or `all`.{nearest(str(given), names)}"
+    )
+
+
+def grid_of(found: WhatIf) -> Grid:
+    """Return the actions as a table of text."""
+    several = len(found.learners) > 1
+    own = [f" {spoken(learner)}" if several else "" for learner in found.learners]
+    has_learned = bool(found.actions[0].learned)
+    headings = (
+        "action",
+        *(f"return{who}" for who in own),
+        "length",
+        "end",
+        "policy",
+        *(f"learned{who}" for who in own if has_learned),
+        *(f"value{who}" for who in own),
+        "optimal",
+        "regret",
+    )
+    rows = [
+        (
+            f"{row.name}{' (recorded)' if row.is_recorded else ''}",
+            *(number(value, 0 if value % 1 == 0 else 2) for value in row.returns),
+            f"{row.length:,}",
+            ENDS[row.end],
+            f"{100 * row.probability:.3g} %",
+            *(number(value, 3) for value in (*row.learned, *row.values, row.optimal_value, row.regret)),
+        )
+        for row in found.actions
+    ]
+    return Grid(headings, rows)
+
+
+class _Branches:
+    """The branches of one step of a recorded episode.
+
+    Args:
+        recording: of a job.
+        at: the step.
+
+    Raises:
+        RecordingError: there is no such step, its tables are unknown, or it is damaged.
+        RunnerError: it is the recording of a loop.
+    """
+
+    def __init__(self, recording: Recording, at: StepRef) -> None:
+        recording.require_job(
+            "what if", "`dualtaxi branch` and runner.branch() play a loop on with one action."
+        )
+        require_steps(recording, "branch")
+        self._recording, self._at, self._mdp = recording, at, recording.mdp
+        self._place = place_of(recording, (at.episode,) if at.after is None else (at.after, at.episode))
+        self._read_episode()
+        is_training, step = at.after is None, int(self._step["step"])
+        self._tables = TableReplay(recording, step if is_training else self._place.table_step)
+        moment = Moment(
+            phase="train" if is_training else "eval",
+            episode=self._place.number,
+            step=step,
+            t=at.t,
+            state=int(self._step["state"]),
+            trained_episode=at.episode if at.after is None else at.after,
+            trained_step=self._tables.step,
+        )
+        self._playing = Continuation(self._tables.learner, moment)
+
+    def _read_episode(self) -> None:
+        """Read the step, what came before it, and where the episode led."""
+        recording, phase, episode, t = self._recording, self._place.phase, self._place.number, self._at.t
+        span = recording.episode_span(phase, episode)
+        if t >= len(span):
+            raise RecordingError(
+                f"{recording.path}: {self._place.title} has {len(span):,} steps, from 0; found no step {t:,}."
+            )
+        self._returns, self._succeeded, done = np.zeros(len(recording.agents)), False, 0
+        returns = self._returns
+        for block in episode_blocks(recording, phase, episode):
+            check_steps(block, self._mdp, str(recording.path), schema.PHASE_NAMES[phase])
+            before = block[: max(0, t - done)]
+            self._returns = _summed(self._returns, before)
+            self._succeeded |= self._has_success(before)
+            if done <= t < done + len(block):
+                self._step = block[t - done].copy()
+            returns = _summed(returns, block)
+            done += len(block)
+        self._recorded = Outcome(tuple(returns.tolist()), len(span), ending_of(recording, phase, episode))
+
+    def _has_success(self, steps: NDArray[np.void]) -> bool:
+        return len(steps) > 0 and bool((events_of(self._mdp, steps) & self._mdp.success_mask).any())
+
+    def play(self, action: int) -> Branched:
+        """Return the episode of an action, from the step on."""
+        recording, place, t = self._recording, self._place, self._at.t
+        limit = self._mdp.step_limit - t if self._mdp.step_limit else MAX_STEPS
+        sizes = sizes_of(recording.run, str(recording.path))
+        blocks = [
+            blank_records(topic, sizes[topic], count).view(np.recarray)
+            for topic, count in (
+                (recording.topic(f"/{place.phase}/step"), limit),
+                (recording.topic(f"/{place.phase}/episode"), 1),
+            )
+        ]
+        steps: NDArray[np.void] = blocks[0][: self._playing.play(action, *blocks)]
+        times = self._step["log_time"] + np.arange(len(steps), dtype=np.uint64) * schema.STEP_NANOSECONDS
+        steps["log_time"] = steps["publish_time"] = times
+        if action == int(self._step["action"]):
+            steps[0]["explored"] = self._step["explored"]
+        end = next((end for end in ("terminated", "truncated") if steps[-1][end]), "cut off")
+        if self._succeeded or self._has_success(steps):
+            end = "success"
+        returns = tuple(_summed(self._returns, steps).tolist())
+        return Branched(place, steps, Outcome(returns, t + len(steps), end))
+
+    def compare(self, actions: Iterable[int]) -> WhatIf:
+        """Return where each of some joint actions leads."""
+        recording, mdp, playing = self._recording, self._mdp, self._playing
+        state, recorded = int(self._step["state"]), int(self._step["action"])
+        names, probabilities = actions_in_words(mdp), playing.policy
+        learned = self._learned(state)
+        values, optimal = self._exact_values(state, probabilities)
+        rows = [
+            ActionOutcome(
+                **vars(self.play(action).outcome),
+                action=action,
+                name=str(names[action]),
+                is_recorded=action == recorded,
+                probability=float(probabilities[state, action]),
+                learned=learned[action],
+                values=tuple(map(finite, values[action].tolist())),
+                optimal_value=finite(float(optimal[action])),
+                regret=finite(float(optimal.max() - optimal[action])),
+            )
+            for action in actions
+        ]
+        return WhatIf(
+            run_id=recording.run_id,
+            at=str(self._at),
+            title=self._place.title,
+            state=state,
+            state_in_words=str(states_in_words(mdp)[state]),
+            tables_step=self._tables.step,
+            learners=recording.agents,
+            policy=playing.policy_in_words,
+            epsilon=playing.epsilon,
+            discount=playing.discount,
+            recorded=self._recorded,
+            actions=tuple(sorted(rows, key=_rank)),
+            notes=tuple(self._notes(rows)),
+        )
+
+    def _learned(self, state: int) -> list[tuple[float, ...]]:
+        """Return the Q-values of each joint action in a state; empty tuples where nothing is learned."""
+        if not self._tables.learner.rules.learns:
+            return [()] * self._mdp.joint_actions
+        rows = [table[state] for table in self._tables.tables]
+        own = self._tables.own_actions
+        return [
+            tuple(float(row[action]) for row, action in zip(rows, actions, strict=True))
+            for actions in own.tolist()
+        ]
+
+    def _exact_values(
+        self, state: int, policy: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the values of each joint action under the policy, [J, learners], and the optimum, [J]."""
+        mdp, learners, discount = self._mdp, len(self._recording.agents), self._playing.discount
+        if discount >= 1:
+            return np.full((mdp.joint_actions, learners), np.nan), np.full(mdp.joint_actions, np.nan)
+        own = policy_values(mdp, policy, learners, discount)
+        best = optimal_values(mdp, discount)[:, np.newaxis]
+        return (
+            action_values(mdp, state, own, mdp.rewards_of(learners), discount),
+            action_values(mdp, state, best, mdp.summed_rewards[..., np.newaxis], discount)[:, 0],
+        )
+
+    def _notes(self, rows: Sequence[ActionOutcome]) -> Iterator[str]:
+        """Yield what a reader must know about these figures, a sentence each."""
+        if self._at.after is None:
+            yield (
+                "nothing is learned after the step, so even the recorded action may lead elsewhere than it "
+                "did, because training went on"
+            )
+        if self._playing.discount >= 1:
+            yield "there are no exact values: with a discount of 1 a process without end has none"
+        if any(row.end == "cut off" for row in rows):
+            yield f"episodes that were not over after {MAX_STEPS:,} more steps were not played to their end"
+
+
+def _summed(returns: NDArray[np.float64], steps: NDArray[np.void]) -> NDArray[np.float64]:
+    """Return returns after more steps, added one by one, as the kernel does: equal to the last bit."""
+    return np.asarray(np.cumsum(np.vstack([returns, steps["rewards"]]), axis=0)[-1])
+
+
+def _rank(row: ActionOutcome) -> tuple[float, float, float, int]:
+    """Return the key that sorts actions: by value, return and probability, the highest first."""
+    value = sum(value for value in row.values if value is not None)
+    return -round(value, 9), -sum(row.returns), -row.probability, row.action
+
+
+def _compact(name: str) -> str:
+    return spoken(name).replace(" ", "").casefold()
