@@ -74,7 +74,7 @@ class Document:
 class _Loader(yaml.SafeLoader):
     """PyYAML's parser with the scalars of YAML 1.2 and bounds on depth and number of values."""
 
-    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 - PyYAML's own way to configure a class
+    yaml_implicit_resolvers: dict[str, object] = {}  # noqa: RUF012 - PyYAML's own way to configure a class
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
@@ -130,7 +130,7 @@ def read_yaml(text: str, source: str, *, lines: bool = True) -> Document:
     return Document(value, builder.places, builder.problems)
 
 
-def write_yaml(value: Mapping[str, Any]) -> str:
+def write_yaml(value: Mapping[str, object]) -> str:
     """Return `value` as YAML, from which `read_yaml` returns an equal value."""
     text: str = yaml.dump(
         value, Dumper=_Dumper, sort_keys=False, default_flow_style=False, allow_unicode=True, width=110
@@ -168,7 +168,7 @@ class _Builder:
         return None
 
     def _mapping(self, node: yaml.MappingNode, path: Path) -> dict[str, Any]:
-        built: dict[str, Any] = {}
+        built: dict[str, object] = {}
         for key_node, value_node in node.value:
             place = self._place(key_node)
             key = self._key(key_node, path)
@@ -196,7 +196,7 @@ class _Builder:
         self.problems.append(Problem(path, message, self._place(node)))
         return None
 
-    def _scalar(self, node: yaml.ScalarNode, kind: str, path: Path) -> Any:
+    def _scalar(self, node: yaml.ScalarNode, kind: str, path: Path) -> object:
         convert, description = _KINDS[kind]
         try:
             return convert(node.value)
@@ -227,7 +227,7 @@ def _number(text: str) -> float:
 
 _NULL = dict.fromkeys(("", "~", "null"))
 _BOOL = {"true": True, "false": False}
-_KINDS: dict[str, tuple[Callable[[str], Any], str]] = {
+_KINDS: dict[str, tuple[Callable[[str], object], str]] = {
     "null": (lambda text: _NULL[text.lower()], "null"),
     "bool": (lambda text: _BOOL[text.lower()], "true or false"),
     "int": (_whole_number, "whole number of a usable size"),

@@ -32,13 +32,13 @@ class Job:
         return identity_of(self.config.to_mapping(), self.seed)
 
 
-def identity_of(config: Mapping[str, Any], seed: int) -> str:
+def identity_of(config: Mapping[str, object], seed: int) -> str:
     """Return the identity of the job of a resolved configuration, given as plain values, and a seed."""
     text = json.dumps(_content(config, seed), sort_keys=True, separators=(",", ":"))
     return blake3(text.encode()).hexdigest()[:32]
 
 
-def _content(config: Mapping[str, Any], seed: int) -> dict[str, Any]:
+def _content(config: Mapping[str, object], seed: int) -> dict[str, object]:
     return {key: value for key, value in config.items() if key not in NOT_CONTENT} | {"seed": seed}
 
 

@@ -181,7 +181,7 @@ def _contradictions(given: Mapping[str, Any]) -> list[Problem]:
     return problems
 
 
-def _resolved(file: ExperimentFile, name: str) -> dict[str, Any]:
+def _resolved(file: ExperimentFile, name: str) -> dict[str, object]:
     """Return the values of the resolved experiment, without the shorthands of `file`."""
     values = {key: getattr(file, key) for key in ExperimentConfig.model_fields}
     values["name"] = file.name or name

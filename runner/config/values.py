@@ -77,7 +77,7 @@ class FrozenMapping(Mapping[str, Any]):
         return repr(self._items)
 
 
-def frozen(value: object, path: Path = ()) -> Any:
+def frozen(value: object, path: Path = ()) -> object:
     """Return `value` with read-only mappings and lists; refuse what JSON cannot hold."""
     if len(path) > MAX_DEPTH:
         raise refusal(path[:1], f"nested deeper than {MAX_DEPTH} levels")

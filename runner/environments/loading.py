@@ -152,7 +152,7 @@ def _raised(error: Exception) -> str:
     return f"{type(error).__name__}: {error}{at}"
 
 
-def _transitions(env_id: str, base: Any) -> dict[str, NDArray[Any]]:
+def _transitions(env_id: str, base: object) -> dict[str, NDArray[Any]]:
     """Return the transition arrays, from the environment's own or from its `P`."""
     if hasattr(base, "transitions"):
         own = base.transitions

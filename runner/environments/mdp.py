@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from runner.environments.scene import SceneDescription, scene_mistake
 from runner.errors import EnvironmentNotUsable
+from runner.util.arrays import Array
 from runner.util.values import is_text, is_whole
 
 Indices = NDArray[np.integer[Any]]
@@ -312,11 +313,11 @@ def _distinct(names: tuple[object, ...]) -> bool:
     return all(map(is_text, names)) and len(set(names)) == len(names)
 
 
-def _is_array(array: Any, kind: Any) -> bool:
+def _is_array(array: object, kind: object) -> bool:
     return isinstance(array, np.ndarray) and array.dtype == kind
 
 
-def _within(values: NDArray[Any], low: int, high: int) -> bool:
+def _within(values: Array, low: int, high: int) -> bool:
     return bool(values.size) and int(values.min()) >= low and int(values.max()) < high
 
 

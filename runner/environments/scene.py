@@ -128,7 +128,7 @@ def _array_mistake(
     return None
 
 
-def _is_pair(value: object) -> TypeGuard[Sequence[Any]]:
+def _is_pair(value: object) -> TypeGuard[Sequence[object]]:
     return isinstance(value, list | tuple) and len(value) == 2
 
 

@@ -52,7 +52,7 @@ class GridWorld:
         return np.asarray(np.bitwise_or.reduce(list(bits)), np.uint32)
 
 
-def grid_world(env_id: str, base: Any, arrays: Arrays) -> GridWorld | None:
+def grid_world(env_id: str, base: object, arrays: Arrays) -> GridWorld | None:
     """Return the additions to one of Gymnasium's grid worlds; None for any other environment.
 
     Args:
@@ -161,7 +161,7 @@ def _cliff(_: str, base: Any, arrays: Arrays) -> GridWorld:
     )
 
 
-_ADAPTERS: Final[Mapping[str, Callable[[str, Any, Arrays], GridWorld]]] = {
+_ADAPTERS: Final[Mapping[str, Callable[[str, object, Arrays], GridWorld]]] = {
     "gymnasium.envs.toy_text.taxi.TaxiEnv": _taxi,
     "gymnasium.envs.toy_text.frozen_lake.FrozenLakeEnv": _frozen_lake,
     "gymnasium.envs.toy_text.cliffwalking.CliffWalkingEnv": _cliff,
@@ -192,9 +192,9 @@ def _scene(
     shape: tuple[int, int],
     things: list[dict[str, str]],
     actions: tuple[str, ...],
-    landmarks: list[dict[str, Any]],
+    landmarks: list[dict[str, object]],
     walls: list[list[list[int]]] | None = None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return a scene with the keys that every environment's has."""
     return {
         "rows": int(shape[0]),
@@ -206,7 +206,7 @@ def _scene(
     }
 
 
-def _tiles(tiles: NDArray[np.bytes_], kinds: Mapping[bytes, dict[str, str]]) -> list[dict[str, Any]]:
+def _tiles(tiles: NDArray[np.bytes_], kinds: Mapping[bytes, dict[str, str]]) -> list[dict[str, object]]:
     """Return a landmark for each tile that has a meaning."""
     return [
         kinds[bytes(tile)] | {"cell": [int(row), int(column)]}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -189,7 +189,7 @@ class Learner:
         self._mark_success(episodes[:ended])
         return filled, ended
 
-    def training_side(self) -> dict[str, Any]:
+    def training_side(self) -> dict[str, object]:
         """Return the measures of training at this moment, named as in the recording's metrics."""
         rewards, counts = self._reward_distribution()
         lengths = self._tally.recent_lengths[: min(self.episode, len(self._tally.recent_lengths))]

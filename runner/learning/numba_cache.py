@@ -29,7 +29,7 @@ def watch(module: str) -> None:
         """Numba's own choice of a cache folder, with a stamp of the whole package."""
 
         @classmethod
-        def from_function(cls, function: Any, file: str) -> Any:
+        def from_function(cls, function: object, file: str) -> object:
             """Return the locator of a function; None if it is not of this folder."""
             if Path(file).resolve().parent != folder:
                 return None
@@ -53,12 +53,12 @@ class _FirstStart(event.Listener):  # type: ignore[misc]  # Numba has no types
     def __init__(self, notify: Callable[[], None]) -> None:
         self._notify: Callable[[], None] | None = notify
 
-    def on_start(self, _event: Any) -> None:
+    def on_start(self, _event: object) -> None:
         if self._notify is not None:
             notify, self._notify = self._notify, None
             notify()
 
-    def on_end(self, _event: Any) -> None:
+    def on_end(self, _event: object) -> None:
         pass
 
 

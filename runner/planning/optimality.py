@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +38,7 @@ class ExactEvaluator:
         self._learners = learners
         self._best: dict[float, tuple[float, Outcome]] = {}
 
-    def measure(self, policy: Policy, discount: float) -> dict[str, Any]:
+    def measure(self, policy: Policy, discount: float) -> dict[str, object]:
         """Return the exact measures of a policy, named as in the recording.
 
         With a discount of 1 the values are nan: those of a process without end are not defined.

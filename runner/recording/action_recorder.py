@@ -74,7 +74,7 @@ def _outcomes(rows: Rows) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDA
     return rows["t"], observations, rows["rewards"], rows["terminated"], rows["truncated"]
 
 
-def _packed(rows: Rows, n: int) -> dict[str, Any]:
+def _packed(rows: Rows, n: int) -> dict[str, object]:
     """Return the fields of a message for a block of steps."""
     columns = []
     for name in rows.dtype.names or ():

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from runner.environments.mdp import MAX_ARRAYS_BYTES
 from runner.errors import RecordingError
+from runner.util.arrays import Array
 
 _MAX_WINDOW: Final = 1 << 27
 """The most memory that zstd may take for its window."""
@@ -25,14 +26,14 @@ _HEADER: Final = re.compile(
 )
 
 
-def pack_array(array: NDArray[Any]) -> bytes:
+def pack_array(array: Array) -> bytes:
     """Return an array as a `.npy` file, compressed with zstd."""
     buffer = BytesIO()
     np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
     return zstandard.ZstdCompressor(level=9).compress(buffer.getvalue())
 
 
-def unpack_array(data: bytes, max_bytes: int, where: str) -> NDArray[Any]:
+def unpack_array(data: bytes, max_bytes: int, where: str) -> Array:
     """Return the array in a compressed `.npy` file; never unpickles or takes more memory than it declares.
 
     Raises:

@@ -30,7 +30,7 @@ _FIXED: Final[dict[int, tuple[str, int]]] = {
 _DELIMITED: Final = 2
 """The wire type of fields that their length precedes: bytes, and packed fields."""
 
-Sizes = tuple[int | np.dtype[Any], ...]
+Sizes = tuple[int | np.dtype[np.generic], ...]
 """The sizes that depend on the run: elements of each repeated field, the dtype of each bytes field."""
 
 HEADER: Final = [
@@ -68,7 +68,7 @@ def record_dtype(message: MessageType, sizes: Sizes) -> np.dtype[np.void]:
     return np.dtype(layout)
 
 
-def _value_dtypes(message: MessageType, sizes: Sizes) -> list[np.dtype[Any]]:
+def _value_dtypes(message: MessageType, sizes: Sizes) -> list[np.dtype[np.generic]]:
     """Return the dtype of each field's value."""
     remaining = iter(sizes)
     values = []
@@ -82,7 +82,7 @@ def _value_dtypes(message: MessageType, sizes: Sizes) -> list[np.dtype[Any]]:
     return values
 
 
-def _tag(field: Field, value: np.dtype[Any]) -> bytes:
+def _tag(field: Field, value: np.dtype[np.generic]) -> bytes:
     """Return the constant bytes before a field's value: tag, and its length if it is bytes or packed."""
     if not field.repeated and field.kind != Pb.TYPE_BYTES:
         return bytes([field.number << 3 | _FIXED[field.kind][1]])
@@ -125,8 +125,8 @@ def topic_sizes(
     topic: Topic,
     learners: int,
     events: int,
-    action: np.dtype[Any] | None = None,
-    observation: np.dtype[Any] | None = None,
+    action: np.dtype[np.generic] | None = None,
+    observation: np.dtype[np.generic] | None = None,
 ) -> Sizes:
     """Return the sizes of a topic in a run, as `record_dtype` takes them.
 

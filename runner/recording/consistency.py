@@ -18,6 +18,7 @@ from runner.recording import schema
 from runner.recording.loop_blocks import Block, Blocks, Bools, Inconsistent, Ints, OnBlock
 from runner.recording.reader import Recording
 from runner.recording.schema import RESET_ONLY
+from runner.util.arrays import Array
 
 Floats = NDArray[np.float64]
 Expected = dict[str, NDArray[Any]]
@@ -386,7 +387,7 @@ class _Phase:
         return Inconsistent(f"/{self._phase}/step, step {step}: {name}: found {found}, expected {expected}")
 
 
-def _equal(found: NDArray[Any], expected: NDArray[Any]) -> Bools:
+def _equal(found: Array, expected: Array) -> Bools:
     """Return which rows are the same, byte for byte; of numbers NaN equals NaN."""
     if found.dtype.names or found.dtype.kind == "V":
         found, expected = (

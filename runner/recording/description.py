@@ -118,7 +118,7 @@ class RunDescription(ABC):
         return parse_code(self.attachment(CODE_ATTACHMENT), str(self.path))
 
     @cached_property
-    def raw_result(self) -> dict[str, Any]:
+    def raw_result(self) -> dict[str, object]:
         """The result as it was written, unchecked; empty if the run ended without one.
 
         Raises:
@@ -324,5 +324,5 @@ class RunDescription(ABC):
         plan = self.config.get("recording")
         return isinstance(plan, Mapping) and plan.get("steps", "all") != "all"
 
-    def _json(self, name: str) -> dict[str, Any]:
+    def _json(self, name: str) -> dict[str, object]:
         return json_object(self.metadata(name).get("json"), f"{self.path}: the metadata {name!r}")

@@ -101,7 +101,7 @@ def read_layouts(columns: Iterable[tuple[int, str]], where: str) -> list[ExtraLa
     return layouts
 
 
-def _values_dtype(description: dict[str, Any], what: str) -> np.dtype[Any]:
+def _values_dtype(description: dict[str, object], what: str) -> np.dtype[np.generic]:
     parts = description.get("spaces")
     if description.get("type") != "Dict" or not isinstance(parts, dict) or not 0 < len(parts) <= MAX_NAMES:
         raise RecordingError(f"{what}: found no mapping of 1 to {MAX_NAMES} names.")

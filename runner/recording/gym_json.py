@@ -21,7 +21,7 @@ _MAX_REPR: Final = 1000
 
 
 class _Registered(NamedTuple):
-    to_json: Callable[[Any], Any]
+    to_json: Callable[[object], object]
     from_json: Callable[[Any], Any]
 
 
@@ -29,7 +29,7 @@ _REGISTERED: Final[dict[type[Space], _Registered]] = {}
 
 
 def register_space(
-    cls: type[Space], *, to_json: Callable[[Any], Any], from_json: Callable[[Any], Any]
+    cls: type[Space], *, to_json: Callable[[object], object], from_json: Callable[[object], object]
 ) -> None:
     """Record the values of a space of your own exactly, so that episodes with such actions can be repeated.
 
@@ -58,7 +58,7 @@ def registered(space: Space) -> type[Space] | None:
     return next((kind for kind in type(space).__mro__ if kind in _REGISTERED), None)
 
 
-def text_of(space: Space, value: Any) -> str:
+def text_of(space: Space, value: object) -> str:
     """Return a value as text: a string of an unknown space as it is, other values as JSON.
 
     Raises:
@@ -70,7 +70,7 @@ def text_of(space: Space, value: Any) -> str:
     return value if is_plain and isinstance(value, str) else json.dumps(_to_json(space, value))
 
 
-def value_of(space: Space, text: str) -> Any:
+def value_of(space: Space, text: str) -> object:
     """Return the value of a text that `text_of` returned, in the dtypes of the space.
 
     Raises:
@@ -164,7 +164,7 @@ def _batch(space: Any, values: Any) -> Any:
     return np.array(_numbers(values), space.dtype).reshape(-1, *space.shape)
 
 
-def _numbers(data: Any) -> Any:
+def _numbers(data: object) -> object:
     """Return nested numbers; in JSON, NaN and infinities are text."""
     if isinstance(data, list):
         return [_numbers(part) for part in data]

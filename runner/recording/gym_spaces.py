@@ -69,7 +69,7 @@ def parts_of(space: Space, where: str) -> list[Part]:
     return parts
 
 
-def describe_space(space: Space) -> dict[str, Any]:
+def describe_space(space: Space) -> dict[str, object]:
     """Return a space as JSON, which `runner.recording.spaces` reads; `parts_of` has accepted the space."""
     return _kind(space).describe(space)
 
@@ -128,7 +128,7 @@ class _Text(_Kind):
         return spaces.Text(length, min_length=0, charset=string.printable)
 
 
-def _checked_text(value: Any) -> str:
+def _checked_text(value: object) -> str:
     if not isinstance(value, str):
         raise TypeError(f"{type(value).__name__} is not a text")
     return value
@@ -228,7 +228,7 @@ class _Box(_Kind):
             return space
         return spaces.Box(space.low.astype(found), space.high.astype(found), dtype=found.type)
 
-    def can_widen(self, space: Any) -> bool:
+    def can_widen(self, space: object) -> bool:
         return isinstance(space, spaces.Box) and not np.can_cast(np.float64, space.dtype)
 
 
@@ -303,7 +303,7 @@ def _bound(bound: Any) -> Any:
     return as_json(values.tolist()) if values.size <= _MAX_BOUNDS else None
 
 
-def _numbers(bound: Any) -> Any:
+def _numbers(bound: object) -> object:
     """Return a bound as numbers; in JSON, infinities are text."""
     if isinstance(bound, list):
         return [_numbers(part) for part in bound]

@@ -13,6 +13,7 @@ from runner.environments.gym_types import Space
 from runner.errors import RecordingError
 from runner.recording.gym_spaces import Part, parts_of
 from runner.recording.spaces import MAX_VALUE_BYTES, encode_text
+from runner.util.arrays import Array
 
 SCALARS: Final = (np.bool_, *(np.dtype(code).type for code in "bBhHiIlLqQefd"))
 
@@ -47,7 +48,7 @@ class Leaf:
         """Classes whose values are all recorded exactly, or refused by NumPy."""
         self._is_rounded = False
 
-    def fit(self, value: Any, batch: tuple[int, ...] = ()) -> NDArray[Any]:
+    def fit(self, value: object, batch: tuple[int, ...] = ()) -> Array:
         """Return a value as an array that can be recorded.
 
         Args:
@@ -148,7 +149,7 @@ def _column_of(leaf: Leaf, column: NDArray[Any]) -> NDArray[Any]:
     return column
 
 
-def fitted(leaves: Sequence[Leaf], value: Any, batch: tuple[int, ...]) -> list[NDArray[Any]]:
+def fitted(leaves: Sequence[Leaf], value: object, batch: tuple[int, ...]) -> list[Array]:
     """Return a batch of values of a space as an array for each leaf, [*batch, ...].
 
     Raises:
@@ -169,7 +170,7 @@ def put_fitted(leaves: Sequence[Leaf], arrays: Sequence[NDArray[Any]], at: Any, 
         _column_of(leaf, column)[...] = array[at]
 
 
-def put_unknown(leaves: Sequence[Leaf], column: NDArray[Any]) -> None:
+def put_unknown(leaves: Sequence[Leaf], column: Array) -> None:
     """Fill a column of values of the space with NaN, and with 0 where they are whole numbers."""
     for leaf in leaves:
         _column_of(leaf, column)[...] = np.nan if leaf.base.kind == "f" else 0
@@ -203,7 +204,7 @@ def filler_by_agent(
     return put
 
 
-def value_bytes(leaves: Sequence[Leaf], value: Any) -> bytes:
+def value_bytes(leaves: Sequence[Leaf], value: object) -> bytes:
     """Return a value of a space as its bytes in a recording.
 
     Raises:
@@ -224,7 +225,7 @@ def value_bytes(leaves: Sequence[Leaf], value: Any) -> bytes:
     return b"".join(pieces)
 
 
-def put_chosen(leaves: Sequence[Leaf], values: Any, into: NDArray[Any], which: NDArray[np.intp]) -> None:
+def put_chosen(leaves: Sequence[Leaf], values: object, into: Array, which: NDArray[np.intp]) -> None:
     """Put values of single environments into their rows, as a vector's info holds them.
 
     Raises:

@@ -107,7 +107,7 @@ class _Gpus:
     """The GPUs of NVIDIA; none without its driver or without the library (the extra `gpu`)."""
 
     def __init__(self) -> None:
-        self._handles: list[Any] = []
+        self._handles: list[object] = []
         try:
             import pynvml
 

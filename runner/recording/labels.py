@@ -60,7 +60,7 @@ def are_readable(folder: Path) -> bool:
         return False
 
 
-def labels_from(values: Mapping[str, Any]) -> Labels:
+def labels_from(values: Mapping[str, object]) -> Labels:
     """Return the labels in a JSON object; invalid ones are ignored."""
     name, tags, note = values.get("name"), values.get("tags"), values.get("note")
     valid = {tag for tag in tags if is_tag(tag)} if isinstance(tags, list) else set()
@@ -105,7 +105,7 @@ def as_json(labels: Labels) -> dict[str, Any]:
     return {key: value for key, value in values.items() if value}
 
 
-def is_tag(text: Any) -> bool:
+def is_tag(text: object) -> bool:
     """Return whether a run can have this tag."""
     return isinstance(text, str) and _TAG.fullmatch(text) is not None
 

@@ -24,7 +24,7 @@ def owner() -> dict[str, Any]:
 
 
 @lru_cache(1)
-def _of_process(pid: int) -> dict[str, Any]:
+def _of_process(pid: int) -> dict[str, object]:
     """Return what does not change while this process lives."""
     return {"boot_id": boot_id(), "pid": pid, "process_started": process_start(pid)}
 

@@ -101,7 +101,7 @@ class EnvironmentMaker:
         return {"json": json.dumps(asdict(self), sort_keys=True)}
 
 
-def parse_maker(values: Mapping[str, Any], where: str) -> EnvironmentMaker:
+def parse_maker(values: Mapping[str, object], where: str) -> EnvironmentMaker:
     """Return the maker in a metadata record.
 
     Args:
@@ -130,7 +130,7 @@ def parse_maker(values: Mapping[str, Any], where: str) -> EnvironmentMaker:
     )
 
 
-def _parse_vector(values: Any, where: str) -> VectorMaker:
+def _parse_vector(values: object, where: str) -> VectorMaker:
     check = _Check(values, where)
     number = check.values.get("number")
     check.require("number", is_whole(number, 1, _MAX_ENVIRONMENTS))

@@ -182,14 +182,14 @@ def json_object(text: str | bytes | None, what: str) -> dict[str, Any]:
         raise RecordingError(f"{what} holds no JSON object ({error}).") from error
 
 
-def lost_ranges(repair: Mapping[str, Any], path: str) -> dict[str, list[list[int]]]:
+def lost_ranges(repair: Mapping[str, object], path: str) -> dict[str, list[list[int]]]:
     """Return the messages that a repair could not save: by topic, ranges (first, stop) of their numbers.
 
     Raises:
         RecordingError: the metadata record has no such ranges.
     """
 
-    def are_ranges(value: Any) -> bool:
+    def are_ranges(value: object) -> bool:
         if not isinstance(value, list) or not all(isinstance(one, list) and len(one) == 2 for one in value):
             return False
         numbers = [number for one in value for number in one]
@@ -221,7 +221,7 @@ def _indented(text: str) -> str:
     return json.dumps(json.loads(text), indent=1, sort_keys=True)
 
 
-def environment_description(text: bytes, path: str) -> dict[str, Any]:
+def environment_description(text: bytes, path: str) -> dict[str, object]:
     """Return the description in `environment.json`.
 
     Raises:
@@ -266,7 +266,7 @@ def environment_of(description: Mapping[str, Any], attachment: Callable[[str], b
 def write_description(
     file: RecordingFile,
     run: Mapping[str, str],
-    config: Mapping[str, Any],
+    config: Mapping[str, object],
     provenance: Mapping[str, str],
     environment: Attachments,
     maker: EnvironmentMaker | None = None,
@@ -301,7 +301,7 @@ def write_maker(file: RecordingFile, phase: str, maker: EnvironmentMaker) -> Non
         raise storage_error(file, error) from error
 
 
-def write_result(file: RecordingFile, status: str, result: Mapping[str, Any]) -> None:
+def write_result(file: RecordingFile, status: str, result: Mapping[str, object]) -> None:
     """Write how the run ended, the index and the summary.
 
     Raises:
@@ -313,5 +313,5 @@ def write_result(file: RecordingFile, status: str, result: Mapping[str, Any]) ->
         raise storage_error(file, error) from error
 
 
-def _json_entry(value: Mapping[str, Any]) -> dict[str, str]:
+def _json_entry(value: Mapping[str, object]) -> dict[str, str]:
     return {"json": json.dumps(value, sort_keys=True)}

@@ -81,7 +81,7 @@ class Observer:
         if self.console is not None and self._stopwatch.has_begun and self._stopwatch.seconds_at(now) >= 0:
             self.console.write(now, stream, text)
 
-    def _see(self, topic: Topic, now: float, fields: dict[str, Any]) -> None:
+    def _see(self, topic: Topic, now: float, fields: dict[str, object]) -> None:
         stamps = {"started": self._stopwatch.started, "seconds": max(0.0, self._stopwatch.seconds_at(now))}
         if len(self._seen) < _MAX_WAITING:
             self._seen.append((topic, encode(topic.message, stamps | fields)))

@@ -363,7 +363,7 @@ class Recording(TopicReader):
         """Yield the exact measures of the evaluations, in order; none unless `evaluation.exact` was set."""
         yield from self._measures(schema.OPTIMALITY_TOPIC)
 
-    def _measures(self, topic: Topic) -> Iterator[dict[str, Any]]:
+    def _measures(self, topic: Topic) -> Iterator[dict[str, object]]:
         """Yield metrics; one that the recording's version did not have is NaN, as unknown ones are."""
         channel = self._index.channels.get(topic.channel)
         recorded = self._index.schemas.get(channel.schema_id, b"") if channel else b""

@@ -279,7 +279,7 @@ class Recorder:
         self._pipeline.raise_failure()
         return self._pipeline.hash.topics()
 
-    def totals(self, topic_digests: Mapping[str, str]) -> dict[str, Any]:
+    def totals(self, topic_digests: Mapping[str, str]) -> dict[str, object]:
         """Return the totals in a result; `topic_digests` is what `drain` returned."""
         return {
             "content_digest": combined_digest(topic_digests),

@@ -158,7 +158,7 @@ def _cell_difference(found: Mapping[str, Any], expected: Mapping[str, Any]) -> t
     return f"data[{state}, {action}]", float(left[cell]), float(right[cell])
 
 
-def _both_nan(left: Any, right: Any) -> bool:
+def _both_nan(left: object, right: object) -> bool:
     return isinstance(left, float) and left != left and right != right  # noqa: PLR0124
 
 

@@ -37,7 +37,7 @@ class ResetState(NamedTuple):
     """Which environment of a vector; 0 for a generator that all environments share."""
     np_random_seed: int | None = None
     """The seed of the generator that the reset made, drawn by NumPy; None if it made none."""
-    bit_generator: Mapping[str, Any] | None = None
+    bit_generator: Mapping[str, object] | None = None
     """The state of `unwrapped.np_random` before the reset, as `numpy.random.PCG64.state` takes it."""
     ale_state: bytes = b""
     """The state of an Atari environment's emulator before the reset, as `ale_py.ALEState` takes it, with its

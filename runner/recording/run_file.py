@@ -166,7 +166,7 @@ def parse_run_file(record: Mapping[str, Any]) -> RunFile:
     )
 
 
-def parse_result(record: Mapping[str, Any], problems: list[str]) -> Summary:
+def parse_result(record: Mapping[str, object], problems: list[str]) -> Summary:
     """Return a recording's result; a line is appended to `problems` for each invalid value."""
     return _parse_summary(_without_deep_values(record, problems), "", problems)
 
@@ -185,7 +185,7 @@ def _parse_summary(record: Mapping[str, Any], prefix: str, problems: list[str]) 
     return Summary(**fields, values_by_key=values)
 
 
-def _without_deep_values(record: Mapping[str, Any], problems: list[str]) -> Mapping[str, Any]:
+def _without_deep_values(record: Mapping[str, object], problems: list[str]) -> Mapping[str, object]:
     if not is_too_deep(record):
         return record
     problems.append(f"found values nested more than {MAX_JSON_DEPTH} deep")

@@ -45,7 +45,7 @@ class Leaf:
     """Of its value, its shape included; None for a text."""
 
 
-def leaves_of(description: Any, where: str) -> list[Leaf]:
+def leaves_of(description: object, where: str) -> list[Leaf]:
     """Return the leaves of a space in order.
 
     Raises:
@@ -105,7 +105,7 @@ def _parts(description: Mapping[str, Any]) -> list[tuple[str, Any]] | None:
     return None
 
 
-def _leaves(description: Any, path: tuple[str, ...]) -> Iterator[Leaf]:
+def _leaves(description: object, path: tuple[str, ...]) -> Iterator[Leaf]:
     if not isinstance(description, Mapping) or len(path) > _MAX_DEPTH:
         raise ValueError("found no object that describes a space, or too many inside one another")
     parts = _parts(description)
@@ -118,7 +118,7 @@ def _leaves(description: Any, path: tuple[str, ...]) -> Iterator[Leaf]:
         yield from _leaves(part, (*path, name))
 
 
-def _leaf_dtype(description: Mapping[str, Any]) -> np.dtype[Any] | None:
+def _leaf_dtype(description: Mapping[str, object]) -> np.dtype[np.generic] | None:
     kind = description["type"]
     if kind == "Text":
         return None

@@ -81,7 +81,7 @@ class _Conversion:
             raise ValueError(f"it holds more than {MAX_VALUES:,} values")
 
 
-def _repr(value: Any) -> str:
+def _repr(value: object) -> str:
     try:
         return repr(value)[:_MAX_REPR]
     except Exception:  # a repr is foreign code, and no reason to fail

@@ -237,7 +237,7 @@ def _allocated_bytes() -> int:
     return 0
 
 
-def _rebuilt(kind: type[Exception], args: tuple[Any, ...], attributes: dict[str, Any]) -> Exception:
+def _rebuilt(kind: type[Exception], args: tuple[object, ...], attributes: dict[str, object]) -> Exception:
     """Return an error as it was in the other process; its constructor may take other arguments."""
     error = kind.__new__(kind, *args)
     vars(error).update(attributes)

@@ -68,7 +68,7 @@ def as_utf8(text: str) -> str:
     return text.encode(errors="surrogateescape").decode(errors="backslashreplace")
 
 
-def flatten(values: Mapping[str, Any], keep_empty: bool = False, prefix: str = "") -> dict[str, Any]:
+def flatten(values: Mapping[str, object], keep_empty: bool = False, prefix: str = "") -> dict[str, object]:
     """Return the values in nested mappings by dotted key, such as `evaluation.trials`.
 
     Args:
@@ -76,7 +76,7 @@ def flatten(values: Mapping[str, Any], keep_empty: bool = False, prefix: str = "
         keep_empty: whether an empty mapping counts as a value.
         prefix: what each key begins with.
     """
-    flat: dict[str, Any] = {}
+    flat: dict[str, object] = {}
     for key, value in values.items():
         if isinstance(value, Mapping) and (value or not keep_empty):
             flat |= flatten(value, keep_empty, f"{prefix}{key}.")
@@ -91,7 +91,7 @@ def is_too_deep(value: Any, depth: int = 0) -> bool:
     while level:
         if depth > MAX_JSON_DEPTH:
             return True
-        inner: list[Any] = []
+        inner: list[object] = []
         for item in level:
             if isinstance(item, Mapping):
                 inner += item.values()
@@ -126,7 +126,7 @@ def without_surrogates(value: Any, source: str | bytes) -> Any:
     return _replaced(value) if escape in source.lower() else value  # type: ignore[operator]
 
 
-def _replaced(value: Any) -> Any:
+def _replaced(value: object) -> object:
     if isinstance(value, str):
         return value.encode(errors="replace").decode()
     if isinstance(value, list):

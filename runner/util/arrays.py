@@ -1,0 +1,9 @@
+"""Types of arrays that many modules handle."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.generic]
+"""An array whose element type is known only at run time, such as a column of a recording."""
+Records = NDArray[np.void]
+"""Structured records, such as messages of one topic."""
