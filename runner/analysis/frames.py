@@ -116,7 +116,7 @@ def steps(
 
 
 def transition_table(
-    env_id: str = "dualtaxi:DualTaxi-v1", kwargs: Mapping[str, Any] | None = None, rewards: str = "team"
+    env_id: str = "dualtaxi:DualTaxi-v1", kwargs: Mapping[str, object] | None = None, rewards: str = "team"
 ) -> pd.DataFrame:
     """Return an environment's transition table, its states and actions described: a row for each outcome.
 
@@ -227,7 +227,7 @@ def _frame(data: Any) -> pd.DataFrame:
     return frame
 
 
-def _flat(record: Mapping[str, Any]) -> dict[str, Any]:
+def _flat(record: Mapping[str, object]) -> dict[str, object]:
     """Return the values of a record by dotted key; an unknown one (None) is NaN."""
     return {key: math.nan if value is None else value for key, value in flatten(record).items()}
 

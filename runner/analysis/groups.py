@@ -165,7 +165,7 @@ def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tupl
     return list(dict.fromkeys(pair for name in names for pair in known[name]))
 
 
-def flat_config(config: Mapping[str, Any]) -> dict[str, Any]:
+def flat_config(config: Mapping[str, object]) -> dict[str, object]:
     """Return the values of a configuration by dotted key, but for its name and seeds."""
     return {key: value for key, value in flatten(config).items() if key not in ("seeds", "name")}
 
@@ -235,7 +235,7 @@ def _labelled(runs_of: Sequence[Sequence[RunSeries]], names: Sequence[str]) -> l
 def _value_at(path: str, series: Sequence[RunSeries]) -> Callable[[RunSeries], str]:
     """Return a function that returns a run's value at a path of the configuration, as JSON."""
 
-    def paths(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    def paths(values: Mapping[str, object], prefix: str = "") -> dict[str, object]:
         found: dict[str, Any] = {}
         for key, value in values.items():
             found[f"{prefix}{key}"] = value

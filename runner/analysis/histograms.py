@@ -20,6 +20,7 @@ from runner.environments.naming import numbered_actions, spoken
 from runner.recording.metrics import is_usable
 from runner.recording.reader import Recording
 from runner.recording.schema import RESET_ONLY, TRAIN_EPISODE
+from runner.util.arrays import Array
 
 Values = NDArray[np.float64]
 
@@ -225,7 +226,7 @@ def _uniform(actions: list[Any]) -> NDArray[Any]:
     return np.array([None] * len(actions))
 
 
-def _parts(recording: Recording, actions: NDArray[Any], notes: list[str]) -> dict[str, NDArray[Any]]:
+def _parts(recording: Recording, actions: Array, notes: list[str]) -> dict[str, Array]:
     """Return the numbers of actions by part: an agent, a field or an index; empty for a single number."""
     if recording.can_train_again:
         own = recording.mdp.own_actions[actions]

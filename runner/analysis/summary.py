@@ -186,7 +186,7 @@ def random_policy_sentence(recording: Recording) -> str:
     return baseline.sentence if baseline else ""
 
 
-def _loop_as_json(loop: Summary) -> dict[str, Any]:
+def _loop_as_json(loop: Summary) -> dict[str, object]:
     last, recent = loop.last_evaluation, loop.recent_training
     return {
         "last_evaluation": last.as_json() if last else None,

@@ -64,7 +64,7 @@ class Manifest:
         return _json(values | {"seal": blake3(_json(values)).hexdigest()})
 
 
-def _json(values: Mapping[str, Any]) -> bytes:
+def _json(values: Mapping[str, object]) -> bytes:
     return json.dumps(values, indent=1, sort_keys=True).encode() + b"\n"
 
 

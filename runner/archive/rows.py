@@ -77,7 +77,7 @@ def message_payload(topic: Topic, position: int, row: Mapping[str, Any], shape: 
     return encode(topic.message, fields)
 
 
-def snapshot_row(run_id: str, snapshot: PlacedTable, with_values: bool) -> dict[str, Any]:
+def snapshot_row(run_id: str, snapshot: PlacedTable, with_values: bool) -> dict[str, object]:
     """Return the row of a snapshot; without its values, their hash checks the ones a replay gives."""
     table = snapshot.table
     data = table.values.tobytes()

@@ -177,7 +177,7 @@ def _spreadable(leaf: Leaf) -> int:
     return count if count <= MAX_NUMBERS else 0
 
 
-def _not_fixed(records: Records) -> Any:
+def _not_fixed(records: Records) -> object:
     raise TypeError(f"a text is not of fixed width: {records.dtype}")
 
 

@@ -271,7 +271,7 @@ class Session:
         if self._observer is not None:
             self._observer.steps(phase, sum(self.recorder.steps.values()), steps)
 
-    def _measure(self, phase: str, topic: schema.Topic, metrics: dict[str, Any]) -> None:
+    def _measure(self, phase: str, topic: schema.Topic, metrics: dict[str, object]) -> None:
         """Record metrics, and show them to the observer."""
         self.recorder.message(topic, encode(topic.message, metrics))
         if self._observer is not None:

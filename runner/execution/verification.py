@@ -70,7 +70,7 @@ def compare_names(recording: Recording, learners: list[str] | None = None) -> No
         raise Diverged("metadata run", "agents", list(recording.agents), learners)
 
 
-def compare_values(path: str, found: Any, expected: Any) -> None:
+def compare_values(path: str, found: object, expected: object) -> None:
     """Compare two values of the environment's description.
 
     Raises:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from typing import Any, Final
+from typing import Final
 
 from runner.errors import RecordingError
 from runner.recording import schema
@@ -95,7 +95,7 @@ def whole_ranges(
     return whole
 
 
-def flat_text(config: Mapping[str, Any]) -> dict[str, str]:
+def flat_text(config: Mapping[str, object]) -> dict[str, str]:
     """Return a resolved configuration as flat text: `evaluation.trials` is `100`; lists as JSON."""
     flat = flatten(config, keep_empty=True)
     return {key: value if isinstance(value, str) else json.dumps(value) for key, value in flat.items()}

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from runner.drawing.raster import Pixels, require_packages
 from runner.errors import RunnerError
+from runner.util.arrays import Array
 from runner.util.extras import require
 
 LAST_SECONDS: Final = 2.5
@@ -185,7 +186,7 @@ class _Palette:
             self._choose(codes.ravel(), pixels.reshape(-1, 3))
         return self._nearest[codes], self._colours
 
-    def _choose(self, codes: NDArray[Any], pixels: NDArray[np.uint8]) -> None:
+    def _choose(self, codes: Array, pixels: NDArray[np.uint8]) -> None:
         """Set the palette to the most common colours of a frame, each the mean of those of one code."""
         counts = np.bincount(codes, minlength=1 << 15)
         common = np.argsort(-counts, kind="stable")[:_COLOURS]

@@ -66,7 +66,7 @@ def export_mcap(run: Run, target: Path, anonymous: bool = False, force: bool = F
     return McapExport(target, list(_warnings(run)) if anonymous else [])
 
 
-def _record(run: Run, anonymous: bool) -> dict[str, Any]:
+def _record(run: Run, anonymous: bool) -> dict[str, object]:
     """Return what an importer needs besides the recording."""
     summary = {key: run.summary[key] for key in ("seconds", "error", "bytes") if key in run.summary}
     if anonymous and "error" in summary:
@@ -113,7 +113,7 @@ def _warnings(run: Run) -> Iterator[str]:
         yield "The labels of the run (name, tags and note) stay as they are."
 
 
-def _texts(value: Any, place: str) -> Iterator[tuple[str, str]]:
+def _texts(value: object, place: str) -> Iterator[tuple[str, str]]:
     """Yield every text in a configuration with its path."""
     if isinstance(value, str):
         yield place, value

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.export.contents import Ranges, whole_ranges
 from runner.export.minari_episodes import Episode, episodes_in
 from runner.recording.gym_spaces import restore_space
 from runner.recording.reader import Recording
+from runner.util.arrays import Array
 from runner.util.extras import require
 
 PATTERNS: Final = ("data/main_data.hdf5", "data/metadata.json")
@@ -93,7 +93,7 @@ def write_dataset(
     )
     written = Written()
 
-    def buffers() -> Iterator[Any]:
+    def buffers() -> Iterator[object]:
         for episode in episodes_in(recording, phase, whole):
             yield _buffer(episode, written.episodes)
             written.episodes += 1
@@ -135,7 +135,7 @@ def _missing(recording: Recording, phase: str, is_all: bool, written: Written) -
     return notes
 
 
-def _buffer(episode: Episode, number: int) -> Any:
+def _buffer(episode: Episode, number: int) -> object:
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
     truncated = episode.truncated.copy()
@@ -156,7 +156,7 @@ def _buffer(episode: Episode, number: int) -> Any:
     )
 
 
-def _with_reset(values: NDArray[Any]) -> NDArray[Any]:
+def _with_reset(values: Array) -> Array:
     """Return the values of steps after a zero for the reset."""
     return np.concatenate([np.zeros_like(values[:1]), values])
 

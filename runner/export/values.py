@@ -46,7 +46,7 @@ class Values:
         parts = [np.asarray(_part(value, leaf), np.float64).ravel() for leaf in self._leaves]
         return np.concatenate([np.empty(0), *parts])
 
-    def texts_in(self, value: Any) -> str:
+    def texts_in(self, value: object) -> str:
         """Return the texts of a value on one line."""
         return ", ".join(f"{'.'.join(leaf.path)} {_part(value, leaf)!r}".strip() for leaf in self._texts)
 
@@ -63,7 +63,7 @@ class Values:
         return np.ascontiguousarray(np.stack([pixels] * 3, axis=-1) if pixels.ndim == 2 else pixels)
 
 
-def value_in_words(value: Any, limit: int = FEW) -> str:
+def value_in_words(value: object, limit: int = FEW) -> str:
     """Return a value of any space as text on one line: `3`, `[0.12 -0.5]`, `go 3, push [0.5]`.
 
     Arrays of more numbers than `limit` are described by their shape.
@@ -109,7 +109,7 @@ def action_in_words(recording: Recording, phase: str, agent: str = "") -> Callab
     return in_words
 
 
-def plain_value(value: Any) -> Any:
+def plain_value(value: object) -> object:
     """Return a value whose records are dictionaries, or tuples if their fields are numbered."""
     if not isinstance(value, np.void) or not value.dtype.names:
         return value

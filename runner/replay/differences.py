@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.recording.spaces import decode
+from runner.util.arrays import Array
 from runner.util.jsonable import as_json
 
 _MAX_TEXT: Final = 200
@@ -45,7 +46,7 @@ class Difference:
         )
 
 
-def first_differing_row(recorded: NDArray[Any], got: NDArray[Any], tolerance: float) -> int | None:
+def first_differing_row(recorded: Array, got: Array, tolerance: float) -> int | None:
     """Return the number of the first row that differs; None if none does.
 
     Args:
@@ -69,7 +70,7 @@ def first_differing_row(recorded: NDArray[Any], got: NDArray[Any], tolerance: fl
     return None
 
 
-def _other_bytes(recorded: NDArray[Any], got: NDArray[Any]) -> NDArray[np.bool_]:
+def _other_bytes(recorded: Array, got: Array) -> NDArray[np.bool_]:
     n = len(recorded)
     left, right = (np.ascontiguousarray(each).view(np.uint8).reshape(n, -1) for each in (recorded, got))
     return np.asarray((left != right).any(axis=1))
@@ -128,6 +129,6 @@ def _plain(value: Any) -> Any:
     return as_json(value.item() if isinstance(value, np.ndarray | np.generic) and not value.shape else value)
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     text = repr(value) if isinstance(value, str) else str(value)
     return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}…"

@@ -44,7 +44,7 @@ def redo(
     trust: bool = False,
     tolerance: float = 0.0,
     report: Report = lambda _: None,
-    make: Callable[[], Any] | None = None,
+    make: Callable[[], object] | None = None,
     draw_from: int = 0,
 ) -> Iterator[RedoneSteps]:
     """Do recorded episodes again; yield their steps in blocks of about 0.2 s, compared with the recording.
@@ -167,7 +167,7 @@ def stream_from_child(
             raise CannotRedo(f"The environment ended its process: {error}") from error
 
 
-def _quietly(function: Callable[..., None], *arguments: Any, **keywords: Any) -> None:
+def _quietly(function: Callable[..., None], *arguments: object, **keywords: object) -> None:
     """Call a function in a child process, without what environments print: it would be mixed with results."""
     warnings.simplefilter("ignore")
     with open(os.devnull, "wb") as nothing:  # noqa: PTH123 - a device

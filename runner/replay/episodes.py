@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -26,7 +26,7 @@ _HELD_BYTES: Final = 32 << 20
 as have pictures of this size."""
 
 
-OnReset = Callable[[RowStepper, Iterator[Any]], None]
+OnReset = Callable[[RowStepper, Iterator[object]], None]
 """Takes an environment before the reset that begins an episode, and the episode's recorded actions."""
 
 

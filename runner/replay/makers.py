@@ -279,7 +279,7 @@ def _attribute(name: str) -> Any:
     return found
 
 
-def _name_of(entry_point: str | Callable[..., Any] | None) -> str:
+def _name_of(entry_point: str | Callable[..., object] | None) -> str:
     """Return an entry point as `module:attribute`."""
     if entry_point is None or isinstance(entry_point, str):
         return entry_point or ""

@@ -25,7 +25,7 @@ _FOREVER: Final = 2**63 - 1
 _BLOCK_BYTES: Final = 16 << 20
 _Row = tuple[Any, ...]
 """Number, environment, episode, step, time, seed, whether it has one, and observation of a reset."""
-_Extra = tuple[dict[str, Any] | None, int | None]
+_Extra = tuple[dict[str, object] | None, int | None]
 """Options and large seed of a call of `reset`."""
 
 
@@ -144,7 +144,7 @@ def _reset_rows(recording: Recording, topic: schema.Topic, times: range) -> Iter
 
 def _with_extras(
     recording: Recording, phase: str, rows: Iterator[_Row], times: range
-) -> Iterator[tuple[_Row, dict[str, Any] | None, int | None]]:
+) -> Iterator[tuple[_Row, dict[str, object] | None, int | None]]:
     """Yield resets with their options, and with seeds too large for the record of a reset.
 
     Both stand among the infos, once for a call of `reset`. If several calls came without a step between them,

@@ -85,7 +85,7 @@ def parse_spec(text: str) -> EnvironmentSpec:
     return EnvironmentSpec(name, entry_point or "", kwargs, limit, _wrappers_of(wrappers, name))
 
 
-def _wrappers_of(values: Any, owner: str) -> tuple[Wrapper, ...]:
+def _wrappers_of(values: object, owner: str) -> tuple[Wrapper, ...]:
     """Return the wrappers in the JSON of `WrapperSpec`s.
 
     Raises:
@@ -101,7 +101,7 @@ def _wrappers_of(values: Any, owner: str) -> tuple[Wrapper, ...]:
     return tuple(found)
 
 
-def parse_game(text: str) -> tuple[str, str, dict[str, Any]]:
+def parse_game(text: str) -> tuple[str, str, dict[str, object]]:
     """Return module, function and keyword arguments of a PettingZoo environment."""
     values = _json_of(text)
     entry_point, kwargs = values.get("entry_point"), values.get("kwargs") or {}
@@ -111,7 +111,7 @@ def parse_game(text: str) -> tuple[str, str, dict[str, Any]]:
     return module, function, kwargs
 
 
-def _json_of(text: str) -> dict[str, Any]:
+def _json_of(text: str) -> dict[str, object]:
     if len(text) > _MAX_SPEC:
         raise CannotRedo(
             f"The specification of the recorded environment has {len(text):,} characters, expected "
@@ -126,7 +126,7 @@ def _json_of(text: str) -> dict[str, Any]:
     return values
 
 
-def check_arguments(spec: EnvironmentSpec, registered: Mapping[str, Any]) -> None:
+def check_arguments(spec: EnvironmentSpec, registered: Mapping[str, object]) -> None:
     """Refuse arguments of an environment and its wrappers that name a file, unless they are registered.
 
     Raises:
@@ -149,7 +149,7 @@ def check_plain(what: str, kwargs: Mapping[str, Any], registered: Mapping[str, A
             raise CannotRedo(f"Found the {what} {key}={value!r}, which names a file. {TRUST}")
 
 
-def _texts(value: Any) -> Iterator[str]:
+def _texts(value: object) -> Iterator[str]:
     """Yield the texts in a JSON value."""
     if isinstance(value, str):
         yield value

@@ -267,7 +267,7 @@ class EnvironmentStepper(RowStepper):
             # States are counted from 0, the first observations are as they came.
             start = 0 if is_first else int(self.observation_space.start)  # type: ignore[attr-defined]
 
-            def put_state(row: int, observation: Any) -> None:
+            def put_state(row: int, observation: object) -> None:
                 if observation.__class__ is not int:
                     observation = int(np.asarray(observation).reshape(()))
                 column[row] = observation - start
@@ -277,7 +277,7 @@ class EnvironmentStepper(RowStepper):
         if self._recording.kind == "transition":
             return filler(leaves, column)
 
-        def put_bytes(row: int, observation: Any) -> None:
+        def put_bytes(row: int, observation: object) -> None:
             column[row] = value_bytes(leaves, observation)
 
         return put_bytes

@@ -16,6 +16,7 @@ from runner.recording.reader import Recording
 from runner.replay.recorded import RecordedReset
 from runner.replay.redone import Frame
 from runner.replay.stepping import Results, Stepper
+from runner.util.arrays import Array
 
 _Numbered = tuple[int, RecordedReset]
 """The place of a reset among those of a block, and the reset."""
@@ -98,7 +99,7 @@ class VectorStepper(Stepper):
             raise CannotRedo("The vector environment draws no pictures of its environments.")
         return pictures[self._drawn]
 
-    def _raw_actions(self, rows: NDArray[np.void]) -> NDArray[Any]:
+    def _raw_actions(self, rows: NDArray[np.void]) -> Array:
         if self._recording.kind != "step":
             return np.array(rows["action"])
         start = int(self.action_space.start)  # type: ignore[attr-defined]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 
-def is_in_turns(env: Any) -> bool:
+def is_in_turns(env: object) -> bool:
     """Return whether an environment has the interface of an `AECEnv`."""
     return all(hasattr(env, part) for part in ("agent_iter", "last", "observe"))
 

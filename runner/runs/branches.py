@@ -42,7 +42,7 @@ class BranchOrigin:
         return f"at {self.at}, action {self.action}{named}, then {self.policy}"
 
 
-def origin_in(config: Mapping[str, Any]) -> BranchOrigin | None:
+def origin_in(config: Mapping[str, object]) -> BranchOrigin | None:
     """Return what the run with this configuration was branched from; None if it is no branch."""
     settings = config.get("config")
     found = settings.get("origin") if isinstance(settings, Mapping) else None

@@ -158,7 +158,7 @@ def run_facts(recording: Recording, details: Mapping[str, Any]) -> dict[str, Any
     return facts | {"summary": summary}
 
 
-def _export_record(recording: Recording) -> dict[str, Any]:
+def _export_record(recording: Recording) -> dict[str, object]:
     """Return the description of the run in an exported recording; empty for any other recording."""
     if EXPORT_RECORD not in recording.metadata_names:
         return {}
@@ -214,7 +214,7 @@ def _has_content(run: Run, content_digest: str) -> bool:
 
 
 def _continue_or_keep(
-    occupied: Occupied, recording: Path, facts: Mapping[str, Any], labels: Labels
+    occupied: Occupied, recording: Path, facts: Mapping[str, object], labels: Labels
 ) -> tuple[Run, bool]:
     """Return the existing run of `occupied`, and whether it already has all of the recording.
 
@@ -244,7 +244,7 @@ def _continue_or_keep(
             return _with_facts(run, facts), False
 
 
-def _finish(run: Run, facts: Mapping[str, Any]) -> Run:
+def _finish(run: Run, facts: Mapping[str, object]) -> Run:
     """Return the run; update its `run.json` if only its recording is finished."""
     if facts["status"] != "finished" or run.status not in UNFINISHED or run.stands_alone:
         return run
@@ -252,7 +252,7 @@ def _finish(run: Run, facts: Mapping[str, Any]) -> Run:
         return _with_facts(there, facts) if there.status in UNFINISHED else there
 
 
-def _with_facts(run: Run, facts: Mapping[str, Any]) -> Run:
+def _with_facts(run: Run, facts: Mapping[str, object]) -> Run:
     """Replace the facts on the recording in `run.json`; keep those on its folder."""
     kept = {key: value for key, value in run.facts.items() if key not in ("owner", "proof", "summary")}
     write_object(run.folder / RUN_FILE, kept | dict(facts))

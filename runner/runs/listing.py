@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from runner.errors import RecordingError, RunNotFound, StorageError
 from runner.recording.run_file import RUN_ID
@@ -74,7 +74,7 @@ def run_in(folder: Path) -> Run | None:
     return None
 
 
-def _is_run(facts: dict[str, Any]) -> bool:
+def _is_run(facts: dict[str, object]) -> bool:
     """Return whether facts have the id of a run; the others may be damaged."""
     run_id = facts.get("run_id")
     return isinstance(run_id, str) and RUN_ID.fullmatch(run_id) is not None and run_id.strip(".") != ""

@@ -103,7 +103,7 @@ class RunDiff:
     metrics: list[MetricDiff] = field(default_factory=list)
     costs: list[Change] = field(default_factory=list)
     """Steps, seconds and size."""
-    alike: dict[str, dict[str, Any]] = field(default_factory=dict)
+    alike: dict[str, dict[str, object]] = field(default_factory=dict)
     """What is the same in both, by path, of config, provenance and costs."""
     ignored: list[str] = field(default_factory=list)
     """Paths that differ but were excluded by the options."""

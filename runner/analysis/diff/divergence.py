@@ -24,6 +24,7 @@ from runner.recording.messages import decode
 from runner.recording.reader import Recording
 from runner.replay.steps import episode_blocks
 from runner.runs.branches import BranchOrigin
+from runner.util.arrays import Array
 
 Block = NDArray[np.void]
 
@@ -131,7 +132,7 @@ def _differs(a: Block, b: Block, name: str) -> NDArray[np.bool_]:
     return np.asarray(differs)
 
 
-def _bits(values: NDArray[Any]) -> NDArray[Any]:
+def _bits(values: Array) -> NDArray[Any]:
     """Return floats and composed values as whole numbers of the same bits, so that NaN equals NaN."""
     kind, size = values.dtype.kind, values.dtype.itemsize
     if kind not in "fV":

@@ -106,11 +106,11 @@ def _text(value: Any) -> str:
     return UNKNOWN if value is None else str(value)
 
 
-def _amount(value: Any) -> str:
+def _amount(value: object) -> str:
     return f"{value:,}" if isinstance(value, int | float) else _text(value)
 
 
-def _values(title: str, difference: RunDiff, field: str, text: Callable[[Any], str] = _text) -> Section:
+def _values(title: str, difference: RunDiff, field: str, text: Callable[[object], str] = _text) -> Section:
     """Return the values by path of a field: those that differ, then those that are alike."""
     changes: list[Change] = getattr(difference, field)
     differ = [(change.path, text(change.a), text(change.b)) for change in changes]

@@ -231,7 +231,7 @@ class Chart(Canvas):
         points = np.column_stack(_thinned(self.x(x), self.y(y)))
         self.shape(points, stroke=colour, dash=dash, width=width, is_curve=True, **style)
 
-    def band(self, x: Values, low: Values, high: Values, fill: str, **style: Any) -> None:
+    def band(self, x: Values, low: Values, high: Values, fill: str, **style: object) -> None:
         """Fill the area between two lines."""
         lower, upper = (np.column_stack(_thinned(self.x(x), self.y(edge))) for edge in (low, high))
         self.shape(np.concatenate([lower, upper[::-1]]), fill=fill, **style)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from runner.drawing import svg
 from runner.recording import schema
 from runner.recording.reader import Recording
+from runner.util.arrays import Array
 
 MAX_LOGGED: Final = 5000
 """Logged values near a part that a page shows."""
@@ -173,6 +174,6 @@ def short(value: float) -> Value:
     return int(rounded) if rounded == int(rounded) else rounded
 
 
-def short_rows(rows: NDArray[Any]) -> list[list[Value]]:
+def short_rows(rows: Array) -> list[list[Value]]:
     """Round the numbers of rows."""
     return [[short(value) for value in row] for row in rows.tolist()]

@@ -134,7 +134,7 @@ def sentence(text: str) -> str:
     return f"{start}{space}{rest}{'' if text[-1:] in '.:' else '.'}"
 
 
-def embedded(data: Any) -> str:
+def embedded(data: object) -> str:
     """Return data as JSON that is safe inside a script element."""
     text = json.dumps(data, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")

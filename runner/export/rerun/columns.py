@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from runner.drawing import palette
 from runner.export.rerun.step_values import StepValues
+from runner.util.arrays import Array
 
 APPLICATION: Final = "dualtaxi"
 MAX_ROWS: Final = 8_192
@@ -92,7 +93,7 @@ class Column(NamedTuple):
     descriptor: Any
     array: pa.Array
 
-    def component_descriptor(self) -> Any:
+    def component_descriptor(self) -> object:
         """Return the descriptor of the component."""
         return self.descriptor
 
@@ -101,7 +102,7 @@ class Column(NamedTuple):
         return self.array
 
 
-def instances(archetype: Any, **parts: NDArray[Any]) -> list[Column]:
+def instances(archetype: object, **parts: Array) -> list[Column]:
     """Return the columns of n rows with equally many instances each.
 
     Args:
@@ -114,7 +115,7 @@ def instances(archetype: Any, **parts: NDArray[Any]) -> list[Column]:
     ]
 
 
-def ragged(archetype: Any, lengths: NDArray[np.int64], **parts: NDArray[Any]) -> list[Column]:
+def ragged(archetype: object, lengths: NDArray[np.int64], **parts: Array) -> list[Column]:
     """Return the columns of rows with different numbers of instances; each part is [all instances, ...]."""
     offsets = pa.array(np.concatenate(([0], np.cumsum(lengths))).astype(np.int32))
     return [_column(archetype, name, offsets, part) for name, part in parts.items()]

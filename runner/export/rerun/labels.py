@@ -20,6 +20,7 @@ from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names, numbered_actions, spoken
 from runner.export.rerun.columns import Column
 from runner.export.rerun.scene import Scene
+from runner.util.arrays import Array
 
 MAX_REWARDS: Final = 2_000
 MAX_T: Final = 10_000
@@ -94,7 +95,7 @@ class Labels:
         movers = np.arange(len(self._movers))[None, :]
         return self._movers[movers, is_carrying, np.searchsorted(self._masks, events)[:, None]]
 
-    def of_t(self, t: NDArray[Any]) -> NDArray[np.uint16]:
+    def of_t(self, t: Array) -> NDArray[np.uint16]:
         """Return the label of each `t`."""
         return np.asarray(self._t + np.minimum(t, self._longest), np.uint16)
 

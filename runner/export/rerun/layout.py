@@ -277,7 +277,7 @@ def _draw_grid(stream: rr.RecordingStream, path: str, scene: Scene) -> None:
 
 def _lines(rows: range, columns: range) -> list[Any]:
     """Return horizontal lines at these rows and vertical ones at these columns, over all of them."""
-    across: list[Any] = [[(columns[0], y), (columns[-1], y)] for y in rows]
+    across: list[object] = [[(columns[0], y), (columns[-1], y)] for y in rows]
     return across + [[(x, rows[0]), (x, rows[-1])] for x in columns]
 
 

@@ -27,6 +27,7 @@ from runner.export.rerun.steps import StepWriter
 from runner.export.values import FEW
 from runner.recording import schema
 from runner.replay.steps import check_steps
+from runner.util.arrays import Array
 
 MAX_BARS: Final = 16
 """Extras of more numbers are drawn as bars."""
@@ -218,7 +219,7 @@ class LoopExporter:
         if grid is not None:
             grid.clear_gaps(["grid"], grid.covered[-1][1])
 
-    def _is_of(self, steps: NDArray[Any], member: Member) -> NDArray[np.bool_]:
+    def _is_of(self, steps: Array, member: Member) -> NDArray[np.bool_]:
         """Return which steps, given by number, were taken in an environment."""
         return np.asarray(steps % self._recording.environments == member.number)
 
@@ -247,7 +248,7 @@ class LoopExporter:
         phase: str,
         member: Member,
         extras: Mapping[str, np.ma.MaskedArray[Any, Any]],
-        log_times: NDArray[Any],
+        log_times: Array,
         times: list[rr.TimeColumn],
     ) -> None:
         """Send the values that the loop recorded with these steps: as lines, or as bars if they are many."""

@@ -110,7 +110,7 @@ def tuples_of(database: SqliteDatabase, query: Any) -> Iterator[tuple[Any, ...]]
     return found
 
 
-def write_rows(database: SqliteDatabase, rows: Sequence[Mapping[str, Any]]) -> None:
+def write_rows(database: SqliteDatabase, rows: Sequence[Mapping[str, object]]) -> None:
     """Write whole rows, replacing those of the same folders; within a transaction."""
     fields = Row._meta.sorted_fields
     columns = ", ".join(f'"{field.column_name}"' for field in fields)

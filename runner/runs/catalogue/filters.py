@@ -126,7 +126,7 @@ class _Translation:
                 return self.condition(item.expr, self._field(item, field), depth + 1)
         return self._anywhere(item) if field is None else self._leaf(item, field)
 
-    def _leaf(self, item: Item, field: Column) -> Any:
+    def _leaf(self, item: Item, field: Column) -> object:
         from luqum import tree
 
         match item:
@@ -162,7 +162,7 @@ class _Translation:
         except RunnerError as error:
             raise self._error(item, str(error).removesuffix(".")) from None
 
-    def _anywhere(self, item: Any) -> Any:
+    def _anywhere(self, item: object) -> object:
         """Return the condition that a word is in the id, the names, the tags or the note of a run."""
         from luqum import tree
 
@@ -231,7 +231,7 @@ def _error_at(text: str, at: int, message: str) -> RunnerError:
     return RunnerError(f"filter: {message}{end}\n  {shown}\n  {' ' * (at - start)}^")
 
 
-def _joined(how: Callable[[Any, Any], Any], parts: Sequence[Any]) -> Any:
+def _joined(how: Callable[[object, object], object], parts: Sequence[object]) -> object:
     """Return conditions joined in pairs, so that many of them do not nest deeply."""
     if len(parts) == 1:
         return parts[0]
@@ -296,7 +296,7 @@ def setting_path(path: str) -> str:
     return '$."' + path.replace("\\", "").replace('"', "") + '"'
 
 
-def _setting_condition(path: str, sign: str, value: str) -> Any:
+def _setting_condition(path: str, sign: str, value: str) -> object:
     """Return the condition that a value of the configuration compares so."""
     kind = fn.json_type(Row.settings, setting_path(path))
     found = fn.json_extract(Row.settings, setting_path(path))

@@ -207,4 +207,4 @@ def _is_running(root: str, entry: str) -> bool:
     return run is not None and run.status == "running"
 
 
-_EMPTY: Final[dict[str, Any]] = dict.fromkeys(Row._meta.sorted_field_names)
+_EMPTY: Final[dict[str, object]] = dict.fromkeys(Row._meta.sorted_field_names)

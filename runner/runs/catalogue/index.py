@@ -137,7 +137,7 @@ class Index:
             recorded = recorded.where(Row.digest.in_(digests))
         return recorded.group_by(Row.digest).having(fn.COUNT(Row.entry) > 1)
 
-    def is_copy(self) -> Any:
+    def is_copy(self) -> object:
         """Return the condition that another run, the one in `originals`, recorded a row's content first."""
         first = Row.alias()
         age, of_first = ((each.created, each.id, each.root, each.entry) for each in (Row, first))

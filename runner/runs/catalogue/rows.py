@@ -186,7 +186,7 @@ def number(value: Any) -> float | None:
         return None
 
 
-def _flat(value: Any, path: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
+def _flat(value: object, path: str = "", depth: int = 0) -> Iterator[tuple[str, object]]:
     """Yield the plain values in a configuration by dotted path; items of lists by their position."""
     if isinstance(value, Mapping | list):
         parts = enumerate(value) if isinstance(value, list) else value.items()
