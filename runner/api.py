@@ -26,8 +26,8 @@ from runner.util.values import checked_name
 if TYPE_CHECKING:  # imported late: a run is written to disk before NumPy and Numba are loaded
     from runner.execution.session import Progress
 
-Config = str | os.PathLike[str] | Mapping[str, Any] | ExperimentConfig
-Handler = Callable[[int, Any], Any] | int | signal.Handlers | None
+Config = str | os.PathLike[str] | Mapping[str, object] | ExperimentConfig
+Handler = Callable[[int, object], object] | int | signal.Handlers | None
 
 _SIGNALS: Final = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGBREAK") if hasattr(signal, name)

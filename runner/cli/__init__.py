@@ -212,7 +212,7 @@ class LazyGroup(Group):
         ctx.meta[_AS_JSON] = "--json" in args
         return super().parse_args(ctx, args)
 
-    def invoke(self, ctx: click.Context) -> Any:
+    def invoke(self, ctx: click.Context) -> object:
         """Run the command; errors that a user can correct have no traceback."""
         as_json = ctx.meta[_AS_JSON]
         try:

@@ -32,7 +32,7 @@ def print_json(value: Any, indent: int | None = 1) -> None:
     click.echo(json.dumps(finite(value), indent=indent, allow_nan=False))
 
 
-def json_list(name: str, rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
+def json_list(name: str, rows: Iterable[Mapping[str, object]]) -> Iterator[str]:
     """Yield the text of a JSON object with one named list in parts, so that it is never in memory as a whole.
 
     Each value stands on a line of its own.
@@ -61,7 +61,7 @@ def print_written(text: str, as_json: bool, *paths: Path, **more: object) -> Non
         click.echo(text)
 
 
-def files_written(*paths: Path) -> list[dict[str, Any]]:
+def files_written(*paths: Path) -> list[dict[str, object]]:
     """Return path and bytes of each file; of a folder those of all its files."""
     files = [file for path in paths for file in (sorted(path.rglob("*")) if path.is_dir() else [path])]
     return [{"path": str(file.absolute()), "bytes": file.stat().st_size} for file in files if file.is_file()]

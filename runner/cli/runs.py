@@ -177,7 +177,7 @@ def job_progress(label: str, episodes: int) -> Iterator[tuple[Report, Interrupt]
 # --- printing ---------------------------------------------------------------------------------------------
 
 
-def identity(run: Run) -> dict[str, Any]:
+def identity(run: Run) -> dict[str, object]:
     """Return what identifies a run, as JSON."""
     path = str(run.recording.absolute())
     return {"run_id": run.run_id, "name": run.name, "seed": run.seed, "status": run.status, "path": path}

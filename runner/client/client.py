@@ -181,7 +181,7 @@ class Client(Connection):
 
     # --- the steps of an upload -------------------------------------------------------------------------
 
-    def begin_upload(self, **announced: Any) -> UploadStatus:
+    def begin_upload(self, **announced: object) -> UploadStatus:
         """Begin an upload, or find the one of the same bytes; errors as for `request`."""
         known = {key: value for key, value in announced.items() if value not in (None, "")}
         return self._upload("POST", "/uploads", json=known)
@@ -198,7 +198,7 @@ class Client(Connection):
         return self._upload("GET", f"/uploads/{upload.id}", params={"wait": wait})
 
     def complete_upload(
-        self, upload: UploadStatus, size: int, digest: str, about: dict[str, Any] | None = None
+        self, upload: UploadStatus, size: int, digest: str, about: dict[str, object] | None = None
     ) -> UploadStatus:
         """Complete an upload, so that it is verified; errors as for `request`.
 
@@ -223,7 +223,7 @@ class Client(Connection):
             raise self.unexpected_response() from error
 
 
-def _about(run: Run) -> dict[str, Any]:
+def _about(run: Run) -> dict[str, object]:
     """Return what a run's folder has and its recording does not."""
     if run.stands_alone:  # an exported recording carries its own record of the run
         return {}

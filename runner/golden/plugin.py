@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -103,7 +103,7 @@ class Golden:
 
     def same_environment(
         self,
-        make: Callable[[], Any],
+        make: Callable[[], object],
         episodes: int = 10,
         max_steps: int = 1_000,
         tolerance: float = 0.0,

@@ -41,7 +41,7 @@ class WaitingRun(Protocol):
     def has_environment(self) -> bool:
         """Whether it records one that the script did not hand over."""
 
-    def begin_with(self, env: Any) -> None:
+    def begin_with(self, env: object) -> None:
         """Begin to record an environment that is about to be reset."""
 
     def warn_once(self, message: str, about: str = "") -> None:
@@ -86,7 +86,7 @@ open_runs: list[WaitingRun] = []
 """The runs of scripts that are not closed, the oldest first."""
 _watched: dict[int, WatchedEnvironment] = {}
 """By the id of the environment; a copy of it is not one of them."""
-_hooked: weakref.WeakSet[Any] = weakref.WeakSet()
+_hooked: weakref.WeakSet[object] = weakref.WeakSet()
 """The classes whose `reset` looks for a run that waits."""
 
 
@@ -113,7 +113,7 @@ def _reset(env: Any, original: Callable[..., Any], arguments: Any, named: Mappin
     return watched.call("reset", MethodType(original, env), arguments, named)
 
 
-def _find_run(env: Any) -> None:
+def _find_run(env: object) -> None:
     """Give an environment that is about to be reset to the run that waits for one, if any."""
     waiting = [run for run in open_runs if run.waits_for_environment]
     library = _library_that_resets() if waiting and not isinstance(env, Recorded) else None

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from importlib import metadata
-from typing import Any
 
 from runner.loops.values import warn_user
 from runner.util.extras import require
 
 
-def require_tested(module: str, extra: str, tested: tuple[str, str]) -> Any:
+def require_tested(module: str, extra: str, tested: tuple[str, str]) -> object:
     """Import the library of an adapter; warn if its version is not one of those that were tested.
 
     Args:

@@ -71,7 +71,7 @@ def film_of(value: Any, layout: str, fps: float | None) -> Picture:
     return Picture(np.stack(frames), fps or own_fps)
 
 
-def grid_of(value: Any, layout: str) -> NDArray[Any]:
+def grid_of(value: object, layout: str) -> NDArray[Any]:
     """Return several pictures as one, next to each other in rows: [height, width, channels]."""
     array = _numbers(value)
     if array.ndim != 4 or sorted(layout) != sorted("NCHW"):
@@ -82,7 +82,7 @@ def grid_of(value: Any, layout: str) -> NDArray[Any]:
     return _tiled(images)
 
 
-def histogram_of(values: Any) -> dict[str, NDArray[Any]]:
+def histogram_of(values: object) -> dict[str, NDArray[Any]]:
     """Return counts [bins] and edges [bins + 1] of numbers; those that are not finite are left out."""
     array = _numbers(values).astype(np.float64).ravel()
     finite = array[np.isfinite(array)]
@@ -90,7 +90,7 @@ def histogram_of(values: Any) -> dict[str, NDArray[Any]]:
     return {"counts": counts, "edges": edges}
 
 
-def _numbers(value: Any) -> NDArray[Any]:
+def _numbers(value: object) -> NDArray[Any]:
     try:
         array = as_array(value)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -176,7 +176,7 @@ class Table:
         self.columns = list(columns or ())
         self.data = [list(row) for row in (() if data is None else data)]
 
-    def add_data(self, *row: Any) -> None:
+    def add_data(self, *row: object) -> None:
         """Add a row."""
         self.data.append(list(row))
 

@@ -197,7 +197,7 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
                 self._joining(is_evaluation), remote_worker_ids=env_runner_indices, local_env_runner=False
             )
 
-    def on_evaluate_start(self, *, algorithm: Algorithm, **_: Any) -> None:
+    def on_evaluate_start(self, *, algorithm: Algorithm, **_: object) -> None:
         """State in the evaluating env runners how many steps were trained on."""
         if self._run is not None and (group := algorithm.eval_env_runner_group) is not None:
             steps = algorithm.metrics.peek(("env_runners", _STEPS), default=0)
@@ -241,7 +241,7 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
 
     # --- in the process of an env runner --------------------------------------------------------------
 
-    def on_environment_created(self, *, env_runner: Any, **_: Any) -> None:
+    def on_environment_created(self, *, env_runner: object, **_: object) -> None:
         """Record environments that an env runner made again."""
         if (join := getattr(env_runner, "_recorded_join", None)) is not None:
             _join(join, env_runner)
@@ -304,7 +304,7 @@ def _recorded(env_runner: Any) -> RecordedVector | None:
     return envs if isinstance(envs, RecordedVector) else None
 
 
-def _evaluate_at(steps: int, env_runner: Any) -> None:
+def _evaluate_at(steps: int, env_runner: object) -> None:
     """State after how many training steps an env runner evaluates; called in its process."""
     if (recorded := _recorded(env_runner)) is not None:
         recorded.at_step(steps)
@@ -316,7 +316,7 @@ def _leave(env_runner: Any) -> None:
         recorded._loop.close()
 
 
-def _numbers(values: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
+def _numbers(values: Mapping[object, object], prefix: str = "") -> Iterator[tuple[str, float]]:
     """Yield the numbers in nested mappings by their names, joined by `/`."""
     for key, value in values.items():
         name = f"{prefix}{key}"
@@ -326,7 +326,7 @@ def _numbers(values: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str,
             yield name, float(value)
 
 
-def _arrays(state: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _arrays(state: Mapping[object, object], prefix: str = "") -> Iterator[tuple[str, object]]:
     """Yield the arrays in nested mappings by their names, joined by `/`."""
     for key, value in state.items():
         if isinstance(value, Mapping):

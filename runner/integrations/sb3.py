@@ -256,7 +256,7 @@ class _LogWriter(KVWriter):  # type: ignore[misc]
         self.log({name: value for name, value in key_values.items() if name not in self._of_updates})
         self._is_update_due = True
 
-    def write_update(self, key_values: Mapping[str, Any]) -> None:
+    def write_update(self, key_values: Mapping[str, object]) -> None:
         """Record the numbers of an update, after each time that the library writes."""
         if not self._of_updates:
             self._of_updates = {name for name in key_values if name.startswith("train/")}
@@ -277,7 +277,7 @@ class _LogWriter(KVWriter):  # type: ignore[misc]
         """Do nothing: the run is closed by the callback."""
 
 
-def settings_of(model: BaseAlgorithm) -> dict[str, Any]:
+def settings_of(model: BaseAlgorithm) -> dict[str, object]:
     """Return a model's hyperparameters: the arguments of its class, as far as the model still has them.
 
     A schedule that is constant is its number; another one is its first and last value.
@@ -296,7 +296,7 @@ def settings_of(model: BaseAlgorithm) -> dict[str, Any]:
     return found
 
 
-def _setting(value: Any) -> Any:
+def _setting(value: object) -> object:
     """Return a hyperparameter as JSON holds it; what JSON cannot hold, such as a class, by its name."""
     if isinstance(value, Mapping):
         return {str(key): _setting(part) for key, part in value.items()}
@@ -314,7 +314,7 @@ def _setting(value: Any) -> Any:
     return type(value).__name__ if " object at 0x" in text else text[:_MAX_TEXT]
 
 
-def _observations_in_progress(model: BaseAlgorithm, base: Any) -> Any:
+def _observations_in_progress(model: BaseAlgorithm, base: object) -> object:
     """Return the last observations of environments whose episodes are in progress.
 
     Raises:
@@ -335,7 +335,7 @@ def _observations_in_progress(model: BaseAlgorithm, base: Any) -> Any:
     )
 
 
-def _callbacks_in(callback: Any) -> Iterator[BaseCallback]:
+def _callbacks_in(callback: object) -> Iterator[BaseCallback]:
     """Yield the single callbacks in what `learn` takes."""
     if isinstance(callback, CallbackList):
         callback = callback.callbacks
@@ -347,18 +347,18 @@ def _callbacks_in(callback: Any) -> Iterator[BaseCallback]:
         yield from _callbacks_in(getattr(callback, "callback", None))  # of an EventCallback
 
 
-def _announce(setup_learn: Callable[..., Any]) -> Callable[..., Any]:
+def _announce(setup_learn: Callable[..., object]) -> Callable[..., object]:
     """Return a function that begins recordings, and then does what `setup_learn` does."""
 
     @functools.wraps(setup_learn)
     def setup(
         model: BaseAlgorithm,
         total_timesteps: int,
-        callback: Any = None,
+        callback: object = None,
         reset_num_timesteps: bool = True,
-        *arguments: Any,
-        **named: Any,
-    ) -> Any:
+        *arguments: object,
+        **named: object,
+    ) -> object:
         callbacks = list(_callbacks_in(callback))
         recordings = [one for one in callbacks if isinstance(one, Recording)]
         if len(recordings) > 1:

@@ -120,7 +120,7 @@ class ScriptRun:
         self._note = note[:MAX_NOTE]
         is_folder = "://" not in str(recordings or "")
         self.run_id = new_run_id(recordings_folder(recordings if is_folder else None))
-        self._waiting: list[tuple[str, tuple[Any, ...], int | None]] = []
+        self._waiting: list[tuple[str, tuple[object, ...], int | None]] = []
         self._since, self._waiting_bytes = 0.0, 0
         self._loop: Loop[Any] | None = None
         self._is_own = False
@@ -164,7 +164,7 @@ class ScriptRun:
         self._waiting_bytes += picture.frames.nbytes
         self._do("picture", (name, picture), step)
 
-    def _do(self, method: str, arguments: tuple[Any, ...], step: int | None) -> None:
+    def _do(self, method: str, arguments: tuple[object, ...], step: int | None) -> None:
         """Call a method of the recording's `Messages`, now or when there is a recording."""
         if self.closed:
             self.warn_once(f"run {self.run_id} is closed: values that are logged now are not recorded.")

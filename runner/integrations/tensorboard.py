@@ -108,10 +108,10 @@ class SummaryWriter:
     def add_scalar(
         self,
         tag: str,
-        scalar_value: Any,
-        global_step: Any = None,
-        *_: Any,
-        **__: Any,
+        scalar_value: object,
+        global_step: object = None,
+        *_: object,
+        **__: object,
     ) -> None:
         """Log a number."""
         self._run.log(tag, as_number(tag, scalar_value), step_of(global_step))
@@ -119,10 +119,10 @@ class SummaryWriter:
     def add_scalars(
         self,
         main_tag: str,
-        tag_scalar_dict: Mapping[str, Any],
-        global_step: Any = None,
-        *_: Any,
-        **__: Any,
+        tag_scalar_dict: Mapping[str, object],
+        global_step: object = None,
+        *_: object,
+        **__: object,
     ) -> None:
         """Log several numbers, as `main_tag/name`."""
         for name, value in tag_scalar_dict.items():
@@ -132,9 +132,9 @@ class SummaryWriter:
         self,
         tag: str,
         text_string: str,
-        global_step: Any = None,
-        *_: Any,
-        **__: Any,
+        global_step: object = None,
+        *_: object,
+        **__: object,
     ) -> None:
         """Log a text; a table of hyperparameters, as CleanRL writes it, also becomes the settings."""
         if self._run.is_waiting and (found := _HYPERPARAMETERS.search(str(text_string))):
@@ -144,10 +144,10 @@ class SummaryWriter:
     def add_histogram(
         self,
         tag: str,
-        values: Any,
-        global_step: Any = None,
-        *_: Any,
-        **__: Any,
+        values: object,
+        global_step: object = None,
+        *_: object,
+        **__: object,
     ) -> None:
         """Record a histogram of 64 bins: the arrays `tag/counts` and `tag/edges`."""
         self._run.snapshot(tag, histogram_of(values), step_of(global_step))
@@ -155,10 +155,10 @@ class SummaryWriter:
     def add_tensor(
         self,
         tag: str,
-        tensor: Any,
-        global_step: Any = None,
-        *_: Any,
-        **__: Any,
+        tensor: object,
+        global_step: object = None,
+        *_: object,
+        **__: object,
     ) -> None:
         """Record an array."""
         self._run.snapshot(tag, tensor, step_of(global_step))
@@ -166,10 +166,10 @@ class SummaryWriter:
     def add_image(
         self,
         tag: str,
-        img_tensor: Any,
-        global_step: Any = None,
+        img_tensor: object,
+        global_step: object = None,
         dataformats: str = "CHW",
-        **_: Any,
+        **_: object,
     ) -> None:
         """Record a picture."""
         self._run.picture(tag, picture_of(img_tensor, dataformats.upper()), step_of(global_step))
@@ -177,10 +177,10 @@ class SummaryWriter:
     def add_images(
         self,
         tag: str,
-        img_tensor: Any,
-        global_step: Any = None,
+        img_tensor: object,
+        global_step: object = None,
         dataformats: str = "NCHW",
-        **_: Any,
+        **_: object,
     ) -> None:
         """Record several pictures as one."""
         self._run.picture(tag, picture_of(grid_of(img_tensor, dataformats.upper())), step_of(global_step))
@@ -188,10 +188,10 @@ class SummaryWriter:
     def add_figure(
         self,
         tag: str,
-        figure: Any,
-        global_step: Any = None,
+        figure: object,
+        global_step: object = None,
         close: bool = True,
-        **_: Any,
+        **_: object,
     ) -> None:
         """Record a figure of Matplotlib, or a list of them, as pictures."""
         for each in figure if isinstance(figure, list) else [figure]:
@@ -202,22 +202,22 @@ class SummaryWriter:
     def add_video(
         self,
         tag: str,
-        vid_tensor: Any,
-        global_step: Any = None,
+        vid_tensor: object,
+        global_step: object = None,
         fps: float = 4,
         dataformats: str = "NTCHW",
-        **_: Any,
+        **_: object,
     ) -> None:
         """Record a film."""
         self._run.picture(tag, film_of(vid_tensor, dataformats.upper(), fps), step_of(global_step))
 
     def add_hparams(
         self,
-        hparam_dict: Mapping[str, Any],
-        metric_dict: Mapping[str, Any],
-        hparam_domain_discrete: Any = None,  # noqa: ARG002
+        hparam_dict: Mapping[str, object],
+        metric_dict: Mapping[str, object],
+        hparam_domain_discrete: object = None,  # noqa: ARG002
         run_name: str | None = None,  # noqa: ARG002
-        global_step: Any = None,
+        global_step: object = None,
     ) -> None:
         """Take settings, and log metrics; settings that come after the recording began are logged too."""
         if self._run.is_waiting:
@@ -232,7 +232,7 @@ class SummaryWriter:
             supported = ", ".join(method for method in vars(SummaryWriter) if method.startswith("add_"))
             raise AttributeError(f"SummaryWriter has no {name!r}, but {supported}")
 
-        def not_recorded(*_: Any, **__: Any) -> None:
+        def not_recorded(*_: object, **__: object) -> None:
             self._run.warn_once(f"SummaryWriter.{name} does nothing: a recording has no place for it.")
 
         return not_recorded
@@ -281,7 +281,7 @@ def step_of(step: Any) -> int | None:
     raise ConfigError(f"global_step: found {step!r}, expected a whole number from 0")
 
 
-def as_number(name: str, value: Any) -> Any:
+def as_number(name: str, value: object) -> object:
     """Return a number, also one that stands in an array or tensor of one; text is refused.
 
     Raises:
@@ -336,9 +336,9 @@ def forward() -> bool:
     return found
 
 
-def _forwarding(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
+def _forwarding(name: str, method: Callable[..., object]) -> Callable[..., object]:
     @wraps(method)
-    def both(self: Any, *arguments: Any, **named: Any) -> Any:
+    def both(self: object, *arguments: object, **named: object) -> object:
         if _forwarded is not None and not _forwarded._run.closed:
             getattr(_forwarded, name)(*arguments, **named)
         return method(self, *arguments, **named)

@@ -189,7 +189,7 @@ def _text(key: Any) -> str:
     return key if isinstance(key, str) else "/".join(key)
 
 
-def _name_of(env: Any) -> str:
+def _name_of(env: object) -> str:
     """Return the name of an environment without its transforms."""
     while hasattr(env, "base_env"):
         env = env.base_env
@@ -225,7 +225,7 @@ class Logger(_Logger):  # type: ignore[misc]
         writer._run.name = self.exp_name
         return writer
 
-    def log_scalar(self, name: str, value: Any, step: int | None = None) -> None:
+    def log_scalar(self, name: str, value: object, step: int | None = None) -> None:
         """Log a number."""
         self.experiment.add_scalar(name, value, step)
 
@@ -233,15 +233,15 @@ class Logger(_Logger):  # type: ignore[misc]
         """Log a text."""
         self.experiment.add_text(name, value, step)
 
-    def log_video(self, name: str, video: Any, step: int | None = None, **more: Any) -> None:
+    def log_video(self, name: str, video: object, step: int | None = None, **more: object) -> None:
         """Record a film, [batch, time, channels, height, width]."""
         self.experiment.add_video(name, video, step, more.get("fps", 30))
 
-    def log_hparams(self, cfg: Any) -> None:
+    def log_hparams(self, cfg: object) -> None:
         """Record settings."""
         self.experiment.add_hparams(as_mapping(cfg) or {"config": str(cfg)}, {})
 
-    def log_histogram(self, name: str, data: Any, **more: Any) -> None:
+    def log_histogram(self, name: str, data: object, **more: object) -> None:
         """Record a histogram of 64 bins: the arrays `name/counts` and `name/edges`."""
         self.experiment.add_histogram(name, data, more.get("step"))
 

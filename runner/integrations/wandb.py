@@ -81,7 +81,7 @@ class Config(MutableMapping[str, Any]):
     def __getitem__(self, key: str) -> Any:
         return self._run.script.settings[key]
 
-    def __setitem__(self, key: str, value: Any) -> None:
+    def __setitem__(self, key: str, value: object) -> None:
         self._run.configure({key: value})
 
     def __delitem__(self, key: str) -> None:
@@ -109,7 +109,7 @@ class Summary(dict[str, Any]):
         super().__init__()
         self.own: dict[str, Any] = {}
 
-    def __setitem__(self, key: str, value: Any) -> None:
+    def __setitem__(self, key: str, value: object) -> None:
         super().__setitem__(key, value)
         self.own[key] = value
 
@@ -118,7 +118,7 @@ class Summary(dict[str, Any]):
         for key, value in {**dict(values), **more}.items():
             self[key] = value
 
-    def seen(self, key: str, value: Any) -> None:
+    def seen(self, key: str, value: object) -> None:
         """Note a value that was logged."""
         super().__setitem__(key, value)
 
@@ -227,7 +227,7 @@ class Tracked:
         else:
             self._log_number(name, value, step)
 
-    def _log_number(self, name: str, value: Any, step: int | None) -> None:
+    def _log_number(self, name: str, value: object, step: int | None) -> None:
         try:
             number = as_number(name, value)
         except ConfigError:
@@ -409,7 +409,7 @@ _warned: set[str] = set()
 
 
 def _without_effect(name: str) -> Callable[..., None]:
-    def do_nothing(*_: Any, **__: Any) -> None:
+    def do_nothing(*_: object, **__: object) -> None:
         if name not in _warned:
             _warned.add(name)
             warn_user(f"wandb.{name} does nothing: a recording needs no such call, or has no place for it.")

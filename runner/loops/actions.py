@@ -138,7 +138,7 @@ def _parsed(space: Space, given: Any, recorded: Any, names: Sequence[str], where
     return array
 
 
-def _parsed_json(space: Space, given: Any, where: str) -> Any:
+def _parsed_json(space: Space, given: object, where: str) -> object:
     """Return an action of a space whose values are recorded as text; as text it is JSON."""
     try:
         value = value_of(space, given) if isinstance(given, str) else given
@@ -191,6 +191,6 @@ def _discrete(space: spaces.Discrete, given: Any, names: Sequence[str], where: s
     return number
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     text = repr(value)
     return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}…"

@@ -47,12 +47,12 @@ class BatchRows(VectorRows):
 
     def take_batch(
         self,
-        observations: Any,
-        actions: Any,
+        observations: object,
+        actions: object,
         rewards: NDArray[np.float64],
         terminated: Flags,
         truncated: Flags,
-        finals: Any = None,
+        finals: object = None,
     ) -> None:
         """Record T steps of all environments; all or nothing of them.
 

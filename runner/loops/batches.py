@@ -233,8 +233,8 @@ def record_batches(
     envs: AnyVectorEnv | str,
     recordings: str | os.PathLike[str] | None = None,
     *,
-    observation_space: Any = None,
-    action_space: Any = None,
+    observation_space: object = None,
+    action_space: object = None,
     autoreset_mode: AutoresetMode | str | None = None,
     make: str | Callable[[], Any] | None = None,
     **options: Unpack[RunOptions],
@@ -277,7 +277,7 @@ def record_batches(
     return RecordedBatches(envs, mode, own_spaces, valid, checked_make(make))
 
 
-def _numpy(values: Any) -> Any:
+def _numpy(values: object) -> object:
     """Return arrays of any library as NumPy's, nested as they are."""
     if isinstance(values, Mapping):
         return {key: _numpy(part) for key, part in values.items()}
@@ -295,7 +295,7 @@ def _arrays(values: Any) -> Any:
         yield values
 
 
-def _flags(what: str, values: Any, shape: tuple[int, ...]) -> Flags:
+def _flags(what: str, values: object, shape: tuple[int, ...]) -> Flags:
     """Return an array of booleans, which may come as 0 and 1.
 
     Raises:

@@ -20,7 +20,7 @@ _MAX_NUMBER: Final = 8
 """Bytes of the widest number that safetensors have."""
 
 
-def content_of(name: str, value: Any, pickle: bool) -> tuple[bytes | memoryview | Path, str]:
+def content_of(name: str, value: object, pickle: bool) -> tuple[bytes | memoryview | Path, str]:
     """Return the content of a checkpoint, and its format.
 
     Args:
@@ -61,7 +61,7 @@ def content_of(name: str, value: Any, pickle: bool) -> tuple[bytes | memoryview 
     )
 
 
-def _leaves(values: Mapping[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+def _leaves(values: Mapping[object, object], prefix: str) -> Iterator[tuple[str, object]]:
     """Yield the values of nested mappings, named `outer/inner`."""
     for key, value in values.items():
         if isinstance(value, Mapping):

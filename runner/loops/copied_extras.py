@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,7 @@ class CopiedExtras:
         self._own = {
             (source.number, phase): source.recording.extras(phase) for source in sources for phase in PHASES
         }
-        dtypes: dict[str, np.dtype[Any]] = {}
+        dtypes: dict[str, np.dtype[np.generic]] = {}
         self._names: dict[tuple[int, str], str] = {}
         """The names in the run, by number of the process and its own name."""
         for (number, _), own in self._own.items():

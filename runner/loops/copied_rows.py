@@ -15,6 +15,7 @@ from runner.loops.rows import Rows
 from runner.recording import schema
 from runner.recording.messages import encode
 from runner.recording.recorder import Recorder
+from runner.util.arrays import Array
 
 _STEP_FIELDS: Final = ("state", "action", "next_state")
 _TRANSITION_FIELDS: Final = ("action", "next_observation", "acted", "agents_terminated", "agents_truncated")
@@ -32,7 +33,7 @@ class Copied:
 class _Copies(Rows):
     """What copied rows have in common."""
 
-    def _set_leaves(self, described: Any) -> None:
+    def _set_leaves(self, described: object) -> None:
         """Do nothing: values are copied."""
 
     @property
@@ -103,13 +104,13 @@ class CopiedRows(_Copies):
     def _rewards(self, n: int) -> NDArray[np.float64]:
         return np.asarray(self._block["rewards"][:n, 0])
 
-    def _transitions(self, n: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    def _transitions(self, n: int) -> tuple[Array, Array, Array]:
         if not self._state_fields:
             return super()._transitions(n)
         state, action, after = (self._block[name][:n].astype(np.int64) for name in _STEP_FIELDS)
         return state, action, after
 
-    def _finish_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
+    def _finish_steps(self, n: int, episode: Array, t: Array, before: int) -> None:
         block = self._block[:n]
         block["step"] = self._recorder.steps[self._phase] + np.arange(n)
         block["episode"], block["t"] = episode, t
@@ -152,12 +153,12 @@ class CopiedMessages(_Copies):
     def _rewards(self, n: int) -> NDArray[np.float64]:
         return self._paid[:n]
 
-    def _finish_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
+    def _finish_steps(self, n: int, episode: Array, t: Array, before: int) -> None:
         """Do nothing: the messages are complete."""
 
-    def _finish_resets(self, begins: NDArray[Any], before: int) -> None:  # noqa: ARG002
+    def _finish_resets(self, begins: Array, before: int) -> None:  # noqa: ARG002
         self._reset_count += len(self._reset_rows)
 
 
-def _payload(message: Mapping[str, Any]) -> dict[str, Any]:
+def _payload(message: Mapping[str, object]) -> dict[str, object]:
     return {name: value for name, value in message.items() if name != "log_time"}

@@ -80,7 +80,7 @@ class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
         """Reset the environment, and record it: the seed, the options, the observation."""
         return self._recorded_reset(seed, options)
 
-    def _record_messages(self, info: Mapping[str, Any], over: bool) -> None:
+    def _record_messages(self, info: Mapping[str, object], over: bool) -> None:
         """Record info and frame of the step that was just put down, where the options include them."""
         if self._options.info:
             self._messages.info(self._phase, info)

@@ -21,6 +21,7 @@ from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAME_LENGTH, MAX_NAMES,
 from runner.recording.gym_values import SCALARS
 from runner.recording.messages import encode
 from runner.recording.recorder import Recorder
+from runner.util.arrays import Array
 from runner.util.values import is_utf8
 
 _MAX_ROWS: Final = 4096
@@ -53,7 +54,7 @@ class Extras:
         """Whether the recording has the names and dtypes."""
         self._columns: dict[str, list[bytes]] = {}
         """By name, the bytes of [*batch, *shape] in each row; zeros where there is no value."""
-        self._fast: dict[str, tuple[np.dtype[Any], tuple[int, ...], Callable[[bytes], None], Put]] = {}
+        self._fast: dict[str, tuple[np.dtype[np.generic], tuple[int, ...], Callable[[bytes], None], Put]] = {}
         """By name, dtype and shape of the usual values, which are appended, and what takes all others."""
         self._max_rows = 0
         self._phase = ""
@@ -64,7 +65,7 @@ class Extras:
         self._final = dict.fromkeys(schema.PHASES, -1)
         """The last step of each phase that cannot be extended any more."""
 
-    def taker(self, phase: str, rows: PhaseRows) -> Callable[[Mapping[str, Any]], None]:
+    def taker(self, phase: str, rows: PhaseRows) -> Callable[[Mapping[str, object]], None]:
         """Return a function that puts down the values of a step that was just taken, by name.
 
         It is called with each step, so it has what it needs at hand.
@@ -143,7 +144,7 @@ class Extras:
         if n - 1 in self._partial:
             self._partial[n - 1].update(values)
 
-    def checked_batch(self, values: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, NDArray[Any]]:
+    def checked_batch(self, values: Mapping[str, object], shape: tuple[int, ...]) -> dict[str, Array]:
         """Return the values of T steps of N environments, by name, as `put_batch` takes them.
 
         Args:
@@ -168,7 +169,7 @@ class Extras:
             for name, array in arrays.items()
         }
 
-    def put_batch(self, phase: str, rows: PhaseRows, values: Mapping[str, NDArray[Any]]) -> None:
+    def put_batch(self, phase: str, rows: PhaseRows, values: Mapping[str, Array]) -> None:
         """Hand the values of the T steps of all environments that were just taken to the recorder.
 
         Args:
@@ -195,7 +196,7 @@ class Extras:
     def _zeros(self, name: str) -> bytes:
         return bytes(self._dtypes[name].itemsize * self._n)
 
-    def _grow(self, row: int, values: Mapping[str, Any]) -> None:
+    def _grow(self, row: int, values: Mapping[str, object]) -> None:
         """Add the names that are new, of which rows before this one have no values."""
         if not isinstance(values, Mapping):
             raise ConfigError(f"extras: found {type(values).__name__}, expected values by name")
@@ -222,7 +223,7 @@ class Extras:
             base, shape = np.dtype(dtype.base.str), (*self._batch, *dtype.shape)
             self._fast[name] = base, shape, column.append, _putter(name, base, shape, column)
 
-    def _dtype_of(self, name: Any, value: Any) -> np.dtype[Any]:
+    def _dtype_of(self, name: object, value: object) -> np.dtype[np.generic]:
         """Return the dtype, with the shape, that a name gets by its first value."""
         if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME_LENGTH or not is_utf8(name):
             raise ConfigError(
@@ -304,7 +305,7 @@ class Extras:
         return {name: np.repeat(flags, self._n) for name, flags in given.items()}
 
 
-def _putter(name: str, base: np.dtype[Any], shape: tuple[int, ...], column: list[bytes]) -> Put:
+def _putter(name: str, base: np.dtype[np.generic], shape: tuple[int, ...], column: list[bytes]) -> Put:
     """Return a function that adds a value of a name to its column, which is of this dtype and shape.
 
     Raises:
@@ -340,7 +341,7 @@ def _fitting(name: str, value: Any, base: np.dtype[Any], shape: tuple[int, ...])
     return array
 
 
-def _numbers(name: str, value: Any) -> NDArray[Any]:
+def _numbers(name: str, value: object) -> Array:
     """Return a value as an array of numbers."""
     try:
         array = as_array(value)

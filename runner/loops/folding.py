@@ -49,6 +49,7 @@ from runner.recording.writer import create_recording
 from runner.runs.listing import run_at
 from runner.runs.run import RECORDING_FILE, SHARDS_FOLDER, Run
 from runner.runs.shards import ENDS_AS, are_over, handed_over, shards_locked, shards_of
+from runner.util.arrays import Array
 from runner.util.files import open_regular, storage_errors
 
 OWNER_WAITS: Final = 5.0
@@ -254,7 +255,7 @@ class _Fold:
 
     # --- the order ------------------------------------------------------------------------------------
 
-    def _ordered(self) -> tuple[NDArray[np.void], tuple[NDArray[Any], NDArray[Any]]]:
+    def _ordered(self) -> tuple[NDArray[np.void], tuple[Array, Array]]:
         """Return the units of all processes in the order of the run, and those of evaluations among them."""
         for source in self._sources:
             for phase, units in source.units.items():
@@ -271,7 +272,7 @@ class _Fold:
         own = every[every["phase"] == PHASES.index("eval")]
         return every, (own["key"].copy(), np.concatenate([[0], np.cumsum(own["steps"])]))
 
-    def _alongside(self, times: NDArray[Any]) -> NDArray[np.float64]:
+    def _alongside(self, times: Array) -> NDArray[np.float64]:
         """Return the training steps of the run when every process had stepped its environments so often."""
         total = np.zeros(len(times))
         for source in self._sources:

@@ -164,13 +164,13 @@ class VectorWatch:
         return {i: state._replace(environment=i) for i, state in found.items() if state is not None}
 
 
-def is_atari(base: Any) -> bool:
+def is_atari(base: object) -> bool:
     """Return whether an environment, without its wrappers, is one of the Arcade Learning Environment."""
     modules = (kind.__module__.partition(".")[0] for kind in type(base).__mro__)
     return "ale_py" in modules and hasattr(base, "ale")
 
 
-def seed_of(generator: Any) -> int | None:
+def seed_of(generator: object) -> int | None:
     """Return the seed that a generator was made from; None if it is unknown."""
     sequence = getattr(getattr(generator, "bit_generator", None), "seed_seq", None)
     entropy = getattr(sequence, "entropy", None)

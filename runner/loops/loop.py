@@ -113,7 +113,7 @@ class Loop(Generic[R]):
         """The environment and its spaces."""
         return self._opened.described
 
-    def _first_action(self, action: Any) -> None:
+    def _first_action(self, action: object) -> None:
         """Record all actions in the dtype of the first one, if the space's own cannot hold it exactly."""
         if self._opened.settle(action):
             for rows in self._rows.values():

@@ -165,7 +165,7 @@ class LoopRun:
             environment = self.described.attachments(), self._maker
             write_description(self._file, self._facts, self._config, self._made_by, *environment)
 
-    def settle(self, action: Any) -> bool:
+    def settle(self, action: object) -> bool:
         """Fix the dtype of all actions by the first one; return whether it is not the space's own."""
         if self.is_settled:
             return False
@@ -183,7 +183,7 @@ class LoopRun:
         if self._actions is not None:
             self._actions.commit()
 
-    def finish(self, status: str, error: str, rewards_off_table: int) -> dict[str, Any]:
+    def finish(self, status: str, error: str, rewards_off_table: int) -> dict[str, object]:
         """Write everything and the result; return the summary.
 
         Raises:
@@ -208,7 +208,7 @@ class LoopRun:
         """Close the file, finished or not."""
         self._file.close()
 
-    def write_status(self, status: str, summary: Mapping[str, Any]) -> None:
+    def write_status(self, status: str, summary: Mapping[str, object]) -> None:
         """Write how the run ended next to its recording.
 
         Raises:

@@ -214,7 +214,7 @@ class Messages:
             self._recorder.append(topic, encode(schema.INFO, fields), self._loop.position)
 
     def reset_info(
-        self, phase: str, info: Mapping[str, Any], options: Mapping[str, Any] | None, seed: Any
+        self, phase: str, info: Mapping[str, object], options: Mapping[str, object] | None, seed: object
     ) -> None:
         """Record the chosen fields of a reset's info, its options, and a seed too large for its record."""
         reset: dict[str, Any] = {"options": options} if options else {}
@@ -223,7 +223,7 @@ class Messages:
         if reset or self._options.info:
             self.info(phase, info, reset)
 
-    def _json_of(self, what: str, fields: Mapping[str, Any]) -> str:
+    def _json_of(self, what: str, fields: Mapping[str, object]) -> str:
         """Return fields as a JSON object; a field that cannot be recorded is replaced by the reason."""
         pieces, size = [], 0
         for key, value in fields.items():

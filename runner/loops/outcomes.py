@@ -74,7 +74,7 @@ class Outcomes:
             "logged": self._logged,
         }
 
-    def _evaluation(self) -> dict[str, Any] | None:
+    def _evaluation(self) -> dict[str, object] | None:
         if not self._trials:
             return None
         means = {name: total / count for name, (total, count) in self._sums.items() if count}

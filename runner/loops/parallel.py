@@ -84,7 +84,7 @@ class RecordedParallel(RecordedAlone[AgentRows]):
         """Reset the environment, and record it."""
         return self._recorded_reset(seed, options)
 
-    def _info_by_field(self, info: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _info_by_field(self, info: Mapping[str, object]) -> Mapping[str, object]:
         return by_field(info)
 
 

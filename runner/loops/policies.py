@@ -36,9 +36,9 @@ from runner.runs.run import Run
 
 MAX_NUMBERS: Final = 256
 """The most numbers in one of the values that a policy returns along an episode."""
-Policy = Callable[[Any], Any]
+Policy = Callable[[object], object]
 """Takes an observation; returns an action, or what is to be shown of it."""
-MakePolicy = Callable[[Any, Any, Any], Policy]
+MakePolicy = Callable[[object, object, object], Policy]
 """Takes the content of a checkpoint, and the spaces of observations and actions."""
 
 

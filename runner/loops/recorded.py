@@ -107,7 +107,7 @@ class Recorded(Generic[R]):
             self._loop.leave_out(error)
             return ""
 
-    def note_step(self, values: Mapping[str, Any] | None = None, /, **more: Any) -> None:
+    def note_step(self, values: Mapping[str, object] | None = None, /, **more: object) -> None:
         """Record values with the last step, as `step(action, extras={...})` does.
 
             rec.note_step(td_error=error)
@@ -125,7 +125,7 @@ class Recorded(Generic[R]):
         except Exception as error:
             self._loop.leave_out(error)
 
-    def _extras_by_name(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _extras_by_name(self, values: Mapping[str, object]) -> Mapping[str, object]:
         return values
 
     def at_step(self, steps: int) -> None:
@@ -260,11 +260,11 @@ class RecordedAlone(Recorded[S]):
             self._loop.fail(error)
         return result
 
-    def _info_by_field(self, info: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _info_by_field(self, info: Mapping[str, object]) -> Mapping[str, object]:
         return info
 
 
-def require_pictures(env: Any) -> None:
+def require_pictures(env: object) -> None:
     """Refuse an environment that renders no pictures, in a run with frames.
 
     Raises:

@@ -77,7 +77,7 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         self.reset_infos = self.base.reset_infos
         return self._vector.native
 
-    def step_async(self, actions: Any) -> None:
+    def step_async(self, actions: object) -> None:
         """Begin a step in each environment."""
         self._actions = actions
         self._vector.step_async(actions)
@@ -96,7 +96,7 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         """Set the seeds of the next reset."""
         return self.base.seed(seed)  # type: ignore[no-any-return]
 
-    def set_options(self, options: Any = None) -> None:
+    def set_options(self, options: object = None) -> None:
         """Set the options of the next reset."""
         self.base.set_options(options)
 
@@ -108,7 +108,7 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         """Return one picture of all environments, or show it."""
         return self.base.render(mode)
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> Any:
+    def get_attr(self, attr_name: str, indices: object = None) -> Any:
         """Return an attribute of each environment."""
         return self.base.get_attr(attr_name, indices)
 
@@ -116,11 +116,13 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         """Return whether each environment has an attribute."""
         return bool(self.base.has_attr(attr_name))
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: object = None) -> None:
         """Set an attribute of each environment."""
         self.base.set_attr(attr_name, value, indices)
 
-    def env_method(self, method_name: str, *arguments: Any, indices: Any = None, **named: Any) -> Any:
+    def env_method(
+        self, method_name: str, *arguments: object, indices: object = None, **named: object
+    ) -> Any:
         """Call a method of each environment."""
         return self.base.env_method(method_name, *arguments, indices=indices, **named)
 
@@ -129,7 +131,7 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         return self.base.env_is_wrapped(wrapper_class, indices)
 
 
-def record_vec_env(env: VecEnv, options: dict[str, Any]) -> VecEnv:
+def record_vec_env(env: VecEnv, options: dict[str, object]) -> VecEnv:
     """Return a `VecEnv` whose environments are recorded, as they are inside of all wrappers.
 
     Args:

@@ -18,6 +18,7 @@ from runner.loops.values import warn_user
 from runner.recording import schema
 from runner.recording.gym_values import leaves_of
 from runner.recording.recorder import Recorder
+from runner.util.arrays import Array
 
 MAX_SEED: Final = 2**64 - 1
 """The largest seed that the record of a reset holds."""
@@ -208,7 +209,7 @@ class Rows:
         self._recorder.take(self._episodes, positions.astype(np.uint64))
         self._ended += n
 
-    def _finish_resets(self, begins: NDArray[Any], before: int) -> None:
+    def _finish_resets(self, begins: Array, before: int) -> None:
         """Complete the records of resets and hand them to the recorder."""
         n = len(self._reset_rows)
         rows = np.array(self._reset_rows, np.int64)
@@ -235,12 +236,12 @@ class Rows:
         """Return the rewards of the first n rows."""
         raise NotImplementedError
 
-    def _transitions(self, n: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:  # noqa: ARG002
+    def _transitions(self, n: int) -> tuple[Array, Array, Array]:  # noqa: ARG002
         """Return state, action and next state of the first n rows; empty arrays without states."""
         nothing = np.empty(0, np.int64)
         return nothing, nothing, nothing
 
-    def _finish_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
+    def _finish_steps(self, n: int, episode: Array, t: Array, before: int) -> None:
         """Complete the records of the first n rows and hand them to the recorder."""
         raise NotImplementedError
 

@@ -17,6 +17,7 @@ from runner.recording import schema
 from runner.recording.gym_values import filler, filler_by_agent, leaves_by_agent, value_bytes
 from runner.recording.messages import encode
 from runner.recording.recorder import Recorder
+from runner.util.arrays import Array
 
 _DISCRETE: Final = struct.Struct("<qqd??")
 _DISCRETE_DTYPE: Final = np.dtype(
@@ -52,7 +53,7 @@ class BlockRows(Rows):
     def _rewards(self, n: int) -> NDArray[np.float64]:
         return self._scratch["reward"][:n]
 
-    def _finish_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
+    def _finish_steps(self, n: int, episode: Array, t: Array, before: int) -> None:
         block, rows = self._block[:n], self._scratch[:n]
         block["rewards"] = rows["reward"].reshape(n, -1)
         block["terminated"], block["truncated"] = rows["terminated"], rows["truncated"]
@@ -100,7 +101,7 @@ class DiscreteRows(BlockRows):
     def _put_reset(self, observation: Any, seed: int | None) -> None:  # noqa: ARG002
         self._reset_column[len(self._reset_rows)] = whole_number(observation, "observation")
 
-    def _transitions(self, n: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    def _transitions(self, n: int) -> tuple[Array, Array, Array]:
         rows = self._scratch[:n]
         next_state = rows["next_state"] - self._state_start
         state = np.empty(n + 1, np.int64)
@@ -116,7 +117,7 @@ class DiscreteRows(BlockRows):
         }
         return self._columns["state"], self._columns["action"], next_state
 
-    def _finish_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
+    def _finish_steps(self, n: int, episode: Array, t: Array, before: int) -> None:
         for name, values in self._columns.items():
             if not 0 <= values.min() <= values.max() <= _MAX_STATE:
                 raise RecordingError(
@@ -141,7 +142,7 @@ class ArrayRows(BlockRows):
         self._first = filler(self._observation_leaves, self._reset_block["observation"])
         return rooms
 
-    def _settle(self, row: int, action: Any) -> None:
+    def _settle(self, row: int, action: object) -> None:
         """Put down the first action, whose dtype is the one that all are recorded in."""
         self._is_settled = True
         self._first_action(action)
@@ -165,7 +166,7 @@ class ArrayRows(BlockRows):
     def _put_reset(self, observation: Any, seed: int | None) -> None:  # noqa: ARG002
         self._first(len(self._reset_rows), observation)
 
-    def _finish_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
+    def _finish_steps(self, n: int, episode: Array, t: Array, before: int) -> None:
         block, rows = self._block[:n], self._scratch[:n]
         block["acted"] = 1
         block["agents_terminated"], block["agents_truncated"] = rows["terminated"], rows["truncated"]
@@ -300,10 +301,10 @@ class VariableRows(Rows):
     def _rewards(self, n: int) -> NDArray[np.float64]:
         return self._paid[:n]
 
-    def _finish_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
+    def _finish_steps(self, n: int, episode: Array, t: Array, before: int) -> None:
         """Do nothing: the messages are complete."""
 
-    def _finish_resets(self, begins: NDArray[Any], before: int) -> None:
+    def _finish_resets(self, begins: Array, before: int) -> None:
         """Do nothing: the messages are complete."""
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from runner.errors import ConfigError, RecordingError
 from runner.recording import schema
 from runner.recording.chunks import MAX_CHUNK_BYTES
+from runner.util.arrays import Array
 from runner.util.jsonable import as_json, as_mapping
 from runner.util.values import is_utf8
 
@@ -64,7 +65,7 @@ def logged_number(name: str, value: Any) -> float:
         ) from error
 
 
-def check_log_name(name: Any, value: Any) -> None:
+def check_log_name(name: object, value: object) -> None:
     """Refuse a name that a logged value cannot have.
 
     Raises:
@@ -76,7 +77,7 @@ def check_log_name(name: Any, value: Any) -> None:
         raise ConfigError(f"log: found the name {name!r} for {value!r}, expected text that is valid Unicode")
 
 
-def arrays_of(name: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+def arrays_of(name: str, value: object) -> Iterator[tuple[str, Array]]:
     """Yield the arrays of a snapshot: the value itself, or those of a mapping as `name/key`.
 
     Raises:

@@ -76,7 +76,7 @@ class VecEnvVector(AnyVectorEnv):
         self._close()
 
 
-def mode_of(base: Any) -> str:
+def mode_of(base: object) -> str:
     """Return how the environments of a vector without wrappers are put together, as in `VectorMaker`."""
     if isinstance(base, VecEnvVector):
         return base.mode

@@ -148,12 +148,12 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
 
     def record_reset(
         self,
-        observations: Any,
-        infos: Any,
+        observations: object,
+        infos: object,
         seeds: Sequence[int | None] = (),
         which: NDArray[np.bool_] | None = None,
         states: States | None = None,
-        options: Mapping[str, Any] | None = None,
+        options: Mapping[str, object] | None = None,
     ) -> None:
         """Record a reset of some environments, or of all, that was just done.
 

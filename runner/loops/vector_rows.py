@@ -23,6 +23,7 @@ from runner.recording.gym_values import filler, leaves_of, put_chosen
 from runner.recording.recorder import Recorder
 from runner.recording.reset_states import ResetState
 from runner.recording.schema import Topic
+from runner.util.arrays import Array
 
 _TRUE: Final = b"\1"
 _MAX_STEPS: Final = 2048
@@ -194,7 +195,7 @@ class VectorRows:
         if self._filled == self._room:
             self.commit()
 
-    def _now(self) -> NDArray[Any]:
+    def _now(self) -> Array:
         """Return the observations [N] after the last step or reset of each environment."""
         if not self._filled:
             return self._current
@@ -344,9 +345,9 @@ class VectorRows:
 
     def _put_ends(
         self,
-        last: NDArray[Any],
-        length: NDArray[Any],
-        returns: NDArray[Any],
+        last: Array,
+        length: Array,
+        returns: Array,
         terminated: Flags,
         truncated: Flags,
     ) -> None:
@@ -365,11 +366,11 @@ class VectorRows:
     def _put_resets(
         self,
         which: NDArray[np.intp],
-        observation: NDArray[Any],
+        observation: Array,
         seeds: Sequence[int | None],
         states: Sequence[ResetState | None],
-        episode: NDArray[Any],
-        steps: NDArray[Any],
+        episode: Array,
+        steps: Array,
     ) -> None:
         """Record resets in their order; `steps` are the steps of the phase before each."""
         valid = [seed if seed is not None and 0 <= seed <= MAX_SEED else None for seed in seeds]
@@ -390,7 +391,7 @@ class VectorRows:
                 self._recorder.append(self._reset_states, payload, other + int(steps[k]))
         self._reset_count += len(which)
 
-    def _record(self, topic: Topic, columns: Mapping[str, NDArray[Any]], steps: NDArray[Any]) -> None:
+    def _record(self, topic: Topic, columns: Mapping[str, Array], steps: Array) -> None:
         """Hand records, given by field, to the recorder; `steps` are the steps of the phase at each."""
         other = sum(self._recorder.steps.values()) - self._recorder.steps[self._phase]
         positions = (steps + other).astype(np.uint64)

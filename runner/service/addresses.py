@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 from urllib.parse import urlencode
 
 from runner.analysis.step_reference import StepRef
@@ -46,7 +45,7 @@ class Paging:
         return f"{self.address}{'&' if '?' in self.address else '?'}page={page}"
 
 
-def link(path: str, values: Mapping[str, Any]) -> str:
+def link(path: str, values: Mapping[str, object]) -> str:
     """Return an address with a query of the values that are not empty."""
     query = [(key, value) for key, value in values.items() if value not in ("", None, [], ())]
     return f"{path}?{urlencode(query, doseq=True)}" if query else path

@@ -121,7 +121,7 @@ def run_histograms(path: Path, axis: str) -> bytes:
 
 def _shown_curve(
     panel: Panel, curve: Curve, start: float, stop: float | None, points: int, lines: bool
-) -> dict[str, Any]:
+) -> dict[str, object]:
     inside = np.flatnonzero((curve.places >= start) & (curve.places < (math.inf if stop is None else stop)))
     chosen = inside[thinned(curve.middle[inside], points)]
     has_band = len(curve.runs) > 1

@@ -20,7 +20,7 @@ from runner.service.settings import Settings
 from runner.service.uploads import Uploads
 
 
-def _state(name: str) -> Any:
+def _state(name: str) -> object:
     """Return the dependency on a part of the service, as `app.state` has it."""
 
     def get(request: Request) -> Any:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import errno
 from http import HTTPStatus
-from typing import Any, Final
+from typing import Final
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -65,12 +65,12 @@ class ErrorResponse(BaseModel):
     error: ErrorBody
 
 
-def error_docs(*statuses: HTTPStatus) -> dict[int | str, dict[str, Any]]:
+def error_docs(*statuses: HTTPStatus) -> dict[int | str, dict[str, object]]:
     """Return the OpenAPI documentation of a route's errors."""
     return {int(status): {"model": ErrorResponse, "description": status.phrase} for status in statuses}
 
 
-def media_docs(*media: str) -> dict[int | str, dict[str, Any]]:
+def media_docs(*media: str) -> dict[int | str, dict[str, object]]:
     """Return the OpenAPI documentation of the media types of a route's response."""
     return {200: {"content": {kind: {} for kind in media}}}
 

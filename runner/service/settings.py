@@ -6,7 +6,7 @@ import ipaddress
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from platformdirs import user_config_path
 
@@ -109,7 +109,7 @@ class Settings:
         """Return a message with paths relative to the service's folders."""
         return without_folders(text, *self.recordings, self.tokens.parent, cache_folder())
 
-    def log_fields(self) -> dict[str, Any]:
+    def log_fields(self) -> dict[str, object]:
         """Return what is logged of the settings when the service starts."""
         return {
             "recordings": [str(folder) for folder in self.recordings],

@@ -85,7 +85,7 @@ class RayActor:
         with self._lock:
             self._messages.append(message)
 
-    def take_messages(self) -> list[Any]:
+    def take_messages(self) -> list[object]:
         """Return the messages since the last call."""
         with self._lock:
             messages, self._messages = self._messages, []

@@ -43,8 +43,8 @@ class Effect:
 
 
 def effects_of(
-    parameters: Mapping[str, Range | list[Any]],
-    trials: Sequence[Mapping[str, Any]],
+    parameters: Mapping[str, Range | list[object]],
+    trials: Sequence[Mapping[str, object]],
     values: Sequence[float],
 ) -> list[Effect]:
     """Return main effects and interactions, the largest first; empty for too few trials.
@@ -112,7 +112,7 @@ def forest_prediction(
 
 
 def effects_of_grid(
-    parameters: Mapping[str, Range | list[Any]], seed_values: Sequence[Sequence[float]]
+    parameters: Mapping[str, Range | list[object]], seed_values: Sequence[Sequence[float]]
 ) -> list[Effect]:
     """Return main effects and interactions of a grid whose points were all completed, without a forest.
 
@@ -168,7 +168,7 @@ def _effects(names: Sequence[str], all_shares: Sequence[Mapping[tuple[int, ...],
     return sorted(effects, key=lambda effect: -effect.share)
 
 
-def _levels(parameter: Range | list[Any], parameters: int) -> list[Any]:
+def _levels(parameter: Range | list[object], parameters: int) -> list[object]:
     """Return the values of a parameter in the grid, evenly spaced; all of them if they are few."""
     limit = max(2, min(MAX_LEVELS, int(MAX_POINTS ** (1 / parameters) + 1e-9)))
     if not isinstance(parameter, Range):

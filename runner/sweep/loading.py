@@ -209,14 +209,14 @@ def _valid_experiment(sweep: Sweep, path: str, sample: object, document: Documen
     raise problem
 
 
-def _samples(parameter: Range | list[Any]) -> Iterator[Any]:
+def _samples(parameter: Range | list[object]) -> Iterator[object]:
     if isinstance(parameter, Range):
         yield from (parameter.at(0), parameter.last)
     else:
         yield from parameter
 
 
-def _experiment(sweep: Sweep, values: Mapping[str, Any], document: Document) -> ExperimentConfig:
+def _experiment(sweep: Sweep, values: Mapping[str, object], document: Document) -> ExperimentConfig:
     """Return the base with values; errors name the places of the parameters."""
     within = Document(sweep.start_of_trials)
     places = {path: document.place(("parameters", path)) for path in values}

@@ -82,7 +82,7 @@ def _parameter_kind(value: object) -> str | None:
     return "array" if isinstance(value, list | tuple) else None
 
 
-_Choices = Annotated[list[Any], Field(min_length=1)]
+_Choices = Annotated[list[object], Field(min_length=1)]
 Parameter = Annotated[
     Annotated[_Choices, Tag("array")] | Annotated[Range, Tag("Range")], Discriminator(_parameter_kind)
 ]
@@ -151,7 +151,7 @@ class Limits(Section):
 
 
 _Base = Annotated[
-    Annotated[str, Tag("path")] | Annotated[dict[str, Any], Tag("mapping")],
+    Annotated[str, Tag("path")] | Annotated[dict[str, object], Tag("mapping")],
     Discriminator(lambda value: "mapping" if isinstance(value, Mapping) else "path"),
 ]
 
@@ -248,7 +248,7 @@ class Sweep:
         return self.base.seeds
 
     @property
-    def start_of_trials(self) -> dict[str, Any]:
+    def start_of_trials(self) -> dict[str, object]:
         """The base as plain values, which a trial's values override."""
         assert isinstance(self.file.base, dict)
         return self.file.base
@@ -262,7 +262,7 @@ class Sweep:
         changes = [f"{path}={json.dumps(value)}" for path, value in self.applicable(values).items()]
         return from_mapping(self.start_of_trials, changes)
 
-    def applicable(self, values: Mapping[str, Any]) -> dict[str, Any]:
+    def applicable(self, values: Mapping[str, object]) -> dict[str, object]:
         """Return the values without those in the section of another algorithm than the one they name."""
         if "algorithm" not in values:
             return dict(values)  # the configuration reports sections of other algorithms

@@ -279,12 +279,12 @@ def _ranking_grid(sweep: Sweep, ranked: Sequence[Ranked]) -> Grid:
     return Grid((*headings, *sweep.file.parameters, "state"), rows)
 
 
-def values_text(values: Mapping[str, Any]) -> str:
+def values_text(values: Mapping[str, object]) -> str:
     """Return values as text: `step_size 0.25, discount 0.9`."""
     return ", ".join(f"{path} {value_text(value)}" for path, value in values.items())
 
 
-def value_text(value: Any) -> str:
+def value_text(value: object) -> str:
     """Return a value in a few characters, as in a configuration."""
     if isinstance(value, float):
         return f"{value:.4g}"

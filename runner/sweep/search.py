@@ -80,7 +80,7 @@ class Search:
         else:
             self._study.tell(trial, value)
 
-    def _draw(self) -> tuple[Any, dict[str, Any]]:
+    def _draw(self) -> tuple[object, dict[str, object]]:
         """Return the next trial of Optuna and its values; choices are JSON there."""
         trial = self._study.ask(self._space)
         return trial, {
@@ -88,7 +88,7 @@ class Search:
             for path, parameter in self._file.parameters.items()
         }
 
-    def _grid_point(self, number: int) -> dict[str, Any]:
+    def _grid_point(self, number: int) -> dict[str, object]:
         """Return a point of the grid, the last parameter changing fastest, as values for Optuna."""
         point: dict[str, Any] = {}
         for path, parameter in reversed(self._file.parameters.items()):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from runner.config.document import read_yaml, write_yaml
 from runner.config.job import identity_of
@@ -101,7 +101,7 @@ def require_startable(sweep: Sweep, recordings: Path, resume: bool, accept_chang
                 require_same_makers(run)
 
 
-def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def differences(before: Mapping[str, object], now: Mapping[str, object]) -> list[tuple[str, str, str]]:
     """Return what differs between two sweeps: path, value before, value now."""
     ours, theirs = flatten(before), flatten(now)
     return [

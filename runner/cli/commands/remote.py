@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from runner.client.jobs import RemoteJob
     from runner.runs.run import Run
 
-    Upload = Callable[[Report], dict[str, Any]]
+    Upload = Callable[[Report], dict[str, object]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Server:
         return Client(url, self.token, log=say)
 
 
-def _server_options(command: Callable[..., Any]) -> Callable[..., Any]:
+def _server_options(command: Callable[..., object]) -> Callable[..., object]:
     """Add --server, --token and --token-file to a command, which receives a `Server`."""
 
     @click.option(
@@ -72,8 +72,8 @@ def _server_options(command: Callable[..., Any]) -> Callable[..., Any]:
     )
     @functools.wraps(command)
     def with_server(
-        *args: Any, url: str | None, token: str | None, token_file: Path | None, **rest: Any
-    ) -> Any:
+        *args: object, url: str | None, token: str | None, token_file: Path | None, **rest: object
+    ) -> object:
         from runner.client.connection import find_token
 
         return command(*args, server=Server(url, find_token(token, token_file)), **rest)
@@ -149,7 +149,7 @@ def push(
 def _named(names: tuple[str, ...], server: Server, recordings: Path | None) -> Iterator[tuple[str, Upload]]:
     """Yield the names of runs, and the function that uploads each."""
 
-    def upload(name: str, report: Report) -> dict[str, Any]:
+    def upload(name: str, report: Report) -> dict[str, object]:
         run = find_recorded(name, recordings)
         return _stored(client.push(run, report), run.name, run.recording.stat().st_size)
 
@@ -162,7 +162,7 @@ def _outbox(server: Server) -> Iterator[tuple[str, Upload]]:
     """Yield the ids of the runs in the outbox, and the function that uploads each."""
     from runner.client.outbox import deliver, outbox_folder, waiting
 
-    def upload(run: Run, url: str, report: Report) -> dict[str, Any]:
+    def upload(run: Run, url: str, report: Report) -> dict[str, object]:
         run_bytes = run.recording.stat().st_size  # the run leaves the outbox when it is delivered
         with server.client(url) as client:
             return _stored(deliver(run, client, report), run.name, run_bytes)
@@ -333,7 +333,7 @@ def _print_job(job: RemoteJob, as_json: bool) -> None:
     draw(facts({key: text for key, text in rows.items() if text}))
 
 
-def _job_as_json(job: RemoteJob) -> dict[str, Any]:
+def _job_as_json(job: RemoteJob) -> dict[str, object]:
     """Return a job with the keys of the HTTP API."""
     begun = [{"seed": seed, "run_id": run_id} for seed, run_id in job.begun.items()]
     return dataclasses.asdict(job) | {"begun": begun}

@@ -234,7 +234,7 @@ def _optimality(recording: Recording, measures: Mapping[str, Any]) -> dict[str, 
     return rows | ({"stuck in": "\n".join(lines)} if lines else {})
 
 
-def _yaml(value: Any) -> str:
+def _yaml(value: object) -> str:
     """Return a value as YAML on one line."""
     import yaml
 

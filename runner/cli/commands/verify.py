@@ -133,7 +133,7 @@ def _redone(redone: Redone) -> dict[str, str]:
     return {key: text for key, text in rows.items() if text}
 
 
-def _redone_as_json(redone: Redone) -> dict[str, Any]:
+def _redone_as_json(redone: Redone) -> dict[str, object]:
     versions = {key: {"then": then, "here": here} for key, (then, here) in redone.versions.items()}
     verdict = {} if redone.verdict == "impossible" else {"verdict": redone.verdict}
     return verdict | {"redone": asdict(redone) | {"assumed": list(redone.assumed), "versions": versions}}
@@ -170,7 +170,7 @@ def _verification(found: Verification, rerun: bool) -> dict[str, str]:
     return {key: text for key, text in rows.items() if text}
 
 
-def _verification_as_json(found: Verification, rerun: bool) -> dict[str, Any]:
+def _verification_as_json(found: Verification, rerun: bool) -> dict[str, object]:
     return {
         "path": str(found.path.absolute()),
         "verdict": _verdict(found, rerun),

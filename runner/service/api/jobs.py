@@ -7,7 +7,7 @@ import json
 import time
 from collections.abc import AsyncIterator
 from http import HTTPStatus
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 from anyio.to_thread import run_sync
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
@@ -84,7 +84,7 @@ Source = Annotated[
         description="The file's name, for messages; the default name of the job.",
     ),
 ]
-_YAML: Final[dict[str, Any]] = {
+_YAML: Final[dict[str, object]] = {
     "requestBody": {
         "required": True,
         "description": "A configuration or a sweep, as a YAML file has it; a sweep contains its base.",

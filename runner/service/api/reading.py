@@ -272,7 +272,7 @@ async def q_table(
     state: Annotated[
         int | None, Query(ge=0, lt=2**31, description="Also the values of this state, with their history.")
     ] = None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return size, fill and range of each learner's exact table, as `dualtaxi qtable --json` prints it."""
     _refuse_both(step, episode)
     return _json(await compute(computed.q_table, step, episode, state, "json"))  # type: ignore[return-value]

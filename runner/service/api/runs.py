@@ -125,7 +125,7 @@ def one_run(run: FoundRun, settings: SettingsOf) -> Response:
     return Response(as_json(summary_of(run, settings)), media_type="application/json")
 
 
-def summary_of(run: Run, settings: Settings) -> dict[str, Any]:
+def summary_of(run: Run, settings: Settings) -> dict[str, object]:
     """Return everything about a run except its series; only `run.json` if its recording cannot be read."""
     problems: list[str] = []
     error = run.summary.error
@@ -148,7 +148,7 @@ def summary_of(run: Run, settings: Settings) -> dict[str, Any]:
     responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND),
     summary="Change name, tags and note.",
 )
-def label_run(run: FoundRun, labels: LabelChanges, catalogue: CatalogueOf) -> dict[str, Any]:
+def label_run(run: FoundRun, labels: LabelChanges, catalogue: CatalogueOf) -> dict[str, object]:
     """Change the labels of a run as `dualtaxi label` does, and return them."""
     return relabelled(run, labels, catalogue)
 
@@ -173,7 +173,7 @@ def stop_run(run: FoundRun) -> StopResponse:
     return StopResponse(run_id=run.run_id, stop_requested=True)
 
 
-def relabelled(run: Run, labels: LabelChanges, catalogue: Catalogue) -> dict[str, Any]:
+def relabelled(run: Run, labels: LabelChanges, catalogue: Catalogue) -> dict[str, object]:
     """Change the labels of a run, and return them; errors as for `label`."""
     now = label(run, labels.name, labels.note, labels.tag, labels.untag)
     catalogue.changed()

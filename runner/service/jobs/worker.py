@@ -8,7 +8,7 @@ import signal
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from runner.client.jobs import LogEvent, RunEvent, RunProgress
 from runner.config import ExperimentConfig, from_mapping
@@ -164,7 +164,9 @@ def run_seed_on_ray(spec: JobSpec, channel: JobChannel, config: ExperimentConfig
     return str(status)
 
 
-def _run_seed_in_actor(actor: RayActor, spec: JobSpec, values: dict[str, Any], seed: int) -> tuple[str, str]:
+def _run_seed_in_actor(
+    actor: RayActor, spec: JobSpec, values: dict[str, object], seed: int
+) -> tuple[str, str]:
     """Run the seed; return the run's status, and the error message if it failed."""
     try:
         return run_seed(spec, actor, from_mapping(values), seed), ""

@@ -184,7 +184,7 @@ class WorkerPool:
                 raise
         return _Worker(job.number, process, ours)
 
-    def _reserved_runs(self, job: Job, values: dict[str, Any]) -> dict[int, str]:
+    def _reserved_runs(self, job: Job, values: dict[str, object]) -> dict[int, str]:
         """Return the run id of each seed, stored before the run exists: so no run is started twice."""
         if job.kind == "sweep":
             return {}
