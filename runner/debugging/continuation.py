@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from runner.learning import algorithms, kernel
 from runner.learning.kernel import Tally
-from runner.learning.learner import Learner
+from runner.learning.learner import NEVER, Learner
 from runner.learning.schedules import compile_schedule, schedule_value
 from runner.planning.evaluation import joint_probabilities
 
@@ -41,7 +41,7 @@ class Continuation:
     def __init__(self, learner: Learner, moment: Moment) -> None:
         self._learner, self._moment = learner, moment
         learner.begin_evaluation()
-        rules = learner.rules
+        self._settings = rules = learner.segment_at(moment.trained_step).rules
         draws_actions = len(rules.algorithm) == algorithms.WOLF_PHC
         # Without learning all others act alike; SARSA would expect that its next action is chosen already.
         algorithm = rules.algorithm if draws_actions else (0,) * algorithms.Q_LEARNING
@@ -50,12 +50,12 @@ class Continuation:
     @property
     def discount(self) -> float:
         """The discount at the moment."""
-        return self._scheduled(self._learner.rules.discount)
+        return self._scheduled(self._settings.discount)
 
     @property
     def epsilon(self) -> float:
         """The probability of exploring at the moment; 1 of random agents."""
-        rules = self._learner.rules
+        rules = self._settings
         if self._moment.phase == "eval":
             return 0.0 if rules.learns else 1.0
         epsilon = self._scheduled(rules.epsilon)
@@ -64,7 +64,7 @@ class Continuation:
     @property
     def policy_in_words(self) -> str:
         """What acts from the moment on."""
-        if not self._learner.rules.learns:
+        if not self._settings.learns:
             return "random"
         own = "greedy"
         if len(self._rules.algorithm) == algorithms.WOLF_PHC:
@@ -140,7 +140,8 @@ class Continuation:
             steps,
             episodes,
             self._moment.episode + 1,
-            2**62,
+            NEVER,
+            None,
         )
         return int(filled), int(ended)
 
