@@ -209,8 +209,11 @@ def learn(
     next_state: int,
     next_action: int,
     bootstraps: bool,
-) -> None:
-    """Update learner i's tables by one step.
+) -> tuple[int, bool]:
+    """Update learner i's tables by one step, and return what else its new value was made of.
+
+    A new value is a weighted sum of the old one, the reward, and the values that the target has of the next
+    state; `ledger` follows these weights.
 
     Args:
         seed: of the run.
@@ -225,17 +228,25 @@ def learn(
         next_state: of the step.
         next_action: its own action of the next step; only SARSA needs it.
         bootstraps: whether the next state counts: it does unless the episode was terminated.
+
+    Returns:
+        The action of the next state whose value the target has, -1 for none; of Expected SARSA it has those
+        of all actions, and this is the greedy one. And which of two ways was taken: whether the second table
+        of Double Q-learning learned, or Hysteretic Q-learning lowered a value.
     """
     algorithm = len(rules.algorithm)
     width = model.width[i]
     row = Index(tables.offset[i]) + state * Index(width)
     next_row = Index(tables.offset[i]) + next_state * Index(width)
     td_target = reward
+    bootstrapped, second = np.int64(-1), False
     if algorithm == DOUBLE_Q_LEARNING:
         bits = draws.draw(draws.key(seed, draws.UPDATE, now.episode), now.t * len(model.width) + i)
-        learned, other = (FIRST, SECOND) if draws.coin(bits) < 0.5 else (SECOND, FIRST)
+        second = draws.coin(bits) >= 0.5
+        learned, other = (SECOND, FIRST) if second else (FIRST, SECOND)
         if bootstraps:
             best = _best(tables.extra[learned], next_row, width)
+            bootstrapped = np.int64(best)
             td_target += now.discount * tables.extra[other, next_row + best]
         old = tables.extra[learned, row + action]
         tables.extra[learned, row + action] = old + now.step_size * (td_target - old)
@@ -243,6 +254,7 @@ def learn(
         _set(tables, i, state, action, row, width, mean)
     else:
         if bootstraps:
+            bootstrapped = np.int64(next_action if algorithm == SARSA else tables.greedy[i, next_state])
             if algorithm == SARSA:
                 td_target += now.discount * tables.q[next_row + Index(next_action)]
             elif algorithm == EXPECTED_SARSA:
@@ -254,12 +266,14 @@ def learn(
         old = tables.q[row + action]
         rate = now.step_size
         if algorithm == HYSTERETIC_Q_LEARNING and td_target < old:
+            second = True
             rate = schedule_value(rules.parameters[DECREASE], now.episode, now.step)
         _set(tables, i, state, action, row, width, old + rate * (td_target - old))
     if algorithm == WOLF_PHC:
         win = schedule_value(rules.parameters[WIN], now.episode, now.step)
         lose = schedule_value(rules.parameters[LOSE], now.episode, now.step)
         _improve_policy(tables, i, state, row, width, win, lose)
+    return bootstrapped, second
 
 
 @numba.njit(inline="always")

@@ -25,6 +25,7 @@ from runner.learning.algorithms import (
     exploring,
     learn,
 )
+from runner.learning.ledger import outcome_of
 from runner.learning.model import Model
 from runner.learning.schedules import schedule_value
 
@@ -296,12 +297,15 @@ def replay(
     rules: Rules,
     steps: NDArray[np.void],
     rows: NDArray[np.float64],
+    updates: NDArray[np.void] | None = None,
+    traced: int = 0,
 ) -> None:
     """Apply the updates of recorded training steps, in order, to the tables.
 
     A recorded step and the run's draws hold all inputs of its update, so the replayed update is equal to
     `train`'s, to the last bit. As far as `rows` ([steps, L, widest], or empty) goes, row k gets each
-    learner's values of the state before step k's update: those it chose by.
+    learner's values of the state before step k's update: those it chose by. Item k of `updates`
+    ([steps] of `ledger.UPDATE`, or None) gets what decides the weights of learner `traced`'s update.
     """
     algorithm = len(rules.algorithm)
     learners = len(model.width)
@@ -333,7 +337,13 @@ def replay(
             own = Index(model.own_action[record.action, 0 if rules.first_action_for_all else i])
             next_own = Index(model.own_action[next_action, i])
             reward = record.rewards[i]
-            learn(seed, model, tables, rules, now, i, state, own, reward, next_state, next_own, bootstraps)
+            bootstrapped, second = learn(
+                seed, model, tables, rules, now, i, state, own, reward, next_state, next_own, bootstraps
+            )
+            if updates is not None and i == traced:  # known when it is compiled, as None is a type
+                update = updates[k]
+                update.outcome, update.episode = outcome_of(model, record, i), episode
+                update.bootstrapped, update.second = bootstrapped, second
 
 
 @numba.njit(cache=True, nogil=True)

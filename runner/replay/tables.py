@@ -20,6 +20,7 @@ from runner.environments.mdp import Mdp
 from runner.errors import RecordingError
 from runner.learning import kernel
 from runner.learning.learner import Held, Learner, held_of, kinds_of
+from runner.learning.ledger import UNKNOWN_OUTCOME, UPDATE
 from runner.recording import schema
 from runner.recording.messages import QTable
 from runner.recording.reader import Recording
@@ -47,6 +48,14 @@ class StateProbe(NamedTuple):
         """Return the part of the probe for rows `start` to `stop` of the block, as a block of their own."""
         part = slice(*np.searchsorted(self.before, (start, stop)))
         return StateProbe(self.before[part] - start, self.states[part], self.value[part], self.greedy[part])
+
+
+class Trace(NamedTuple):
+    """What decides the weights of one learner's updates, see `learning.ledger`."""
+
+    updates: NDArray[np.void]
+    """[steps] of `UPDATE`: filled."""
+    learner: int
 
 
 class StepReplay:
@@ -116,7 +125,11 @@ class StepReplay:
         return np.full((count, len(widths), max(widths)), np.nan)
 
     def apply(
-        self, steps: NDArray[np.void], rows: NDArray[np.float64] = _NO_ROWS, probe: StateProbe | None = None
+        self,
+        steps: NDArray[np.void],
+        rows: NDArray[np.float64] = _NO_ROWS,
+        probe: StateProbe | None = None,
+        trace: Trace | None = None,
     ) -> None:
         """Apply the updates of the training steps that follow.
 
@@ -125,6 +138,7 @@ class StepReplay:
             rows: filled with each learner's values of a step's state before its update, [steps, learners,
                 most actions]; empty if they are not needed.
             probe: states to look at on the way.
+            trace: filled with what decides the weights of the updates; not together with `probe`.
 
         Raises:
             RecordingError: steps are missing, or the environment cannot have such steps.
@@ -148,7 +162,9 @@ class StepReplay:
             stop = min(len(steps), at + segment.stop - self.step)
             state = (self._learner.seed, self._learner.model, self._learner.tables, segment.rules)
             records = steps[at:stop].view(np.recarray)
-            if probe is None:
+            if trace is not None:
+                kernel.replay(*state, records, rows[at:stop], trace.updates[at:stop], trace.learner)
+            elif probe is None:
                 kernel.replay(*state, records, rows[at:stop])
             else:
                 kernel.replay_probed(*state, records, rows[at:stop], *probe.between(at, stop))
@@ -202,7 +218,7 @@ class TableReplay(StepReplay):
         Raises:
             RecordingError: the step is earlier, or not recorded.
         """
-        self._advance(step, None)
+        self._advance(step)
 
     def rows(self, stop: int) -> NDArray[np.float64]:
         """Replay up to a step, and return the values that the learners saw on the way.
@@ -215,8 +231,28 @@ class TableReplay(StepReplay):
             RecordingError: the step is earlier, or not recorded.
         """
         seen = self.empty_rows(max(stop - self.step, 0))
-        self._advance(stop, seen)
+        self._advance(stop, rows=seen)
         return seen
+
+    def updates(self, stop: int, learner: int) -> NDArray[np.void]:
+        """Replay up to a step, and return what decides the weights of a learner's updates on the way.
+
+        Returns:
+            [steps] of `UPDATE`.
+
+        Raises:
+            RecordingError: the step is earlier, or not recorded; or the environment cannot have such steps.
+        """
+        trace = Trace(np.empty(max(stop - self.step, 0), UPDATE), learner)
+        first = self.step
+        self._advance(stop, trace=trace)
+        unknown = np.flatnonzero(trace.updates["outcome"] == UNKNOWN_OUTCOME)
+        if len(unknown):
+            raise RecordingError(
+                f"{self._recording.path}: training step {first + int(unknown[0])} leads where the "
+                "environment does not, or has another reward; `dualtaxi verify` checks the whole recording."
+            )
+        return trace.updates
 
     def seek(self, step: int) -> None:
         """Go to any step, from here or from the nearest snapshot before it, whichever is shorter.
@@ -252,7 +288,7 @@ class TableReplay(StepReplay):
         at, tables = self._checkpoints.nearest(step, [table.shape for table in self.snapshot()])
         return (at, held_of(tables, self.kinds)) if at > nearest[0] else nearest
 
-    def _advance(self, stop: int, seen: NDArray[np.float64] | None) -> None:
+    def _advance(self, stop: int, rows: NDArray[np.float64] = _NO_ROWS, trace: Trace | None = None) -> None:
         first = self.step
         if stop < first:
             raise RecordingError(f"a replay at step {first} cannot go back to {stop}; start another.")
@@ -260,8 +296,9 @@ class TableReplay(StepReplay):
             raise self._missing(stop)
         for block in self._recording.blocks(schema.TRAIN_STEP, first, stop) if stop > first else ():
             for part in np.split(block, [-self.step % CHECKPOINT_STEPS] if len(block) else []):
-                at = self.step - first
-                self.apply(part, _NO_ROWS if seen is None else seen[at : at + len(part)])
+                at = slice(self.step - first, self.step - first + len(part))
+                own = None if trace is None else Trace(trace.updates[at], trace.learner)
+                self.apply(part, rows[at], trace=own)
                 self._keep_checkpoint()
         self._checkpoints.prune()
         if self.step < stop:

@@ -1,0 +1,145 @@
+"""The ledger of a Q-value: the weights of the rewards and initial values that it is the sum of.
+
+A new value of an update is a weighted sum: 1 - rate of the old value, rate of the reward, and rate * discount
+of the values that the target has of the next state. So every Q-value is a weighted sum of the rewards of the
+steps before it and of the initial values. `kernel.replay` notes of each update what decides these weights,
+such as which action was greedy, and `spread` finds them from the last step to the first (the adjoint, or
+reverse mode, of the updates): each update passes the weight of the value that it changed on to what it was
+made of.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.learning.algorithms import (
+    DECREASE,
+    DOUBLE_Q_LEARNING,
+    EXPECTED_SARSA,
+    FIRST,
+    HYSTERETIC_Q_LEARNING,
+    SECOND,
+    Rules,
+    exploring,
+)
+from runner.learning.model import Model
+from runner.learning.schedules import schedule_value
+
+UPDATE: Final = np.dtype([("outcome", "<u4"), ("bootstrapped", "<i4"), ("episode", "<i8"), ("second", "?")])
+"""What decides the weights of a learner's update: the outcome of the step, as an index of `Model.next_state`,
+its episode, and what `algorithms.learn` returns."""
+UNKNOWN_OUTCOME: Final = 2**32 - 1
+"""The outcome of a step that the environment cannot have."""
+
+
+class Ledger(NamedTuple):
+    """What the weight of one Q-value was spread over so far, from its moment backwards.
+
+    T tables of the learner: 2 of Double Q-learning, else 1.
+    """
+
+    weights: NDArray[np.float64]
+    """[T, S * width]: how much of each value of the tables at this step the Q-value has."""
+    distances: NDArray[np.float64]
+    """[T, S * width]: these weights times the mean number of steps between that state and the Q-value's."""
+    outcomes: NDArray[np.float64]
+    """[outcomes]: how much of the rewards of steps with this outcome it has."""
+    episodes: NDArray[np.float64]
+    """[stretches, 2]: how much of the rewards in a stretch of episodes it has, and what these add to it."""
+
+
+@numba.njit(inline="always")
+def outcome_of(model: Model, record: np.record, i: int) -> int:
+    """Return which outcome a recorded step had; of several that learner i cannot tell apart, the first."""
+    outcomes = model.cumulative.shape[1]
+    pair = np.int64(record.state) * len(model.own_action) + np.int64(record.action)
+    for k in range(outcomes):
+        if k > 0 and model.cumulative[pair, k - 1] >= 1.0:
+            break
+        outcome = pair * outcomes + k
+        kind = model.outcome_class[outcome]
+        if (
+            model.next_state[outcome] == record.next_state
+            and model.terminated[kind] == record.terminated
+            and model.rewards[kind, i] == record.rewards[i]
+        ):
+            return outcome
+    return UNKNOWN_OUTCOME
+
+
+@numba.njit(cache=True, nogil=True, _nrt=False)
+def spread(
+    model: Model,
+    rules: Rules,
+    i: int,
+    first: int,
+    updates: NDArray[np.void],
+    ledger: Ledger,
+    stretch: int,
+    weights: NDArray[np.float64],
+    distances: NDArray[np.float64],
+) -> None:
+    """Spread the weights of learner i's values over the updates of a block, from the last to the first.
+
+    Args:
+        model: the environment.
+        rules: of the run at these steps.
+        i: the learner.
+        first: the number of the first step.
+        updates: of the steps, [N].
+        ledger: as it is after these steps; it is moved to before them.
+        stretch: episodes of a stretch.
+        weights: [N], filled with the weight of each step's reward.
+        distances: [N], filled with its distance, where it has a weight.
+    """
+    algorithm = len(rules.algorithm)
+    width = model.width[i]
+    joint_actions, outcomes = len(model.own_action), model.cumulative.shape[1]
+    for k in range(len(updates) - 1, -1, -1):
+        update = updates[k]
+        pair = np.int64(update.outcome) // outcomes
+        state, action = pair // joint_actions, pair % joint_actions
+        own = np.int64(model.own_action[action, 0 if rules.first_action_for_all else i])
+        cell = state * width + own
+        learned, other = FIRST, FIRST
+        if algorithm == DOUBLE_Q_LEARNING:
+            learned, other = (SECOND, FIRST) if update.second else (FIRST, SECOND)
+        weight = ledger.weights[learned, cell]
+        if weight == 0.0:
+            weights[k] = 0.0
+            continue
+        distance = ledger.distances[learned, cell]
+        episode, step = update.episode, first + k
+        if algorithm == HYSTERETIC_Q_LEARNING and update.second:
+            rate = schedule_value(rules.parameters[DECREASE], episode, step)
+        else:
+            rate = schedule_value(rules.step_size, episode, step)
+
+        # The reward.
+        reward = model.rewards[model.outcome_class[update.outcome], i]
+        weights[k] = weight * rate
+        distances[k] = distance / weight
+        ledger.outcomes[update.outcome] += weights[k]
+        ledger.episodes[episode // stretch, 0] += weights[k]
+        ledger.episodes[episode // stretch, 1] += weights[k] * reward
+
+        # The old value, and the values of the next state.
+        ledger.weights[learned, cell] = weight * (1.0 - rate)
+        ledger.distances[learned, cell] = distance * (1.0 - rate)
+        if update.bootstrapped < 0:
+            continue
+        passed = rate * schedule_value(rules.discount, episode, step)
+        next_row = np.int64(model.next_state[update.outcome]) * width
+        greedy = passed
+        if algorithm == EXPECTED_SARSA:
+            epsilon = exploring(rules, episode, step + 1)
+            for each in range(width):
+                ledger.weights[other, next_row + each] += passed * epsilon / width * weight
+                ledger.distances[other, next_row + each] += passed * epsilon / width * (distance + weight)
+            greedy = passed * (1.0 - epsilon)
+        ledger.weights[other, next_row + update.bootstrapped] += greedy * weight
+        ledger.distances[other, next_row + update.bootstrapped] += greedy * (distance + weight)
