@@ -2,7 +2,9 @@
 
 The shapes are those of MLtraq's public benchmark: one value in a run, 10,000 values in a run, and many runs
 of one value each. Each tracker works in a process of its own, whose first run is not counted; the time ends
-when everything is written. None of them sends anything: those that have servers log offline, or to files.
+when everything is written, so that a killed process would not lose it. Ours is also measured until everything
+is synced to disk, as tensorboardX and trackio do for each run and MLtraq for all together; MLflow and wandb do not
+sync what is logged. None of them sends anything: those that have servers log offline, or to files.
 
 The trackers that are not installed are named; `make test-integrations` installs most of them.
 """
@@ -30,9 +32,10 @@ Run = Callable[[], contextlib.AbstractContextManager[Log]]
 Track = Callable[[Path, int], contextlib.AbstractContextManager[Run]]
 """Given a folder and the number of values in a run, a context in which runs can be made.
 
-Its end is when everything is on disk."""
+Its end is when everything is written."""
 NAMES = {
     "dualtaxi": "runner",
+    "dualtaxi, synced": "runner",
     "MLtraq": "mltraq",
     "tensorboardX": "tensorboardX",
     "trackio": "trackio",
@@ -59,7 +62,7 @@ def measure(quick: bool) -> list[Figure]:
         }
         if runs == 10:
             of_ten = {name: min(seconds) for name, seconds in times.items()}
-        medians = {name: statistics.median(seconds) for name, seconds in times.items() if name != "dualtaxi"}
+        medians = {name: statistics.median(seconds) for name, seconds in times.items() if "dualtaxi" not in name}
         aim = min(medians.values(), default=None)
         medians.pop("MLtraq", None)
         targets = None if aim is None or not medians else (min(medians.values()), aim)
@@ -68,9 +71,9 @@ def measure(quick: bool) -> list[Figure]:
                 f"{shape}, {name}",
                 seconds,
                 "s",
-                targets if name == "dualtaxi" else None,
+                targets if "dualtaxi" in name else None,
                 higher_is_better=False,
-                detail="targets: the quickest but MLtraq, and the quickest" if name == "dualtaxi" else "",
+                detail="targets: the quickest but MLtraq, and the quickest" if "dualtaxi" in name else "",
             )
             for name, seconds in times.items()
         ]
@@ -97,6 +100,15 @@ def _times(name: str, runs: int, values: int, repetitions: int) -> list[float]:
             raise RuntimeError(f"{name} failed:\n{done.stdout}{done.stderr}")
         seconds: list[float] = json.loads(done.stdout.splitlines()[-1])
         return seconds
+
+
+@contextlib.contextmanager
+def _dualtaxi_synced(folder: Path, values: int) -> Iterator[Any]:
+    from runner.recording.syncing import SYNCER
+
+    with _dualtaxi(folder, values) as run:
+        yield run
+    SYNCER.sync()
 
 
 def _dualtaxi(folder: Path, _values: int) -> Any:
@@ -181,6 +193,7 @@ def _mlflow(folder: Path, _values: int) -> Any:
 
 TRACKERS: dict[str, Track] = {
     "dualtaxi": _dualtaxi,
+    "dualtaxi, synced": _dualtaxi_synced,
     "MLtraq": _mltraq,
     "tensorboardX": _tensorboardx,
     "trackio": _trackio,

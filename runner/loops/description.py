@@ -49,18 +49,22 @@ class Described:
         return self.action if self.wide_action is None else self.wide_action
 
     @cached_property
+    def _spaces(self) -> dict[str, Any]:
+        """The descriptions of the environment's own spaces."""
+        spaces_of = {"observation": self.observation, "action": self.action}
+        return {name: describe_space(space) for name, space in spaces_of.items()}
+
+    @cached_property
     def spaces_json(self) -> str:
-        """The descriptions of both spaces."""
-        described = {"observation": self.observation, "action": self.recorded_action}
-        return json.dumps({name: describe_space(space) for name, space in described.items()})
+        """The descriptions of both spaces, of actions as they are recorded."""
+        wide = {} if self.wide_action is None else {"action": describe_space(self.wide_action)}
+        return json.dumps(self._spaces | wide)
 
     @property
     def common(self) -> str:
         """What all processes that record one run have in common, as JSON: kind, spaces, agents of a game."""
-        spaces_of = {"observation": self.observation, "action": self.action}
-        described = {name: describe_space(space) for name, space in spaces_of.items()}
         agents = list(map(str, self.agents)) if len(self.agents) > 1 else 1
-        return json.dumps({"kind": self.kind, **described, "agents": agents})
+        return json.dumps({"kind": self.kind, **self._spaces, "agents": agents})
 
     def attachments(self) -> Attachments:
         """Return the attachments that describe the environment, with its arrays if it is tabular."""

@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 
 from runner.client.outbox import Follower, connect, is_server, outbox_folder
 from runner.config.job import NOT_CONTENT
-from runner.errors import ConfigError, StorageError, truncated_message
+from runner.errors import ConfigError, RunnerError, StorageError, truncated_message
 from runner.loops.description import Described
 from runner.loops.folding import OWNER_WAITS, fold_if_over
 from runner.loops.options import Options
@@ -29,9 +31,11 @@ from runner.recording.maker import EnvironmentMaker
 from runner.recording.metadata import run_metadata, sizes_of, write_description, write_maker, write_result
 from runner.recording.recorder import Recorder
 from runner.recording.schema import Topic
+from runner.recording.syncing import SYNCER
 from runner.recording.writer import create_recording
 from runner.runs import run as runs
 from runner.runs.code import CodeCollector
+from runner.runs.listing import run_at
 from runner.runs.provenance import provenance
 from runner.runs.redaction import redacted_line
 from runner.runs.run import RECORDING_FILE, Run, new_run, recordings_folder, unless_empty
@@ -200,7 +204,7 @@ class LoopRun:
             result["error"] = truncated_message(error)
         self._code.write(self._file, wait=True)
         self._write_makers()
-        write_result(self._file, status, result)
+        write_result(self._file, status, result, synced=False)
         seconds = round(time.monotonic() - self.started, 3)
         return result | {"seconds": seconds, "bytes": self._file.size}
 
@@ -209,11 +213,12 @@ class LoopRun:
         self._file.close()
 
     def write_status(self, status: str, summary: Mapping[str, object]) -> None:
-        """Write how the run ended next to its recording.
+        """Write how the run ended next to its recording, which is synced to disk within seconds.
 
         Raises:
             StorageError: the disk is full or failing.
         """
+        SYNCER.add(self.run.recording, partial(_mark_unsynced, self.run.folder))
         self.run = self.run.update(status=status, summary=summary, provenance=self._code.made_by(self.run))
 
     def fold(self) -> None:
@@ -246,3 +251,15 @@ class LoopRun:
     def _mark_failed(self, reason: str) -> None:
         with contextlib.suppress(StorageError):
             self.run = self.run.update(status="failed", summary={"error": reason})
+
+
+def _mark_unsynced(folder: Path, error: OSError) -> None:
+    """Mark a run as failed whose recording was complete and could not be written to disk, and say so."""
+    reason = (
+        f"{folder}: the recording could not be written to disk ({error.strerror}); `dualtaxi verify` shows "
+        "whether it is complete."
+    )
+    with contextlib.suppress(RunnerError):
+        run = run_at(folder)
+        run.update(status="failed", summary=dict(run.facts.get("summary") or {}) | {"error": reason})
+    print(reason, file=sys.stderr)  # a warning might be an exception, which nobody would see here

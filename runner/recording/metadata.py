@@ -301,14 +301,16 @@ def write_maker(file: RecordingFile, phase: str, maker: EnvironmentMaker) -> Non
         raise storage_error(file, error) from error
 
 
-def write_result(file: RecordingFile, status: str, result: Mapping[str, object]) -> None:
-    """Write how the run ended, the index and the summary.
+def write_result(
+    file: RecordingFile, status: str, result: Mapping[str, object], *, synced: bool = True
+) -> None:
+    """Write how the run ended, the index and the summary; `synced` is as for `RecordingFile.finish`.
 
     Raises:
         StorageError: the disk is full or failing; nothing of the result is written then.
     """
     try:
-        file.finish("result", _json_entry({"status": status, **result}))
+        file.finish("result", _json_entry({"status": status, **result}), synced=synced)
     except OSError as error:
         raise storage_error(file, error) from error
 

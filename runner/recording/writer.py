@@ -178,8 +178,15 @@ class RecordingFile:
         self._stream.truncate(self._offset)
         self._stream.seek(self._offset)
 
-    def finish(self, name: str = "", entries: Mapping[str, str] | None = None) -> None:
+    def finish(
+        self, name: str = "", entries: Mapping[str, str] | None = None, *, synced: bool = True
+    ) -> None:
         """Write a last metadata record, if one is named, summary and footer, and sync the file.
+
+        Args:
+            name: of the record; empty for none.
+            entries: of the record.
+            synced: False leaves syncing the file to the caller.
 
         Raises:
             OSError: it could not all be written; the file is then as it was before.
@@ -189,7 +196,8 @@ class RecordingFile:
             if name:
                 self.add_metadata(name, entries or {})
             self._append(self.tail())
-            self.sync()
+            if synced:
+                self.sync()
         except OSError:
             self._crc, self._offset = crc, offset
             del self._metadata[metadata:]

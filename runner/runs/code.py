@@ -99,6 +99,8 @@ class RecordedCode:
 
     entries: dict[str, str]
     attachment: bytes = b""
+    root: Path = Path()
+    """The folder that was searched: of the repository, or of the script."""
 
 
 class CodeCollector:
@@ -183,6 +185,7 @@ class _Recent:
         self.key: tuple[str, ...] = ()
         self.read_at = 0.0
         self.code = RecordedCode({})
+        self.recordings = Path()
 
     def unlock(self) -> None:
         """Replace the lock, in a forked process."""
@@ -190,28 +193,31 @@ class _Recent:
 
     def fresh(self, cells: str, recordings: Path) -> RecordedCode | None:
         """Return the code of this process, if it was read a few seconds ago."""
-        _, _, key = self._place(cells, recordings)
+        _, _, key = self._place(cells)
+        code, before = self.code, self.recordings
         is_fresh = key == self.key and time.monotonic() - self.read_at <= _FRESH_SECONDS
-        return self.code if is_fresh else None
+        if is_fresh and _within(code.root, recordings) == _within(code.root, before):
+            return code
+        return None
 
     def read(self, cells: str, recordings: Path) -> RecordedCode:
         """Return the code of this process, read now or a few seconds ago."""
-        folder, script, key = self._place(cells, recordings)
+        folder, script, key = self._place(cells)
         with self.lock:
             if (found := self.fresh(cells, recordings)) is not None:
                 return found
             code = collect(folder, script, cells, recordings)
             # In this order: `fresh` is called without the lock.
-            self.key, self.code = (), code
+            self.key, self.code, self.recordings = (), code, recordings
             self.key, self.read_at = key, time.monotonic()
             return code
 
     @staticmethod
-    def _place(cells: str, recordings: Path) -> tuple[Path, Path | None, tuple[str, ...]]:
+    def _place(cells: str) -> tuple[Path, Path | None, tuple[str, ...]]:
         """Return the folder of the user's script, the script, and a key of what is collected."""
         script = user_script()
         folder = Path.cwd() if script is None else script.parent
-        return folder, script, (str(folder), str(script), cells, str(recordings))
+        return folder, script, (str(folder), str(script), cells)
 
 
 _recent = _Recent()
@@ -268,6 +274,7 @@ def collect(
     return RecordedCode(
         {key: as_utf8(text) for key, text in entries.items() if text},
         code.to_attachment() if code.files or code.patch else b"",
+        root,
     )
 
 

@@ -78,19 +78,10 @@ def provenance(with_command: bool = True) -> dict[str, str]:
     Args:
         with_command: False leaves out the command line, for runs that do not record the user's code.
     """
-    facts = (
-        _machine()
-        | _packages()
-        | _settings()
-        | {
-            "host": socket.gethostname(),
-            "user": _user(),
-            "directory": _directory(),
-        }
-    )
+    facts = _settings() | {"host": socket.gethostname(), "user": _user(), "directory": _directory()}
     if with_command and is_code_wanted():
         facts["command"] = shlex.join(redacted_arguments(sys.argv))
-    return {key: as_utf8(text) for key, text in facts.items()}
+    return _machine() | _packages() | {key: as_utf8(text) for key, text in facts.items()}
 
 
 def is_code_wanted() -> bool:
@@ -126,7 +117,7 @@ def _machine() -> dict[str, str]:
         "container": ", ".join(_containers()),
         **_nvidia(),
     }
-    return {key: text for key, text in facts.items() if text}
+    return {key: as_utf8(text) for key, text in facts.items() if text}
 
 
 @cache
@@ -140,11 +131,11 @@ def _packages() -> dict[str, str]:
     for folder in sys.path:
         with contextlib.suppress(OSError):
             for entry in sorted(path.name for path in Path(folder or ".").iterdir()):
-                if match := _INSTALLED.fullmatch(entry):
+                if match := _INSTALLED.fullmatch(as_utf8(entry)):
                     found.setdefault(f"package.{_normalised(match['name'])}", match["version"])
                 elif entry.endswith(".egg-info"):
                     for one in distributions(path=[folder]):
-                        found.setdefault(f"package.{_normalised(one.name)}", one.version)
+                        found.setdefault(as_utf8(f"package.{_normalised(one.name)}"), as_utf8(one.version))
     return dict(sorted(found.items()))
 
 

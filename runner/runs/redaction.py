@@ -79,6 +79,7 @@ _BARE: Final = re.compile(
 """Without quotes, as in shell scripts and YAML: only what is long and has a digit."""
 
 
+@lru_cache(1024)
 def is_secret_name(name: str) -> bool:
     """Return whether a value of this name is taken for a secret."""
     return _NAME.search(name) is not None
@@ -116,12 +117,7 @@ def redacted_text(text: str, variables: Mapping[str, str] = os.environ) -> str:
         text: the text.
         variables: the environment variables; values of those with the name of a secret are replaced.
     """
-    values = {
-        value
-        for name, value in variables.items()
-        if len(value) >= _MIN_VARIABLE and is_secret_name(name) and "\n" not in value
-    }
-    for value in sorted(values, key=len, reverse=True):
+    for value in _secrets_among(frozenset(variables.items())):
         text = text.replace(value, REDACTED)
     text = _SHAPES.sub(REDACTED, text)
     text = _ADDRESS.sub(REDACTED, text)
@@ -134,19 +130,21 @@ def redacted_text(text: str, variables: Mapping[str, str] = os.environ) -> str:
 def redacted_line(text: str) -> str:
     """Return a line of output as `redacted_text` does, quickly where nothing in it hints at a secret."""
     lowered = text.lower()
-    if any(hint in lowered for hint in _HINTS) or any(value in text for value in _secret_values()):
+    secrets = _secrets_among(frozenset(os.environ.items()))
+    if any(hint in lowered for hint in _HINTS) or any(value in text for value in secrets):
         return redacted_text(text)
     return text
 
 
-def _secret_values() -> tuple[str, ...]:
-    """Return the values of the environment variables with the names of secrets."""
-    return _secrets_among(frozenset(os.environ.items()))
-
-
 @lru_cache(1)
 def _secrets_among(variables: frozenset[tuple[str, str]]) -> tuple[str, ...]:
-    return tuple(value for name, value in variables if len(value) >= _MIN_VARIABLE and is_secret_name(name))
+    """Return the values of the environment variables with the names of secrets, the longest first."""
+    values = {
+        value
+        for name, value in variables
+        if len(value) >= _MIN_VARIABLE and is_secret_name(name) and "\n" not in value
+    }
+    return tuple(sorted(values, key=len, reverse=True))
 
 
 def _without_value(match: re.Match[str]) -> str:

@@ -1,0 +1,97 @@
+"""Finished loops are synced to disk in groups, and lose nothing before that when their process is killed."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import gymnasium
+import pytest
+
+import runner
+from runner.recording import syncing
+from runner.runs.listing import run_at
+
+RECORD = """
+import os, signal, sys
+from pathlib import Path
+import gymnasium
+import runner
+from runner.recording import syncing
+
+def record():
+    env = runner.record(gymnasium.make("CartPole-v1"), sys.argv[1])
+    env.reset(seed=0)
+    env.step(0)
+    return env
+"""
+
+
+def script(folder: Path, text: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", RECORD + textwrap.dedent(text), str(folder)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_a_process_killed_after_close_loses_nothing(tmp_path: Path) -> None:
+    done = script(
+        tmp_path,
+        """
+        syncing.GROUP_SECONDS = 3600
+        for _ in range(3):
+            record().close()
+        os.kill(os.getpid(), signal.SIGKILL)
+        """,
+    )
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    runs = runner.list_runs(tmp_path)
+    assert [run.status for run in runs] == ["finished"] * 3
+    for run in runs:
+        found = runner.verify(run.recording)
+        assert found.sound and found.content_digest
+
+
+def test_the_interpreter_ends_when_all_is_on_disk(tmp_path: Path) -> None:
+    done = script(
+        tmp_path,
+        """
+        syncing.GROUP_SECONDS = 3600
+        syncing.sync = lambda path: print(path.parent.name, flush=True)
+        closed = [record() for _ in range(20)]
+        for env in closed:
+            env.close()
+        abandoned = record()
+        """,
+    )
+    assert done.returncode == 0, done.stderr
+    assert sorted(done.stdout.split()) == sorted(path.name for path in tmp_path.iterdir() if path.is_dir())
+    assert len(done.stdout.split()) == 21
+
+
+def test_a_recording_that_does_not_reach_the_disk_is_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def fail(path: Path) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+
+    monkeypatch.setattr(syncing, "sync", fail)
+    env = runner.record(gymnasium.make("CartPole-v1"), tmp_path)
+    env.close()
+    syncing.SYNCER.sync()
+    run = run_at(env.run.folder)
+    assert run.status == "failed"
+    assert "could not be written to disk (Input/output error)" in run.facts["summary"]["error"]
+    assert run.run_id in capsys.readouterr().err
+
+
+def test_a_run_that_was_removed_is_no_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    env = runner.record(gymnasium.make("CartPole-v1"), tmp_path)
+    env.close()
+    env.run.recording.unlink()
+    syncing.SYNCER.sync()
+    assert run_at(env.run.folder).status == "finished"
+    assert not capsys.readouterr().err
