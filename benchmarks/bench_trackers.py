@@ -62,7 +62,9 @@ def measure(quick: bool) -> list[Figure]:
         }
         if runs == 10:
             of_ten = {name: min(seconds) for name, seconds in times.items()}
-        medians = {name: statistics.median(seconds) for name, seconds in times.items() if "dualtaxi" not in name}
+        medians = {
+            name: statistics.median(seconds) for name, seconds in times.items() if "dualtaxi" not in name
+        }
         aim = min(medians.values(), default=None)
         medians.pop("MLtraq", None)
         targets = None if aim is None or not medians else (min(medians.values()), aim)

@@ -74,7 +74,9 @@ def test_the_interpreter_ends_when_all_is_on_disk(tmp_path: Path) -> None:
     assert len(done.stdout.split()) == 21
 
 
-def test_a_recording_that_does_not_reach_the_disk_is_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_recording_that_does_not_reach_the_disk_is_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def fail(path: Path) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
 
