@@ -3,8 +3,8 @@
 The shapes are those of MLtraq's public benchmark: one value in a run, 10,000 values in a run, and many runs
 of one value each. Each tracker works in a process of its own, whose first run is not counted; the time ends
 when everything is written, so that a killed process would not lose it. Ours is also measured until everything
-is synced to disk, as tensorboardX and trackio do for each run and MLtraq for all together; MLflow and wandb do not
-sync what is logged. None of them sends anything: those that have servers log offline, or to files.
+is synced to disk, as tensorboardX and trackio do for each run and MLtraq for all together. MLflow and wandb
+do not sync what is logged. None of them sends anything: those that have servers log offline, or to files.
 
 The trackers that are not installed are named; `make test-integrations` installs most of them.
 """

@@ -1,4 +1,4 @@
-"""Writes finished recordings to disk in groups, off the thread that learns; the interpreter's end waits for it.
+"""Syncs finished recordings to disk in groups, off the thread that learns; the interpreter's end waits.
 
 The operating system has every byte of a closed file, so a killed process loses none of them. Syncing protects
 them from a power failure; it takes milliseconds a file, and hardly more for many files at once.

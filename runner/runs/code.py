@@ -117,12 +117,15 @@ class CodeCollector:
         self._is_wanted = is_wanted and is_code_wanted()
         self._found: RecordedCode | None = None
         self._deadline = time.monotonic() + WAIT_SECONDS
-        self._thread = threading.Thread(
-            target=self._collect, args=(_cells(), recordings), name="recording-code", daemon=True
-        )
+        if not self._is_wanted:
+            return
+        cells = _cells()
         with contextlib.suppress(OSError):  # there is no current folder: the thread notes it
-            self._found = _recent.fresh(_cells(), recordings) if self._is_wanted else None
-        if self._is_wanted and self._found is None:
+            self._found = _recent.fresh(cells, recordings)
+        if self._found is None:
+            self._thread = threading.Thread(
+                target=self._collect, args=(cells, recordings), name="recording-code", daemon=True
+            )
             self._thread.start()
 
     def _collect(self, cells: str, recordings: Path) -> None:

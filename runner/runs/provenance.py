@@ -78,9 +78,10 @@ def provenance(with_command: bool = True) -> dict[str, str]:
     Args:
         with_command: False leaves out the command line, for runs that do not record the user's code.
     """
-    facts = _settings() | {"host": socket.gethostname(), "user": _user(), "directory": _directory()}
+    variables = dict(os.environ)
+    facts = _settings(variables) | {"host": socket.gethostname(), "user": _user(), "directory": _directory()}
     if with_command and is_code_wanted():
-        facts["command"] = shlex.join(redacted_arguments(sys.argv))
+        facts["command"] = shlex.join(redacted_arguments(sys.argv, variables))
     return _machine() | _packages() | {key: as_utf8(text) for key, text in facts.items()}
 
 
@@ -144,11 +145,11 @@ def _normalised(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def _settings() -> dict[str, str]:
+def _settings(variables: Mapping[str, str]) -> dict[str, str]:
     """Return what may change during a process: environment variables, flags, states of random generators."""
     facts = {
-        f"env.{name}": redacted_text(value)
-        for name, value in os.environ.items()
+        f"env.{name}": redacted_text(value, variables)
+        for name, value in variables.items()
         if _VARIABLE.fullmatch(name) and not is_secret_name(name)
     }
     if hasattr(os, "sched_getaffinity"):

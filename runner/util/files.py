@@ -92,7 +92,11 @@ def write_object(path: Path, value: Mapping[str, Any], mode: int = 0o666) -> Non
     with replacing(path) as fresh:
         descriptor = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BINARY, mode)
         with os.fdopen(descriptor, "wb") as stream:
-            stream.write((json.dumps(value, indent=1, ensure_ascii=False) + "\n").encode())
+            # A line for each key: with `indent`, `json` takes much longer.
+            lines = (
+                f" {json.dumps(key)}: {json.dumps(own, ensure_ascii=False)}" for key, own in value.items()
+            )
+            stream.write(("{\n" + ",\n".join(lines) + "\n}\n").encode())
 
 
 @contextlib.contextmanager

@@ -54,7 +54,8 @@ def test_a_process_killed_after_close_loses_nothing(tmp_path: Path) -> None:
     assert [run.status for run in runs] == ["finished"] * 3
     for run in runs:
         found = runner.verify(run.recording)
-        assert found.sound and found.content_digest
+        assert found.sound
+        assert found.content_digest
 
 
 def test_the_interpreter_ends_when_all_is_on_disk(tmp_path: Path) -> None:
