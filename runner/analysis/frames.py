@@ -221,7 +221,7 @@ def _at_hand(run: Run) -> Run:
     return at_hand(run)
 
 
-def _frame(data: Any) -> pd.DataFrame:
+def _frame(data: object) -> pd.DataFrame:
     """Return a frame of columns by name, or of rows."""
     frame: pd.DataFrame = require("pandas", extra="frames", purpose="a frame").DataFrame(data)
     return frame

@@ -181,7 +181,7 @@ def _content_without_task(run: RunSeries) -> str:
     """Return the configuration without the environment, and without values that repeat its id."""
     names = {run.environment, run.config.get("env", {}).get("id", run.environment)}
 
-    def stripped(value: Any) -> Any:
+    def stripped(value: object) -> object:
         if not isinstance(value, Mapping):
             return value
         return {

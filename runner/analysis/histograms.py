@@ -218,7 +218,7 @@ def _blocks(recording: Recording) -> Iterator[Any]:
             }
 
 
-def _uniform(actions: list[Any]) -> NDArray[Any]:
+def _uniform(actions: list[object]) -> Array:
     """Return actions as one array; an array of objects where they are no arrays of one shape."""
     if all(isinstance(each, (np.ndarray, np.generic)) for each in actions):
         with contextlib.suppress(ValueError):

@@ -33,7 +33,7 @@ class TableFill:
     zero_cells: int | None = None
     percent_filled: float | None = None
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """Return what is known, by name."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
@@ -47,7 +47,7 @@ class RecordedExtras:
     names: Mapping[str, tuple[str, tuple[int, ...]]]
     """Name to dtype and shape."""
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """Return it as JSON can hold it."""
         names = {name: {"dtype": dtype, "shape": list(shape)} for name, (dtype, shape) in self.names.items()}
         return {"steps": self.steps, "names": names}
@@ -83,7 +83,7 @@ class RunDetails:
     clock: Clock | None = None
     """The time that was recorded; None in recordings of earlier versions."""
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> dict[str, object]:
         """Return everything but the series, as JSON can hold it."""
         run, summary = self.run, self.run.summary
         return {
@@ -109,7 +109,7 @@ class RunDetails:
             "extras": {phase: own.as_json() for phase, own in self.extras.items()},
         }
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """Return everything, as JSON can hold it."""
         return self.facts() | {
             "eval": [record.as_json() for record in self.evaluations],

@@ -12,7 +12,6 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
 from runner.archive import layout
 from runner.archive.layout import PHASES, SCHEMAS, Column, Records, Table
@@ -25,6 +24,7 @@ from runner.recording.extras import ExtraLayout
 from runner.recording.metadata import kind_of, sizes_of, spaces_of
 from runner.recording.recorder import BLOCK_BYTES
 from runner.recording.schema import STEP_NANOSECONDS, MessageType, Topic
+from runner.util.arrays import Array
 
 _TICK: Final = np.uint64(STEP_NANOSECONDS)
 _BLANKS: Final = 16_384
@@ -204,7 +204,7 @@ class Shape:
 def _plain(name: str, kind: pa.DataType) -> Column:
     """Return the column of a field. Unsigned 32-bit numbers become signed, which readers can subtract."""
 
-    def read(records: Records) -> NDArray[Any]:
+    def read(records: Records) -> Array:
         values = np.ascontiguousarray(records[name])
         return values.view(np.int32) if kind == _INT32 else values
 
@@ -217,7 +217,7 @@ def _plain(name: str, kind: pa.DataType) -> Column:
 def _element(name: str, kind: pa.DataType, source: str, i: int) -> Column:
     """Return the column of an element of a field that is an array."""
 
-    def read(records: Records) -> NDArray[Any]:
+    def read(records: Records) -> Array:
         values = np.ascontiguousarray(records[source][:, i])
         return values.view(np.int32) if kind == _INT32 else values
 

@@ -104,7 +104,7 @@ def _actions(mdp: Mdp, shape: Shape) -> pa.Table:
     return _table(columns, shape)
 
 
-def _table(columns: dict[str, Any], shape: Shape) -> pa.Table:
+def _table(columns: dict[str, object], shape: Shape) -> pa.Table:
     table = pa.table(columns)
     run_id = pa.array([shape.run_id] * len(table)).dictionary_encode().cast(layout.TEXT)
     return table.add_column(0, pa.field("run_id", layout.TEXT), run_id)

@@ -31,7 +31,7 @@ class PlacedTable:
         return self.table.step
 
 
-def message_row(topic: Topic, payload: bytes, shape: Shape) -> dict[str, Any]:
+def message_row(topic: Topic, payload: bytes, shape: Shape) -> dict[str, object]:
     """Return a message as the values of its columns, but run and position.
 
     Raises:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from runner.archive.layout import Column, Records
 from runner.recording.spaces import Leaf, encode_text, leaves_of
+from runner.util.arrays import Array
 
 MAX_NUMBERS: Final = 64
 """An array with more numbers is one column of bytes."""
@@ -61,7 +62,7 @@ class _LeafColumns:
         # 16-bit floats are widened for programs that read tables
         held = np.dtype("<f4") if base == np.dtype("<f2") else base.newbyteorder("=")
 
-        def read(records: Records) -> NDArray[Any]:
+        def read(records: Records) -> Array:
             return np.ascontiguousarray(self._inside(records[field])[index].astype(held, copy=False))
 
         def write(records: Records, column: pa.Array) -> None:
@@ -104,7 +105,7 @@ class SpaceColumns:
     """
 
     def __init__(
-        self, description: Mapping[str, Any], field: str, where: str, prefix: str | None = None
+        self, description: Mapping[str, object], field: str, where: str, prefix: str | None = None
     ) -> None:
         self._leaves = _named(leaves_of(description, where), prefix or field)
         self.columns_by_leaf: list[tuple[Leaf, list[Column]]] = [

@@ -29,7 +29,7 @@ class Changes(Section):
         return {key: value for key, value in self if value is not None}
 
     @model_serializer
-    def _mapping(self) -> dict[str, Any]:
+    def _mapping(self) -> dict[str, object]:
         return {
             key: value.model_dump(mode="json") if isinstance(value, Section) else value
             for key, value in self.given.items()

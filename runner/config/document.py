@@ -167,7 +167,7 @@ class _Builder:
         self.problems.append(Problem(path, f"found the tag {tag}, expected a plain value without a tag"))
         return None
 
-    def _mapping(self, node: yaml.MappingNode, path: Path) -> dict[str, Any]:
+    def _mapping(self, node: yaml.MappingNode, path: Path) -> dict[str, object]:
         built: dict[str, object] = {}
         for key_node, value_node in node.value:
             place = self._place(key_node)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from blake3 import blake3
 
@@ -22,7 +21,7 @@ class Job:
     config: ExperimentConfig
     seed: int
 
-    def content(self) -> dict[str, Any]:
+    def content(self) -> dict[str, object]:
         """Return the values that determine the content of the job's recording."""
         return _content(self.config.to_mapping(), self.seed)
 

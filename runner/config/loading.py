@@ -78,7 +78,7 @@ def from_text(text: str, source: str, overrides: Sequence[str] = ()) -> Experime
 
 
 def from_mapping(
-    values: Mapping[str, Any], overrides: Sequence[str] = (), *, name: str = "experiment"
+    values: Mapping[str, object], overrides: Sequence[str] = (), *, name: str = "experiment"
 ) -> ExperimentConfig:
     """Return the experiment that plain Python values describe, with the keys of a YAML file.
 
@@ -99,7 +99,7 @@ def from_mapping(
     return experiment_in(Document(values), overrides, name, named_by=repr(name))
 
 
-def packing_from(values: Mapping[str, Any]) -> Recording:
+def packing_from(values: Mapping[str, object]) -> Recording:
     """Return the section `recording` of a configuration with these values.
 
     Raises:
@@ -283,7 +283,7 @@ def _with(value: object, path: Path, new: object) -> Any:
     return {**mapping, key: _with(mapping.get(key), below, new)}
 
 
-def _at(value: Any, path: Path) -> Any:
+def _at(value: object, path: Path) -> object:
     for part in path:
         if isinstance(value, Mapping):
             value = value.get(part)

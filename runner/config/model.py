@@ -255,7 +255,7 @@ class ExperimentConfig(Settings):
         """Return the experiment with the settings that training has at a step, and without branches."""
         if not self.branches:
             return self
-        changes: dict[str, Any] = {}
+        changes: dict[str, object] = {}
         for branch in sorted(self.branches, key=lambda branch: branch.step):
             if branch.step <= step:
                 changes |= branch.settings.given

@@ -34,7 +34,7 @@ T = TypeVar("T")
 class _NotNull:
     """Validates `X | None` as X: None is the default of a key that is left out, and no value of its own."""
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
         return handler.generate_schema(get_args(source)[0])
 
 
@@ -61,7 +61,7 @@ class FrozenMapping(Mapping[str, Any]):
     def __init__(self, items: Mapping[str, Any]) -> None:
         self._items = dict(items)
 
-    def __getitem__(self, key: str) -> Any:
+    def __getitem__(self, key: str) -> object:
         return self._items[key]
 
     def __iter__(self) -> Iterator[str]:

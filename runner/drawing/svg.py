@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.scene import Landmark, SceneDescription
+from runner.util.arrays import Array
 
 CELL: Final = 100
 MARGIN: Final = 14
@@ -95,7 +96,7 @@ class Drawing:
         self.width = scene["columns"] * CELL + 2 * MARGIN
         self.height = scene["rows"] * CELL + 2 * MARGIN
 
-    def places(self, mdp: Mdp, states: NDArray[Any]) -> NDArray[np.int16]:
+    def places(self, mdp: Mdp, states: Array) -> NDArray[np.int16]:
         """Return where each thing is drawn in each state.
 
         Returns:

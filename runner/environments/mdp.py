@@ -321,7 +321,7 @@ def _within(values: Array, low: int, high: int) -> bool:
     return bool(values.size) and int(values.min()) >= low and int(values.max()) < high
 
 
-def _rows(array: NDArray[Any] | None) -> int | None:
+def _rows(array: Array | None) -> int | None:
     return None if array is None or not array.ndim else len(array)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -203,5 +203,5 @@ def _record(job: Job, run: Run, fresh: Path, report: Report, stop: Stop) -> dict
     return summary
 
 
-def _with(config: ExperimentConfig, **changes: Any) -> ExperimentConfig:
+def _with(config: ExperimentConfig, **changes: object) -> ExperimentConfig:
     return from_mapping(config.to_mapping() | changes)

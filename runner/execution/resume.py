@@ -249,7 +249,7 @@ class _ResumedSession(Session):
         self._recording = recording
         self._reference = reference
 
-    def summary(self, topics: dict[str, str]) -> dict[str, Any]:
+    def summary(self, topics: dict[str, str]) -> dict[str, object]:
         """Return the summary of the run."""
         summary, recording = super().summary(topics), self._recording
         if self._reference.exhausted:

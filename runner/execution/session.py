@@ -199,7 +199,7 @@ class Session:
         self._log("interrupted", "WARNING")
         return False
 
-    def summary(self, topics: dict[str, str]) -> dict[str, Any]:
+    def summary(self, topics: dict[str, str]) -> dict[str, object]:
         """Return the summary of the run, for `run.json`."""
         last = self._progress.evaluations[-1] if self._progress.evaluations else None
         return self.recorder.totals(topics) | {

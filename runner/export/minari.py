@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -174,7 +174,7 @@ def _description(recording: Recording, phase: str) -> dict[str, str]:
     return {"description": text, **algorithm}
 
 
-def _spaces(recording: Recording) -> tuple[Any, Any]:
+def _spaces(recording: Recording) -> tuple[object, object]:
     from gymnasium.spaces import Discrete
 
     if not recording.has_spaces:
@@ -187,7 +187,9 @@ def _spaces(recording: Recording) -> tuple[Any, Any]:
         ) from error
 
 
-def _environment_spec(recording: Recording, observations: Any, actions: Any) -> tuple[Any, list[str]]:
+def _environment_spec(
+    recording: Recording, observations: object, actions: object
+) -> tuple[object, list[str]]:
     """Return the specification of the environment; None and a note if it cannot be made here."""
     import gymnasium
 

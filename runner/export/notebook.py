@@ -17,7 +17,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
-from typing import Any, Final
+from typing import Final
 
 from runner.errors import MissingExtra
 from runner.runs.run import Run
@@ -124,7 +124,7 @@ def rerun_view(
     evaluations: Sequence[int] = (),
     width: int = 1000,
     height: int = 640,
-) -> Any:
+) -> object:
     """Return the Rerun viewer with runs in it, as a widget.
 
     Args:

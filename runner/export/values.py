@@ -34,14 +34,14 @@ class Values:
         image: the part that is an image, the first one; None if there is none.
     """
 
-    def __init__(self, description: Mapping[str, Any], name: str) -> None:
+    def __init__(self, description: Mapping[str, object], name: str) -> None:
         leaves = leaves_of(description, f"the {name} space")
         self._leaves = [leaf for leaf in leaves if 0 < _count(leaf) <= MAX_NUMBERS]
         self._texts = [leaf for leaf in leaves if leaf.dtype is None]
         self.names = [each for leaf in self._leaves for each in number_names(leaf, name)]
         self.image = next((leaf for leaf in leaves if is_image(leaf)), None)
 
-    def numbers_in(self, value: Any) -> NDArray[np.float64]:
+    def numbers_in(self, value: object) -> NDArray[np.float64]:
         """Return the numbers of a value, float64 [names]."""
         parts = [np.asarray(_part(value, leaf), np.float64).ravel() for leaf in self._leaves]
         return np.concatenate([np.empty(0), *parts])
@@ -50,7 +50,7 @@ class Values:
         """Return the texts of a value on one line."""
         return ", ".join(f"{'.'.join(leaf.path)} {_part(value, leaf)!r}".strip() for leaf in self._texts)
 
-    def pixels_in(self, value: Any) -> Pixels:
+    def pixels_in(self, value: object) -> Pixels:
         """Return the image of a value as red, green and blue; of stacked ones the last."""
         assert self.image is not None
         pixels = np.asarray(_part(value, self.image))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.util.arrays import Array
 
 DIGEST_BYTES: Final = 16
 COLUMNS: Final = (
@@ -121,7 +122,7 @@ def unpacked(fields: Mapping[str, Any], dtype: np.dtype[np.void], n: int, where:
     return rows
 
 
-def _summed(values: NDArray[Any], n: int) -> NDArray[Any]:
+def _summed(values: Array, n: int) -> Array:
     """Return the numbers whose differences from n rows before these are."""
     n = min(n, len(values))
     padded = np.zeros(-(-len(values) // n) * n, values.dtype)

@@ -378,7 +378,7 @@ class _Phase:
             if more is not None and len(more):
                 raise Inconsistent(f"/{self._phase}/{name}: found more records than the steps account for")
 
-    def _compare(self, number: Ints, name: str, found: NDArray[Any], expected: NDArray[Any]) -> None:
+    def _compare(self, number: Ints, name: str, found: Array, expected: Array) -> None:
         if (wrong := np.flatnonzero(found != expected)).size:
             k = wrong[np.argmin(number[wrong])]
             raise self._wrong(number[k], name, found[k], expected[k])

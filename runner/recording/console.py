@@ -234,7 +234,7 @@ class ConsoleLog:
         if not self.is_full:
             self._screens[stream].write(now, text)
 
-    def take(self, now: float, is_last: bool = False) -> Iterator[tuple[float, dict[str, Any]]]:
+    def take(self, now: float, is_last: bool = False) -> Iterator[tuple[float, dict[str, object]]]:
         """Yield when they were begun, and the fields `stream`, `line` and `text` of the lines to record."""
         for stream, screen in () if self.is_full else self._screens.items():
             for begun, line, text in screen.take(now, is_last):

@@ -22,14 +22,14 @@ _MAX_REPR: Final = 1000
 
 class _Registered(NamedTuple):
     to_json: Callable[[object], object]
-    from_json: Callable[[Any], Any]
+    from_json: Callable[[Any], object]
 
 
 _REGISTERED: Final[dict[type[Space], _Registered]] = {}
 
 
 def register_space(
-    cls: type[Space], *, to_json: Callable[[object], object], from_json: Callable[[object], object]
+    cls: type[Space], *, to_json: Callable[[object], object], from_json: Callable[[Any], object]
 ) -> None:
     """Record the values of a space of your own exactly, so that episodes with such actions can be repeated.
 

@@ -103,7 +103,7 @@ class _Kind:
     def parts(self, space: Space, where: str, keys: Keys) -> Iterator[Part]:  # noqa: ARG002
         yield Part(keys, None, partial(text_of, space))
 
-    def describe(self, space: Space) -> dict[str, Any]:
+    def describe(self, space: Space) -> dict[str, object]:
         return {"type": "Text", "max_length": _MAX_TEXT, **structure_of(space, describe_space)}
 
     def restore(self, description: Description) -> Space:
@@ -293,7 +293,7 @@ def _dtype(description: Description) -> np.dtype[Any]:
     return np.dtype(description["dtype"]).newbyteorder("=")
 
 
-def _bound(bound: Any) -> Any:
+def _bound(bound: object) -> object:
     """Return a bound of a box: one number if it is the same everywhere; None for too many."""
     values = np.asarray(bound)
     if not values.size or values.dtype.kind not in "biuf":

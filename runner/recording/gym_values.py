@@ -193,7 +193,7 @@ def filler_by_agent(
     fillers = {agent: filler(own, column) for agent, own in leaves.items()}
     zeros = np.zeros((), column.dtype)
 
-    def put(row: int, values: Mapping[str, Any]) -> None:
+    def put(row: int, values: Mapping[str, object]) -> None:
         column[row] = zeros
         for agent, value in values.items():
             if agent not in fillers:

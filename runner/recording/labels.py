@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from runner.errors import RunnerError, StorageError
 from runner.util.files import read_object, storage_errors, write_object
@@ -99,7 +99,7 @@ def change_labels(folder: Path, change: Callable[[Labels], Labels]) -> Labels:
             ) from error
 
 
-def as_json(labels: Labels) -> dict[str, Any]:
+def as_json(labels: Labels) -> dict[str, object]:
     """Return labels as the contents of their file; empty ones are left out."""
     values = {"name": labels.name, "tags": list(labels.tags), "note": labels.note}
     return {key: value for key, value in values.items() if value}

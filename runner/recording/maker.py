@@ -9,7 +9,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, Final
+from typing import Final
 
 from runner.errors import RecordingError
 from runner.util.values import MAX_TEXT, is_text, is_too_deep, is_whole
@@ -147,7 +147,7 @@ def _parse_vector(values: object, where: str) -> VectorMaker:
 class _Check:
     """Returns the values of a JSON object, each after a check of its type and size."""
 
-    def __init__(self, values: Any, where: str) -> None:
+    def __init__(self, values: object, where: str) -> None:
         if not isinstance(values, Mapping):
             raise RecordingError(f"{where} is damaged: found {type(values).__name__}, expected an object.")
         self.values = values

@@ -165,7 +165,7 @@ def sizes_of(run: Mapping[str, str], path: str) -> dict[Topic, Sizes]:
     }
 
 
-def json_object(text: str | bytes | None, what: str) -> dict[str, Any]:
+def json_object(text: str | bytes | None, what: str) -> dict[str, object]:
     """Return the JSON object in a text.
 
     Raises:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -192,8 +192,8 @@ class Comparison:
         t: int,
         step: int,
         field: str,
-        recorded: Any,
-        got: Any,
+        recorded: object,
+        got: object,
     ) -> Difference:
         number: int | None = episode
         if self._recording.environments > 1:

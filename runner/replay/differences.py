@@ -89,7 +89,7 @@ def _beyond(recorded: NDArray[Any], got: NDArray[Any], tolerance: float) -> NDAr
 
 def differing_value(
     recorded: Any, got: Any, description: Mapping[str, Any], tolerance: float = 0.0
-) -> tuple[str, Any, Any]:
+) -> tuple[str, object, object]:
     """Return where in two observations the first difference is, such as `[2]`, and both values there.
 
     Args:

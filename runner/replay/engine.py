@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +57,7 @@ class Replay:
         tolerance: float,
         report: Report,
         render: bool,
-        make: Callable[[], Any] | None = None,
+        make: Callable[[], object] | None = None,
         draw_from: int = 0,
     ) -> None:
         self.draw_from = draw_from
@@ -193,7 +193,7 @@ class Replay:
             self._steppers[key] = stepper
         return self._steppers[key]
 
-    def _environment(self, maker: EnvironmentMaker | None, environment: int) -> Any:
+    def _environment(self, maker: EnvironmentMaker | None, environment: int) -> object:
         if self._make is not None:
             return self._make()
         if maker is None:

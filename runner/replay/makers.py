@@ -105,7 +105,7 @@ def why_not_alone(maker: EnvironmentMaker) -> str:
     return reason if maker.make or vector_wrappers(vector) or not parse_spec(maker.spec).entry_point else ""
 
 
-def make_vector(maker: EnvironmentMaker, trust: bool, render: bool = False) -> Any:
+def make_vector(maker: EnvironmentMaker, trust: bool, render: bool = False) -> object:
     """Return a vector environment as a loop had it, an asynchronous one as a `SyncVectorEnv`.
 
     Args:

@@ -169,7 +169,7 @@ def _with_extras(
 
 def _extras(
     recording: Recording, phase: str, times: range
-) -> Iterator[tuple[int, int, dict[str, Any] | None, int | None]]:
+) -> Iterator[tuple[int, int, dict[str, object] | None, int | None]]:
     """Yield time, step, options and large seed of calls of `reset` that had one of both."""
     if not recording.has_messages(f"/{phase}/info"):
         return
@@ -306,7 +306,7 @@ def capacity_of_steps(recording: Recording, phase: str) -> int:
 def _variable_blocks(recording: Recording, topic: schema.Topic, times: range) -> Iterator[NDArray[np.void]]:
     """Yield messages of varying size as records, their values of spaces as bytes."""
     dtype, learners = _row_dtype(recording, topic.phase), len(recording.agents)
-    rows: list[tuple[Any, ...]] = []
+    rows: list[tuple[object, ...]] = []
     for message in recording.decoded(topic, times=times):
         if len(message["rewards"]) != learners:
             raise RecordingError(
@@ -331,7 +331,7 @@ def _row_dtype(recording: Recording, phase: str) -> np.dtype[np.void]:
     if topic in recording.dtypes:
         return recording.dtypes[topic]
     learners = len(recording.agents)
-    kinds: dict[str, Any] = {"rewards": ("f8", (learners,)), "terminated": "?", "truncated": "?"}
+    kinds: dict[str, object] = {"rewards": ("f8", (learners,)), "terminated": "?", "truncated": "?"}
     kinds |= {"action": "O", "next_observation": "O"}
     names = [field.name for field in topic.message.fields]
     return np.dtype([*((name, kinds.get(name, "i8")) for name in names), ("log_time", "u8")])

@@ -23,6 +23,7 @@ from runner.recording.spaces import decode
 from runner.recording.spaces import leaves_of as recorded_leaves
 from runner.replay.recorded import RecordedReset
 from runner.replay.redone import Frame, Values
+from runner.util.arrays import Array
 
 _MAX_TEXT: Final = 300
 _ENDING: Final = struct.Struct("<d??")
@@ -52,7 +53,7 @@ class Results:
         self.agents_terminated = np.zeros(masks, np.uint32)
         """Bit i: agent i of a game; empty for one agent."""
         self.agents_truncated = np.zeros(masks, np.uint32)
-        self.first_observations: NDArray[Any] = np.empty(resets, dtypes.reset)
+        self.first_observations: Array = np.empty(resets, dtypes.reset)
         self.frames: list[Frame] = []
         """After each row; of a vector, after each step of all environments, of the one that is drawn."""
         self.first_frames: list[Frame] = []
@@ -97,7 +98,7 @@ class Stepper(ABC):
 
     env: Any
 
-    def __init__(self, env: Any, recording: Recording) -> None:
+    def __init__(self, env: object, recording: Recording) -> None:
         self.env = env
         self.draws = False
         """Whether to draw a picture after each step and reset."""
@@ -190,7 +191,7 @@ class Stepper(ABC):
         return picture.copy()
 
 
-def _text(description: Mapping[str, Any]) -> str:
+def _text(description: Mapping[str, object]) -> str:
     text = json.dumps(description)
     return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}…"
 
@@ -199,7 +200,7 @@ class RowStepper(Stepper):
     """An environment that takes one step after the other."""
 
     @abstractmethod
-    def _filler(self, column: NDArray[Any], is_first: bool = False) -> Put:
+    def _filler(self, column: Array, is_first: bool = False) -> Put:
         """Return a function that puts an observation into a row of a column; `is_first`: that of a reset."""
 
     @abstractmethod
@@ -262,7 +263,7 @@ class EnvironmentStepper(RowStepper):
     def _spaces(self) -> tuple[Space, Space]:
         return self.env.observation_space, self.env.action_space
 
-    def _filler(self, column: NDArray[Any], is_first: bool = False) -> Put:
+    def _filler(self, column: Array, is_first: bool = False) -> Put:
         if self._recording.kind == "step":
             # States are counted from 0, the first observations are as they came.
             start = 0 if is_first else int(self.observation_space.start)  # type: ignore[attr-defined]
@@ -329,7 +330,7 @@ class GameStepper(RowStepper):
         observations = spaces.Dict({agent: self.env.observation_space(agent) for agent in agents})
         return observations, spaces.Dict({agent: self.env.action_space(agent) for agent in agents})
 
-    def _filler(self, column: NDArray[Any], is_first: bool = False) -> Put:  # noqa: ARG002
+    def _filler(self, column: Array, is_first: bool = False) -> Put:  # noqa: ARG002
         return filler_by_agent(leaves_by_agent(self.observation_space, "observation"), column)
 
     def actions(self, rows: NDArray[np.void]) -> Sequence[Any]:
@@ -346,7 +347,7 @@ class GameStepper(RowStepper):
         """Take the steps of these rows, and fill them in."""
         agents = self.env.possible_agents
 
-        def mask(flags: Mapping[Any, bool]) -> int:
+        def mask(flags: Mapping[object, bool]) -> int:
             return sum(bool(flags.get(agent)) << i for i, agent in enumerate(agents))
 
         row = first

@@ -10,7 +10,7 @@ compiled kernel indexes its arrays by what they say, without any check of its ow
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from runner.recording.messages import QTable
 from runner.recording.reader import Recording
 from runner.replay.checkpoints import CHECKPOINT_STEPS, Checkpoints
 from runner.replay.steps import check_steps
+from runner.util.arrays import Array
 
 NEAR_STEPS: Final = 200_000
 """`TableReplay.seek` replays this many steps rather than load a snapshot on the way."""
@@ -68,7 +69,7 @@ class StepReplay:
         where: the recording or archive that the steps are from, for errors.
     """
 
-    def __init__(self, config: Mapping[str, Any], mdp: Mdp, seed: int, where: str) -> None:
+    def __init__(self, config: Mapping[str, object], mdp: Mdp, seed: int, where: str) -> None:
         self._mdp = mdp
         self._where = where
         self._learner = Learner(from_mapping(config), mdp, seed)
@@ -171,7 +172,7 @@ class StepReplay:
             self.step += stop - at
             at = stop
 
-    def values_in(self, states: NDArray[Any]) -> NDArray[np.float64]:
+    def values_in(self, states: Array) -> NDArray[np.float64]:
         """Return each learner's values in these states now, [states, learners, most actions]."""
         rows = self.empty_rows(len(states))
         for i, table in enumerate(self.tables):

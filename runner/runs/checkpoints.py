@@ -18,12 +18,12 @@ from typing import Any, Final
 
 import numpy as np
 from blake3 import blake3
-from numpy.typing import NDArray
 
 from runner.errors import RecordingError, RunnerError, RunNotFound
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.runs.store import DIGEST, Store
+from runner.util.arrays import Array
 from runner.util.extras import require
 from runner.util.files import hash_of, open_regular
 
@@ -205,7 +205,7 @@ def find_checkpoint(every: Sequence[Checkpoint], reference: str, where: str) -> 
     raise RunNotFound(f"{where} has no checkpoint {reference!r}; it has: {known}.")
 
 
-def arrays_in(data: bytes, where: str) -> dict[str, NDArray[Any]]:
+def arrays_in(data: bytes, where: str) -> dict[str, Array]:
     """Return the arrays in a safetensors file, by name; those of bfloat16 become float32, exactly.
 
     Raises:

@@ -226,7 +226,7 @@ class Run:
         with storage_errors(self.folder / STOP_FILE):
             (self.folder / STOP_FILE).touch()
 
-    def update(self, **facts: Any) -> Run:
+    def update(self, **facts: object) -> Run:
         """Write facts to `run.json`, and return the run with them.
 
         Raises:
@@ -258,13 +258,13 @@ def create_run(
 
 def new_run(
     recordings: Path,
-    config: Mapping[str, Any],
+    config: Mapping[str, object],
     seed: int | None,
     name: str,
     run_id: str | None = None,
     labels: Labels | None = None,
     ids: Iterator[str] | None = None,
-    **more: Any,
+    **more: object,
 ) -> Run:
     """Create the folder of a new run; `more` are further facts, the rest is as for `create_run`.
 

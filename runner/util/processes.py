@@ -138,7 +138,7 @@ class ChildProcess:
 
     def stream(
         self, function: Callable[Args, object], seconds: float, *args: Args.args, **keywords: Args.kwargs
-    ) -> Iterator[Any]:
+    ) -> Iterator[object]:
         """Yield what a function in the process passes to `report_progress`, as it comes.
 
         The function waits where its caller is slower. Arguments and errors are those of `call`, but `seconds`
@@ -147,8 +147,13 @@ class ChildProcess:
         yield from self._events(function, seconds, args, keywords, for_each=True)
 
     def _events(
-        self, function: Callable[..., Any], seconds: float, args: Any, keywords: Any, for_each: bool = False
-    ) -> Generator[Any, None, Any]:
+        self,
+        function: Callable[..., object],
+        seconds: float,
+        args: object,
+        keywords: object,
+        for_each: bool = False,
+    ) -> Generator[object, None, object]:
         """Yield what the function reports, and return its result; the limit is for all, or for each."""
         try:
             self._pipe.send((function, args, keywords))

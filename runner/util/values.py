@@ -85,7 +85,7 @@ def flatten(values: Mapping[str, object], keep_empty: bool = False, prefix: str 
     return flat
 
 
-def is_too_deep(value: Any, depth: int = 0) -> bool:
+def is_too_deep(value: object, depth: int = 0) -> bool:
     """Return whether a JSON value is nested more than `MAX_JSON_DEPTH` deep, counted from `depth`."""
     level = [value]
     while level:

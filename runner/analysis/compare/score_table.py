@@ -93,7 +93,7 @@ def parse_table(text: str, name: str) -> dict[str, Bounds]:
     return table
 
 
-def _mapping(text: str, name: str) -> Mapping[Any, Any]:
+def _mapping(text: str, name: str) -> Mapping[object, object]:
     import yaml
 
     try:

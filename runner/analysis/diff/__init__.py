@@ -261,7 +261,7 @@ def without_ignored(difference: RunDiff, ignore: Sequence[str], everything: bool
     return replace(difference, **facts, ignored=ignored)
 
 
-def as_json(difference: RunDiff) -> dict[str, Any]:
+def as_json(difference: RunDiff) -> dict[str, object]:
     """Return the difference as JSON can hold it, without the whole records of steps."""
     facts = asdict(difference)
     for divergence in (facts["divergence"], facts["evaluation_divergence"]):
@@ -303,7 +303,7 @@ def _identity(recording: Recording) -> Identity:
 
 def _values_by_path(
     a: Recording, b: Recording, names: Sequence[str]
-) -> tuple[dict[str, list[Change]], dict[str, dict[str, Any]]]:
+) -> tuple[dict[str, list[Change]], dict[str, dict[str, object]]]:
     """Return what differs in these fields of a `RunDiff`, nothing for the others, and what is alike."""
     jobs = a.has_tables and b.has_tables
     values = {
@@ -318,7 +318,7 @@ def _values_by_path(
     return changes, {name: equal_values(*values[name]) for name in names}
 
 
-def _costs(recording: Recording) -> dict[str, Any]:
+def _costs(recording: Recording) -> dict[str, object]:
     """Return steps taken, whether recorded or not, episodes, and the size of the file."""
     done = recording.done()
     return {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Final
+from typing import Final
 
 from runner.analysis.diff import NOT_CONTENT, Cause, Change, Divergence, RunDiff
 from runner.analysis.diff.code import FileChange, code_changes, made_in_words
@@ -102,7 +102,7 @@ def summary(difference: RunDiff) -> str:
     return " ".join(sentences)
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     return UNKNOWN if value is None else str(value)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from runner.environments.mdp import Mdp
 from runner.environments.naming import actions_in_words, states_in_words
 from runner.recording.reader import Recording
+from runner.util.arrays import Array
 from runner.util.values import flatten
 
 _MAX_EXAMPLES: Final = 10
@@ -56,7 +57,7 @@ class EnvironmentDiff:
         return not (self.description or self.transitions or self.other_starts)
 
 
-def changes_in(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[Change]:
+def changes_in(a: Mapping[str, object], b: Mapping[str, object]) -> list[Change]:
     """Return the differences of two nested mappings, by dotted path."""
     left, right = flatten(a, keep_empty=True), flatten(b, keep_empty=True)
     paths = dict.fromkeys([*left, *right])
@@ -72,7 +73,7 @@ def changes_in(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[Change]:
     ]
 
 
-def equal_values(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:
+def equal_values(a: Mapping[str, object], b: Mapping[str, object]) -> dict[str, object]:
     """Return the values that two nested mappings share, by dotted path."""
     left, right = flatten(a, keep_empty=True), flatten(b, keep_empty=True)
     return {path: value for path, value in left.items() if path in right and right[path] == value}
@@ -110,7 +111,7 @@ def _pairs_that_differ(a: Mdp, b: Mdp) -> NDArray[np.bool_]:
     return differs
 
 
-def _outcome(mdp: Mdp, k: int) -> list[NDArray[Any]]:
+def _outcome(mdp: Mdp, k: int) -> list[Array]:
     """Return outcome k of every pair: probability, next state, summed reward, terminated, events."""
     shape = mdp.next_state.shape
     if k >= shape[2]:

@@ -225,7 +225,7 @@ class Chart(Canvas):
             self.text(left - 5, at + 3, label, "end", size=8)
 
     def line(
-        self, x: Values, y: Values, colour: str, dash: int = 0, width: float = 1.5, **style: Any
+        self, x: Values, y: Values, colour: str, dash: int = 0, width: float = 1.5, **style: object
     ) -> None:
         """Draw a line through points; `dash` is the number of a pattern of dashes."""
         points = np.column_stack(_thinned(self.x(x), self.y(y)))

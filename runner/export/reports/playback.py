@@ -115,7 +115,7 @@ def tabular_playback(recording: Recording, episode: Episode) -> Playback:
     )
 
 
-def _highest(values: NDArray[np.float64], taken: list[int]) -> dict[str, Any]:
+def _highest(values: NDArray[np.float64], taken: list[int]) -> dict[str, object]:
     """Return the highest Q-values of each step, [action, value] pairs, and the action taken."""
     rows: dict[str, int] = {}
     which: list[int] = []

@@ -63,7 +63,7 @@ def render(view: View) -> str:
     return fill(templates(), view)
 
 
-def fill(environment: Environment, view: View, **shared: Any) -> str:
+def fill(environment: Environment, view: View, **shared: object) -> str:
     """Return the HTML of a view, with values that all views of an environment share."""
     values = {field.name: getattr(view, field.name) for field in fields(view)}
     return environment.get_template(view.TEMPLATE).render(values, **shared)

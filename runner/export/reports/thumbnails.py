@@ -7,7 +7,7 @@ import io
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from runner.errors import RunnerError
 from runner.export.encoded import encoded_pictures
@@ -85,6 +85,6 @@ def _small(data: bytes) -> str:
         raise RunnerError(f"A recorded frame cannot be shown: {error}.") from error
     image.thumbnail((_MAX_SIDE, _MAX_SIDE))
     buffer = io.BytesIO()
-    options: dict[str, Any] = {"quality": _QUALITY, "method": 2}
+    options: dict[str, object] = {"quality": _QUALITY, "method": 2}
     image.save(buffer, "WEBP", **options)
     return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}"

@@ -134,7 +134,7 @@ def strips(lines: NDArray[np.float32]) -> list[Column]:
     return [Column(rr.LineStrips2D.descriptor_strips(), pa.ListArray.from_arrays(_offsets(n, count), each))]
 
 
-def images(values: NDArray[np.float32]) -> list[Any]:
+def images(values: NDArray[np.float32]) -> list[object]:
     """Return the columns of images, [n, pixels], each with its own range of colours."""
     n, pixels = values.shape
     flat = pa.array(np.ascontiguousarray(values).view(np.uint8).reshape(-1))
@@ -147,7 +147,7 @@ def images(values: NDArray[np.float32]) -> list[Any]:
     return [Column(rr.DepthImage.descriptor_buffer(), rows), *shown]
 
 
-def _column(archetype: Any, name: str, offsets: pa.Array, flat: NDArray[Any]) -> Column:
+def _column(archetype: object, name: str, offsets: pa.Array, flat: Array) -> Column:
     # Arrow refuses memory that is not aligned, which the field of a lone record may be.
     flat = np.require(flat, requirements=["C", "A"])
     items = (

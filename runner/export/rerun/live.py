@@ -42,7 +42,7 @@ class Piece(NamedTuple):
     """Steps of both phases executed by the first of these steps; for metrics, all until then."""
     episode: int
     """The training episode at that time."""
-    content: NDArray[np.void] | dict[str, Any]
+    content: NDArray[np.void] | dict[str, object]
     """Records of steps, or metrics."""
 
 
@@ -105,7 +105,7 @@ class LiveView:
         """Show metrics."""
         self._put(Piece(phase, time, 0, metrics))
 
-    def _put(self, piece: Any) -> None:
+    def _put(self, piece: object) -> None:
         try:
             self._queue.put_nowait(piece)
         except queue.Full:

@@ -182,7 +182,7 @@ class _Translation:
             )
         return fn.matches(Row.words, f"*{_pattern(item.value)}*")
 
-    def _compare(self, field: Column, sign: str, item: Item, value: str) -> Any:
+    def _compare(self, field: Column, sign: str, item: Item, value: str) -> object:
         """Return the condition that a field compares so with a value; `item` is its place in the text."""
         try:
             if field.name.startswith(SETTING):

@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from peewee import SqliteDatabase, chunked
 
@@ -154,7 +154,7 @@ class Folders:
         running = [entry for entry, status, _ in found if status == "running"]
         return running, [entry for entry, _, stable in found if not stable]
 
-    def _row(self, root: str, entry: str) -> dict[str, Any]:
+    def _row(self, root: str, entry: str) -> dict[str, object]:
         """Read a run's folder into a row."""
         mark, changed = _mark(root, entry)  # before the files: later changes are found next time
         seen = _state_of(root, entry) or State("", 0, None)

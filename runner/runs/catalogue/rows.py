@@ -107,7 +107,7 @@ Row._meta.add_field("words", TextField(null=True))  # id, name, configuration's 
 Row._meta.add_field("settings", TextField(null=True))  # the configuration: a JSON object of dotted paths
 
 
-def row_of(run: Run, size: int | None) -> dict[str, Any]:
+def row_of(run: Run, size: int | None) -> dict[str, object]:
     """Return the row of a run, by column, without place and fingerprint.
 
     Args:
@@ -157,7 +157,7 @@ def row_of(run: Run, size: int | None) -> dict[str, Any]:
     }
 
 
-def _recorded(run: Run) -> Mapping[str, Any]:
+def _recorded(run: Run) -> Mapping[str, object]:
     """Return the progress of a run that was killed, from its recording; empty if unknown or still running."""
     from runner.recording.reader import open_recording
 

@@ -265,7 +265,7 @@ def _stored(index: Index, chosen: Filter, with_cache: set[str], limit: int | Non
     return _Stored(sums, measured, unmeasured)
 
 
-def _summed(index: Index) -> list[Any]:
+def _summed(index: Index) -> list[object]:
     """Return the sums for the fields of `Sums`, in their order, without the last two."""
     line = "\n"
     protected = fn.INSTR(Value(line).concat(Row.tags).concat(line), f"{line}{KEEP}{line}") > 0
