@@ -69,7 +69,7 @@ class RunProgress:
     eval_steps: int
     bytes: int
     """Size of its recording."""
-    last_evaluation: dict[str, Any] | None
+    last_evaluation: dict[str, object] | None
     """Its episode, and the value of each metric by name; None before the first."""
 
 
@@ -121,7 +121,7 @@ class JobEvent:
         """The name of its type."""
         return _KINDS[type(self.data)]
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """Return its data as a JSON object, without what is unknown; `from_json` is the reverse."""
         values = asdict(self.data)
         if self.kind == "progress":

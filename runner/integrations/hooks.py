@@ -177,7 +177,7 @@ def _hook(cls: Any) -> None:
     _hooked.add(cls)
 
     @functools.wraps(original)
-    def reset(self: Any, *arguments: Any, **named: Any) -> Any:
+    def reset(self: object, *arguments: object, **named: object) -> object:
         if not open_runs:
             return original(self, *arguments, **named)
         return _reset(self, original, arguments, named)

@@ -15,6 +15,7 @@ from runner.errors import ConfigError
 from runner.loops.options import pillow
 from runner.loops.pictures import Picture
 from runner.loops.values import as_array
+from runner.util.arrays import Array
 from runner.util.extras import require
 from runner.util.jsonable import as_json
 
@@ -50,7 +51,7 @@ def picture_of(value: Any, layout: str = "HWC", fps: float = 4.0) -> Picture:
     return Picture(_pixels(_numbers(value), layout), fps)
 
 
-def film_of(value: Any, layout: str, fps: float | None) -> Picture:
+def film_of(value: object, layout: str, fps: float | None) -> Picture:
     """Return a film: an array or tensor, or the path of a video file.
 
     Raises:
@@ -71,7 +72,7 @@ def film_of(value: Any, layout: str, fps: float | None) -> Picture:
     return Picture(np.stack(frames), fps or own_fps)
 
 
-def grid_of(value: object, layout: str) -> NDArray[Any]:
+def grid_of(value: object, layout: str) -> Array:
     """Return several pictures as one, next to each other in rows: [height, width, channels]."""
     array = _numbers(value)
     if array.ndim != 4 or sorted(layout) != sorted("NCHW"):
@@ -82,7 +83,7 @@ def grid_of(value: object, layout: str) -> NDArray[Any]:
     return _tiled(images)
 
 
-def histogram_of(values: object) -> dict[str, NDArray[Any]]:
+def histogram_of(values: object) -> dict[str, Array]:
     """Return counts [bins] and edges [bins + 1] of numbers; those that are not finite are left out."""
     array = _numbers(values).astype(np.float64).ravel()
     finite = array[np.isfinite(array)]

@@ -251,7 +251,7 @@ class _LogWriter(KVWriter):  # type: ignore[misc]
         self._is_update_due = False
         """Whether the library wrote, so that the next update is recorded."""
 
-    def write(self, key_values: Mapping[str, Any], key_excluded: Any, step: int = 0) -> None:  # noqa: ARG002
+    def write(self, key_values: Mapping[str, object], key_excluded: object, step: int = 0) -> None:  # noqa: ARG002
         """Record what the library writes, without the numbers of an update that is recorded already."""
         self.log({name: value for name, value in key_values.items() if name not in self._of_updates})
         self._is_update_due = True

@@ -153,7 +153,7 @@ class ScriptRun:
             self._names.add(name)
         self._do("log", (name, value), step)
 
-    def snapshot(self, name: str, array: Any, step: int | None = None) -> None:
+    def snapshot(self, name: str, array: object, step: int | None = None) -> None:
         """Record an array of numbers, or each of a mapping of arrays."""
         for own_name, values in arrays_of(name, array):
             self._waiting_bytes += values.nbytes

@@ -69,13 +69,13 @@ def record(env: Any, recordings: str | os.PathLike[str] | None = None, **options
     return env
 
 
-_loggers: weakref.WeakSet[Any] = weakref.WeakSet()
+_loggers: weakref.WeakSet[object] = weakref.WeakSet()
 """Those that are not closed."""
 _to_close: list[Loop[Any]] = []
 """The recordings of closed environments, which end with the logger."""
 
 
-def _close(made: Recorded[Any], **arguments: Any) -> None:
+def _close(made: Recorded[Any], **arguments: object) -> None:
     """Close an environment, and the recording if no logger needs it any more.
 
     A collector closes its environment before it yields the last batch, whose losses are logged after that.

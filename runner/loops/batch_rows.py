@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -34,7 +33,7 @@ class BatchRows(VectorRows):
         recorder: Recorder,
         described: Described,
         phase: str,
-        first_action: Callable[[Any], None],
+        first_action: Callable[[object], None],
         mode: AutoresetMode,
     ) -> None:
         super().__init__(recorder, described, phase, first_action, mode == AutoresetMode.NEXT_STEP)
@@ -112,7 +111,7 @@ class BatchRows(VectorRows):
             if self._filled == self._room:
                 self.commit()
 
-    def continues_with(self, observations: Any) -> bool:
+    def continues_with(self, observations: object) -> bool:
         """Return whether these are the observations [N, ...] after the last step or reset of the phase.
 
         Raises:

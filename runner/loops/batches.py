@@ -12,7 +12,6 @@ from typing import Any, Literal, Unpack
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
-from numpy.typing import NDArray
 
 from runner.environments.gym_types import AnyVectorEnv, Space
 from runner.errors import ConfigError, RunnerError
@@ -25,6 +24,7 @@ from runner.loops.values import as_array, check_phase
 from runner.loops.vector import autoreset_mode_of, described_vector, first_of, require_fixed
 from runner.loops.vector_counts import Flags
 from runner.recording.gym_values import element_of
+from runner.util.arrays import Array
 
 
 class NamedEnvironments(AnyVectorEnv):
@@ -53,7 +53,7 @@ class RecordedBatches(Recorded[BatchRows]):
     ) -> None:
         self._envs, self._mode, self._spaces, self._make = envs, mode, own_spaces, make
         self._options, self._phase = options, "train"
-        self._first: Any = None
+        self._first: object = None
         """The observations of a reset before the first batch."""
         if isinstance(envs, VectorEnv):
             self._open(envs)
@@ -108,14 +108,14 @@ class RecordedBatches(Recorded[BatchRows]):
 
     def batch(
         self,
-        observations: Any,
-        actions: Any,
-        rewards: Any,
-        terminated: Any,
-        truncated: Any = None,
+        observations: object,
+        actions: object,
+        rewards: object,
+        terminated: object,
+        truncated: object = None,
         *,
-        final_observations: Any = None,
-        extras: Mapping[str, Any] | None = None,
+        final_observations: object = None,
+        extras: Mapping[str, object] | None = None,
     ) -> None:
         """Record T steps of all N environments, from arrays of NumPy, JAX or PyTorch.
 
@@ -225,7 +225,7 @@ class RecordedBatches(Recorded[BatchRows]):
         if "_loop" in vars(self):
             super().close(**kwargs)
 
-    def __exit__(self, *raised: Any) -> Literal[False]:
+    def __exit__(self, *raised: object) -> Literal[False]:
         return super().__exit__(*raised) if "_loop" in vars(self) else False
 
 
@@ -301,7 +301,7 @@ def _flags(what: str, values: object, shape: tuple[int, ...]) -> Flags:
     Raises:
         ConfigError: it holds something else, or has another shape.
     """
-    found: NDArray[Any] = as_array(values)
+    found: Array = as_array(values)
     if found.shape != shape or (found.dtype.kind != "b" and not np.isin(found, (0, 1)).all()):
         raise ConfigError(
             f"{what}: found {found.dtype} of shape {found.shape}, expected booleans of the shape {shape}, as "

@@ -88,7 +88,7 @@ def branch(
     run: Run,
     *,
     at: str | StepRef,
-    action: Any = None,
+    action: object = None,
     policy: str = "recorded",
     seed: int = 0,
     name: str | None = None,
@@ -279,6 +279,6 @@ class _Player:
         return {agent: action[agent] for agent in agents} if all(map(action.__contains__, agents)) else None
 
 
-def _text(action: Any) -> str:
+def _text(action: object) -> str:
     """Return an action as JSON."""
     return json.dumps(as_json(action))

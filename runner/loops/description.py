@@ -84,7 +84,7 @@ class Described:
         return environment_attachments(description, {})
 
 
-def describe(env: Any, observation: Space, action: Space) -> Described:
+def describe(env: object, observation: Space, action: Space) -> Described:
     """Return the description of a Gymnasium environment with these spaces.
 
     Raises:
@@ -99,7 +99,7 @@ def describe(env: Any, observation: Space, action: Space) -> Described:
     return Described(kind, observation, action, env_id, kwargs, step_limit, agents, mdp=mdp)
 
 
-def _registration(env: Any) -> tuple[str, dict[str, Any], int]:
+def _registration(env: object) -> tuple[str, dict[str, object], int]:
     """Return an environment's id, keyword arguments and step limit, as far as they are registered.
 
     EnvPool's specification has a `config` and no id.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ _CODES: Final = {"b": "?", "i": "bhiq", "u": "BHIQ", "f": " efd"}
 """The codes of `struct` by the kind of a dtype, from 1 byte to 8."""
 _TOPICS: Final = {"train": schema.TRAIN_EXTRA, "eval": schema.EVAL_EXTRA}
 
-Put = Callable[[Any], None]
+Put = Callable[[object], None]
 """Adds a value to its column, or raises `ConfigError`."""
 
 
@@ -49,7 +49,7 @@ class Extras:
         self._recorder, self._batch = recorder, batch
         self._n = batch[0] if batch else 1
         self._taken = recorder.steps
-        self._dtypes: dict[str, np.dtype[Any]] = {}
+        self._dtypes: dict[str, np.dtype[np.generic]] = {}
         self._is_described = False
         """Whether the recording has the names and dtypes."""
         self._columns: dict[str, list[bytes]] = {}
@@ -79,7 +79,7 @@ class Extras:
         """
         steps, fast, taken, n, array = self._steps, self._fast, self._taken, self._n, np.ndarray
 
-        def take(values: Mapping[str, Any]) -> None:
+        def take(values: Mapping[str, object]) -> None:
             if not values:
                 return
             row = len(steps)
@@ -110,7 +110,7 @@ class Extras:
 
         return take
 
-    def extend(self, phase: str, rows: PhaseRows, values: Mapping[str, Any]) -> None:
+    def extend(self, phase: str, rows: PhaseRows, values: Mapping[str, object]) -> None:
         """Put down further values of the last step of the phase that is recorded now.
 
         Args:
@@ -270,7 +270,7 @@ class Extras:
     def _send(
         self,
         steps: NDArray[np.int64],
-        columns: Mapping[str, NDArray[Any]],
+        columns: Mapping[str, Array],
         given: Mapping[str, NDArray[np.bool_]],
     ) -> None:
         """Hand the values with these steps, and whether each was given, to the recorder."""
@@ -318,7 +318,7 @@ def _putter(name: str, base: np.dtype[np.generic], shape: tuple[int, ...], colum
     scalars = frozenset(() if shape else exact)
     pack, append = struct.Struct("<" + _CODES[base.kind][base.itemsize.bit_length() - 1]).pack, column.append
 
-    def put(value: Any) -> None:
+    def put(value: object) -> None:
         if value.__class__ not in scalars:
             append(_fitting(name, value, base, shape).astype(base).tobytes())
             return
@@ -330,7 +330,7 @@ def _putter(name: str, base: np.dtype[np.generic], shape: tuple[int, ...], colum
     return put
 
 
-def _fitting(name: str, value: Any, base: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+def _fitting(name: str, value: object, base: np.dtype[np.generic], shape: tuple[int, ...]) -> Array:
     """Return a value as an array, of the shape and of a dtype that the column holds exactly."""
     array = _numbers(name, value)
     if array.shape != shape or not np.can_cast(array.dtype, base):

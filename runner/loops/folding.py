@@ -90,7 +90,7 @@ def fold_if_over(run: Run, seconds: float = 0.0, report: Report = lambda *_: Non
 def _fold(run: Run, report: Report) -> Run:
     fresh = run.folder / f".{RECORDING_FILE}.folding"
     fresh.unlink(missing_ok=True)
-    summary: Mapping[str, Any] | None = None
+    summary: Mapping[str, object] | None = None
     with ExitStack() as stack:
         sources = _sources(run, stack)
         is_folded = bool(sources) and bool(sources[0].recording.shards)
@@ -167,7 +167,7 @@ class _Fold:
         """The process whose clock becomes that of the run."""
         self._totals = {phase: sum(source.taken[phase] for source in sources) for phase in PHASES}
 
-    def write(self, fresh: Path) -> dict[str, Any]:
+    def write(self, fresh: Path) -> dict[str, object]:
         """Write the new recording; return the summary of the run."""
         first, started = self._first, time.monotonic()
         facts = self._facts()

@@ -42,7 +42,7 @@ class GeneratorWatch:
         has_private = isinstance(self._base, gymnasium.Env | VectorEnv)
         is_computed = isinstance(getattr(type(self._base), "np_random", None), property)
         self._name = "_np_random" if has_private or is_computed else "np_random"
-        self._generator: Any = None
+        self._generator: object = None
         """The generator at the last reset."""
         self.due: float = 0
         """The number of steps from which on a state is recorded again."""

@@ -154,7 +154,7 @@ class Loop(Generic[R]):
             self.active.open()
         self.active = rows
 
-    def note(self, phase: str, rows: R, values: Mapping[str, Any]) -> None:
+    def note(self, phase: str, rows: R, values: Mapping[str, object]) -> None:
         """Record values with the last step of a phase.
 
         Raises:

@@ -68,7 +68,7 @@ def _maker_of_spec(spec: Any) -> EnvironmentMaker:
     wrappers = getattr(spec, "additional_wrappers", ())
     names = tuple(wrapper.entry_point for wrapper in reversed(wrappers))
 
-    def wrapping(assumed: list[str]) -> dict[str, Any]:
+    def wrapping(assumed: list[str]) -> dict[str, object]:
         left = [wrapper for wrapper in wrappers if wrapper.entry_point not in OBSERVERS]
         fields = "disable_env_checker", "order_enforce", "max_episode_steps"
         return {name: getattr(spec, name) for name in fields} | {
@@ -79,7 +79,7 @@ def _maker_of_spec(spec: Any) -> EnvironmentMaker:
 
 
 def _with_spec(
-    maker: EnvironmentMaker, spec: Any, wrapping: Callable[[list[str]], dict[str, Any]], top: str
+    maker: EnvironmentMaker, spec: object, wrapping: Callable[[list[str]], dict[str, object]], top: str
 ) -> EnvironmentMaker:
     """Return a maker with a specification.
 

@@ -93,7 +93,7 @@ class Messages:
         self._states: list[tuple[Topic, ResetState, int]] = []
         """Reset states that it does not have yet, with their positions."""
 
-    def log(self, phase: str, name: str, value: Any) -> None:
+    def log(self, phase: str, name: str, value: object) -> None:
         """Record a number or a text under a name, at this moment.
 
         Raises:
@@ -148,7 +148,7 @@ class Messages:
                 self._recorder.append(schema.LOG_TOPIC, payload, position)
                 self.has_logged = True
 
-    def snapshot(self, phase: str, name: str, array: Any) -> None:
+    def snapshot(self, phase: str, name: str, array: object) -> None:
         """Record an array of numbers, or all arrays of a mapping, as they are now.
 
         Raises:
@@ -166,7 +166,7 @@ class Messages:
                 self._recorder.append(schema.ARRAY_TOPIC, encode(schema.ARRAY, fields), position)
                 self.has_logged = True
 
-    def checkpoint(self, phase: str, name: str, value: Any, pickle: bool) -> str:
+    def checkpoint(self, phase: str, name: str, value: object, pickle: bool) -> str:
         """Store a checkpoint, and record it at this moment; return its digest.
 
         Raises:
@@ -190,7 +190,7 @@ class Messages:
             self.has_logged = True
         return digest
 
-    def info(self, phase: str, info: Mapping[str, Any], reset: Mapping[str, Any] | None = None) -> None:
+    def info(self, phase: str, info: Mapping[str, object], reset: Mapping[str, object] | None = None) -> None:
         """Record the chosen fields of an info, of the step or reset that was just put down.
 
         Args:

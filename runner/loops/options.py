@@ -73,7 +73,7 @@ class Options:
 
     recordings: str | os.PathLike[str] | None
     seed: int | None
-    settings: Any
+    settings: object
     """The user's own settings as JSON holds them."""
     info: tuple[str, ...]
     name: str | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +61,7 @@ class Outcomes:
         if name in self._logged or len(self._logged) < MAX_NAMES:
             self._logged[name] = value if math.isfinite(value) else None
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """Return `last_evaluation`, `recent_training` and `logged`, as JSON can hold them."""
         returns, lengths = self._recent.T
         return {

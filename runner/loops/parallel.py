@@ -29,7 +29,7 @@ class RecordedParallel(RecordedAlone[AgentRows]):
     Its other attributes are those of the environment: `agents`, `action_space`, ...
     """
 
-    def __init__(self, env: Any, loop: Loop[AgentRows], phase: str = "train") -> None:
+    def __init__(self, env: object, loop: Loop[AgentRows], phase: str = "train") -> None:
         self.env = env
         self._watch = GeneratorWatch(env)
         self._record_into(loop)
@@ -117,7 +117,7 @@ class RecordedAec(RecordedParallel):
 
 
 def record_parallel(
-    env: Any,
+    env: object,
     recordings: str | os.PathLike[str] | None = None,
     *,
     phase: str = "train",

@@ -33,6 +33,7 @@ from runner.recording.reader import Recording, open_recording
 from runner.replay.makers import make_environment, why_not_alone, why_not_made
 from runner.runs.checkpoints import Checkpoint
 from runner.runs.run import Run
+from runner.util.arrays import Array
 
 MAX_NUMBERS: Final = 256
 """The most numbers in one of the values that a policy returns along an episode."""
@@ -137,7 +138,7 @@ def _play(rec: Any, act: Policy, seed: int, name: str, is_game: bool) -> None:
 class ValuesAlong:
     """What a policy returned along a recorded episode of T steps."""
 
-    actions: Any
+    actions: object
     """The T recorded actions, nested as their space."""
     rewards: NDArray[np.float64]
     """[T, agents]."""
@@ -193,7 +194,7 @@ def values_along(
     return ValuesAlong(found.actions, found.rewards, values)
 
 
-def _named(value: Any) -> dict[str, NDArray[Any]]:
+def _named(value: object) -> dict[str, Array]:
     """Return what a policy returned, by name.
 
     Raises:

@@ -47,7 +47,7 @@ class Recorded(Generic[R]):
         """
         return self._loop.should_stop
 
-    def log(self, name: str | Mapping[str, Any], value: Any = None) -> None:
+    def log(self, name: str | Mapping[str, object], value: object = None) -> None:
         """Record a number or a text under a name: `rec.log("loss", loss)`, `rec.log({"loss": loss})`.
 
         Raises:
@@ -68,7 +68,7 @@ class Recorded(Generic[R]):
             else:
                 self.log(key, own)
 
-    def snapshot(self, name: str, array: Any) -> None:
+    def snapshot(self, name: str, array: object) -> None:
         """Record an array of numbers, or each of a mapping of arrays, as it is now: `rec.snapshot("q", q)`.
 
         Tensors of PyTorch and JAX are accepted too; their short floats, such as bfloat16, become float32.
@@ -82,7 +82,7 @@ class Recorded(Generic[R]):
         except Exception as error:
             self._loop.leave_out(error)
 
-    def checkpoint(self, name: str, value: Any, *, pickle: bool = False) -> str:
+    def checkpoint(self, name: str, value: object, *, pickle: bool = False) -> str:
         """Keep the agent's parameters as they are now: `rec.checkpoint("policy", model.state_dict())`.
 
         The content goes into a store next to the runs, once for equal contents; the recording has its digest,

@@ -105,7 +105,9 @@ class Rows:
 
     # --- what a loop does -----------------------------------------------------------------------------
 
-    def take(self, action: Any, observation: Any, reward: Any, terminated: Any, truncated: Any) -> None:
+    def take(
+        self, action: object, observation: object, reward: object, terminated: object, truncated: object
+    ) -> None:
         """Put down a step."""
         raise NotImplementedError
 

@@ -161,7 +161,7 @@ class Source:
             if len(rows):
                 yield rows, rows["step"].astype(np.int64)
 
-    def _stream(self, name: str) -> Iterator[Any]:
+    def _stream(self, name: str) -> Iterator[object]:
         """Return the messages of a topic of varying size; units of one environment come in their order."""
         if name not in self._messages:
             self._messages[name] = self.recording.decoded(self.recording.topic(name))

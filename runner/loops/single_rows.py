@@ -36,7 +36,7 @@ class BlockRows(Rows):
     """What a step brings that waits until its block is completed."""
 
     def __init__(
-        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
+        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[object], None]
     ) -> None:
         self._scratch = np.zeros(0, self._scratch_dtype)
         super().__init__(recorder, described, phase, first_action)
@@ -69,7 +69,7 @@ class DiscreteRows(BlockRows):
     _scratch_dtype = _DISCRETE_DTYPE
 
     def __init__(
-        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
+        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[object], None]
     ) -> None:
         self._state_start = int(described.observation.start)  # type: ignore[attr-defined]
         self._action_start = int(described.action.start)  # type: ignore[attr-defined]
@@ -177,7 +177,7 @@ class AgentRows(BlockRows):
     """Rows of `dualtaxi.Transition` of all agents of a PettingZoo parallel environment."""
 
     def __init__(
-        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
+        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[object], None]
     ) -> None:
         self._agents = described.agents
         self._is_settled = False
@@ -204,8 +204,8 @@ class AgentRows(BlockRows):
 
     def take_game(
         self,
-        actions: Mapping[str, Any],
-        observations: Mapping[str, Any],
+        actions: Mapping[str, object],
+        observations: Mapping[str, object],
         rewards: Mapping[str, float],
         terminated: Mapping[str, bool],
         truncated: Mapping[str, bool],
@@ -240,7 +240,7 @@ class VariableRows(Rows):
     """Rows of `dualtaxi.Transition` where a space has texts: each message is made when it comes."""
 
     def __init__(
-        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
+        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[object], None]
     ) -> None:
         self._paid = np.zeros(_VARIABLE_ROWS)
         self._is_settled = False
@@ -259,7 +259,9 @@ class VariableRows(Rows):
         """The number of the episode that the next step belongs to."""
         return self._episode + len(self._begins) + self._fresh
 
-    def take(self, action: Any, observation: Any, reward: Any, terminated: Any, truncated: Any) -> None:
+    def take(
+        self, action: object, observation: object, reward: object, terminated: object, truncated: object
+    ) -> None:
         """Put down a step."""
         row, reward = self.filled, lone_number(reward, "reward")
         require_reset(self._reset_count, self._phase)

@@ -127,7 +127,7 @@ def check_phase(phase: str) -> None:
         raise ConfigError(f"phase: found {phase!r}, expected one of {', '.join(schema.PHASES)}")
 
 
-def frozen_options(options: Mapping[str, Any]) -> dict[str, Any]:
+def frozen_options(options: Mapping[str, object]) -> dict[str, object]:
     """Return the options of a reset as JSON holds them, as the environment may change those that it gets.
 
     Options that JSON cannot hold are returned as they are; they are recorded as the reason for that.

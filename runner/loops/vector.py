@@ -256,7 +256,7 @@ def autoreset_mode_of(envs: AnyVectorEnv | None, chosen: AutoresetMode | str | N
     return stated
 
 
-def described_vector(envs: AnyVectorEnv, first: Any) -> Described:
+def described_vector(envs: AnyVectorEnv, first: object) -> Described:
     """Return the description of a vector environment; `first` is its first environment."""
     registered = first if getattr(envs, "spec", None) is None else envs
     described = describe(registered, *spaces_of_one(envs))
@@ -264,7 +264,7 @@ def described_vector(envs: AnyVectorEnv, first: Any) -> Described:
 
 
 @contextlib.contextmanager
-def first_of(envs: AnyVectorEnv) -> Iterator[Any]:
+def first_of(envs: AnyVectorEnv) -> Iterator[object]:
     """Yield the first environment of a vector, or the vector if it has none of its own.
 
     Those of an AsyncVectorEnv are in other processes, which end if a registration cannot be sent; so one is

@@ -50,7 +50,7 @@ class VectorRows:
         recorder: Recorder,
         described: Described,
         phase: str,
-        first_action: Callable[[Any], None],
+        first_action: Callable[[object], None],
         next_step: bool,
     ) -> None:
         self._recorder, self._phase, self._first_action = recorder, phase, first_action
@@ -147,12 +147,12 @@ class VectorRows:
 
     def take(
         self,
-        actions: Any,
-        observations: Any,
-        rewards: Any,
-        terminated: Any,
-        truncated: Any,
-        final: Any,
+        actions: object,
+        observations: object,
+        rewards: object,
+        terminated: object,
+        truncated: object,
+        final: object,
         states: States | None = None,
     ) -> None:
         """Record a step of all environments.
@@ -199,7 +199,7 @@ class VectorRows:
         """Return the observations [N] after the last step or reset of each environment."""
         if not self._filled:
             return self._current
-        now: NDArray[Any] = self._observations[self._filled - 1].copy()
+        now: Array = self._observations[self._filled - 1].copy()
         for reset in self._block_resets:
             here = reset.row == self._filled
             now[reset.which[here]] = reset.observation[here]

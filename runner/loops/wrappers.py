@@ -67,7 +67,7 @@ def only_observes(wrapper: Any) -> bool:
     return isinstance(wrapper, _SHOWS_ONLY) or class_name(wrapper) in OBSERVERS
 
 
-def declared_wrapper_fields(spec: WrapperSpec, assumed: list[str]) -> dict[str, Any]:
+def declared_wrapper_fields(spec: WrapperSpec, assumed: list[str]) -> dict[str, object]:
     """Return the fields of a wrapper's specification, which has no arguments if it does not record them."""
     if spec.kwargs is None:
         module, _, name = spec.entry_point.partition(":")
@@ -126,7 +126,7 @@ def plain_kwargs(kwargs: Mapping[str, Any], owner: str) -> dict[str, Any]:
     return dict(kwargs)
 
 
-def _is_plain(value: Any) -> bool:
+def _is_plain(value: object) -> bool:
     if isinstance(value, list | tuple):
         return all(map(_is_plain, value))
     if isinstance(value, dict):

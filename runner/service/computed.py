@@ -306,7 +306,7 @@ def replay(runs: Sequence[Run], request: Request) -> bytes:
     return os.fsencode(cached_export(runs, request)[0])
 
 
-def as_json(value: Any) -> bytes:
+def as_json(value: object) -> bytes:
     """Return a value as JSON; NaN and infinity become null."""
     return json.dumps(finite(value), allow_nan=False, ensure_ascii=False).encode(errors="replace")
 

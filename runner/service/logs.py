@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from logging.handlers import QueueHandler, QueueListener
-from typing import Any, Final, TextIO
+from typing import Final, TextIO
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -147,7 +147,7 @@ class AccessLog:
         finally:
             path, query = scope["path"], scope["query_string"].decode("latin-1")
             if status >= 400 or not path.startswith(_QUIET):
-                fields: dict[str, Any] = {
+                fields: dict[str, object] = {
                     "client": scope["client"][0] if scope.get("client") else None,
                     "method": scope["method"],
                     "path": (f"{path}?{query}" if query else path)[:_MAX_PATH],

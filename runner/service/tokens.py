@@ -61,7 +61,7 @@ class Token:
         """Whether it allows more than reading."""
         return WRITE in self.scopes
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """Return its public fields: never the hash."""
         return {"id": self.id, "name": self.name, "scopes": list(self.scopes), "created": self.created}
 
@@ -86,7 +86,7 @@ class _RecordsFile(Generic[Record]):
             `AttributeError` if it is none.
     """
 
-    def __init__(self, path: Path, key: str, parse: Callable[[Any], Record]) -> None:
+    def __init__(self, path: Path, key: str, parse: Callable[[object], Record]) -> None:
         self.path = path
         self._key, self._parse = key, parse
         self._version: tuple[int, int, int] | None = None

@@ -65,7 +65,7 @@ class RayActor:
 
     def __init__(self) -> None:
         self._stopping = threading.Event()
-        self._messages: list[Any] = []
+        self._messages: list[object] = []
         self._lock = threading.Lock()
 
     def run(self, function: Callable[Concatenate[RayActor, P], T], *args: P.args, **kwargs: P.kwargs) -> T:

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from pydantic import ValidationError
 
@@ -58,7 +58,7 @@ def from_text(text: str, source: str) -> Sweep:
     return _with_checked_parameters(_sweep(document, None, Path(source).stem, None), document)
 
 
-def from_values(values: Mapping[str, Any]) -> Sweep:
+def from_values(values: Mapping[str, object]) -> Sweep:
     """Return the sweep that plain values describe, as `Sweep.to_mapping` returns them.
 
     Its parameters were checked when it was loaded; no environment is made to check them again.
@@ -127,7 +127,7 @@ def _combined(errors: Sequence[ConfigError]) -> ConfigError:
 
 def _base(
     file: SweepFile, document: Document, name: str, folder: Path | None
-) -> tuple[ExperimentConfig, dict[str, Any]]:
+) -> tuple[ExperimentConfig, dict[str, object]]:
     """Return the base with the sweep's name, seeds and recording, and the values that trials start from."""
     if isinstance(file.base, str):
         if folder is None:
@@ -153,8 +153,8 @@ def _base(
 
 
 def _start_of_trials(
-    base: ExperimentConfig, given: Mapping[str, Any], parameters: Mapping[str, Any]
-) -> dict[str, Any]:
+    base: ExperimentConfig, given: Mapping[str, object], parameters: Mapping[str, object]
+) -> dict[str, object]:
     """Return the base as plain values, without the defaults that depend on a parameter of the sweep.
 
     The default of `exploration` depends on the learners, and the section of an algorithm on the algorithm:

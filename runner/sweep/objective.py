@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -45,8 +44,8 @@ def curve_of(recording: Recording, metric: str) -> Curve:
 
 
 def readings(
-    metrics: Mapping[str, Any],
-    exact: Mapping[str, Any] | None,
+    metrics: Mapping[str, object],
+    exact: Mapping[str, object] | None,
     agents: Sequence[str],
     events: Sequence[str],
 ) -> dict[str, float]:

@@ -90,7 +90,7 @@ class Search:
 
     def _grid_point(self, number: int) -> dict[str, object]:
         """Return a point of the grid, the last parameter changing fastest, as values for Optuna."""
-        point: dict[str, Any] = {}
+        point: dict[str, object] = {}
         for path, parameter in reversed(self._file.parameters.items()):
             if isinstance(parameter, Range):
                 number, at = divmod(number, parameter.steps + 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import click
 
@@ -186,7 +186,7 @@ def _verification_as_json(found: Verification, rerun: bool) -> dict[str, object]
     }
 
 
-def _difference(difference: Diverged) -> dict[str, Any]:
+def _difference(difference: Diverged) -> dict[str, object]:
     keys = ("topic", "episode", "step", "field", "found", "expected")
     values = {key: getattr(difference, key) for key in keys}
     plain = (str, int, float, list, dict, type(None))

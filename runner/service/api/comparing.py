@@ -52,7 +52,7 @@ async def diff(
     ignore: Annotated[list[str] | None, Query(max_length=100, description="Paths, with * and ?.")] = None,
     target: Annotated[list[str] | None, Query(max_length=20, description="METRIC=LEVEL.")] = None,
     first: Annotated[bool, Query(description="Only settings, and the first step that differs.")] = False,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return what `dualtaxi diff --json` prints."""
     left, right = await found_runs(catalogue, [a, b])
     key = ("diff", *map(timed_recording_state, (left, right)), request.url.query)

@@ -6,7 +6,7 @@ import os
 import pathlib
 import re
 from http import HTTPStatus
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 from fastapi import APIRouter, Header, Path, Query, Response
 from fastapi.responses import FileResponse
@@ -28,7 +28,7 @@ router = APIRouter(
 MEDIA: Final = "application/octet-stream"
 BLOCK: Final = 1 << 20
 """Bytes of a file that are read at a time."""
-FILE: Final[dict[int | str, dict[str, Any]]] = {
+FILE: Final[dict[int | str, dict[str, object]]] = {
     200: {"description": "All of it.", "content": {MEDIA: {}}},
     206: {"description": "The requested ranges.", "content": {MEDIA: {}}},
     304: {"description": "The client has it already."},

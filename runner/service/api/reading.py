@@ -136,7 +136,7 @@ class Records(BaseModel):
     run_id: str
     start: int
     total: int
-    records: list[dict[str, Any]]
+    records: list[dict[str, object]]
 
 
 class Columns(BaseModel):

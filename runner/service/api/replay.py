@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Hashable
 from functools import partial
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
 from fastapi import APIRouter, Path, Query, Response
 from fastapi.responses import StreamingResponse
@@ -63,7 +63,7 @@ class Part(BaseModel):
     """A part of an episode, and the scene of its environment if it has one."""
 
     episode: Playback
-    scene: dict[str, Any] | None
+    scene: dict[str, object] | None
     has_pictures: bool
     """Whether `/pictures` has some; of a scene the page draws them itself."""
     picture_note: str

@@ -110,7 +110,7 @@ class RunResponse(BaseModel, extra="allow"):
     tags: list[str]
     note: str
     config: dict[str, Any]
-    provenance: dict[str, Any]
+    provenance: dict[str, object]
     last_evaluation: dict[str, Any] | None
 
 

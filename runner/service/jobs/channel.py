@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol
+from typing import Final, Literal, Protocol
 
 from runner.client.jobs import JobProgress, LogEvent, RunEvent
 from runner.errors import RunnerError
@@ -29,7 +29,7 @@ class JobSpec:
     number: int
     kind: str
     name: str
-    values: dict[str, Any]
+    values: dict[str, object]
     """The configuration or sweep, every value present."""
     run_ids: dict[int, str]
     """The run ids reserved for a configuration, by seed."""

@@ -10,7 +10,7 @@ import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from runner.config import from_text
 from runner.config.document import Document, Problem, read_yaml
@@ -53,7 +53,7 @@ class CheckedJob:
     runs: int
     bytes: int
     """The estimated size of its recordings; 0 if unknown."""
-    values: dict[str, Any]
+    values: dict[str, object]
     """The configuration, or the sweep, every value present."""
 
 
@@ -101,7 +101,7 @@ def _check_sweep(text: str, source: str, document: Document, recordings: Path) -
     require_optuna()
     sweep = sweep_from_text(text, source)
     base, parameters = document.value["base"], document.value["parameters"]
-    starts: dict[tuple[str | int, ...], Any] = {("base", "initial_q"): base.get("initial_q")}
+    starts: dict[tuple[str | int, ...], object] = {("base", "initial_q"): base.get("initial_q")}
     for path, choices in parameters.items():
         if path.split(".")[0] == "initial_q" and isinstance(choices, list):
             starts |= {("parameters", path, i): choice for i, choice in enumerate(choices)}
@@ -115,7 +115,7 @@ def _check_sweep(text: str, source: str, document: Document, recordings: Path) -
     return CheckedJob("sweep", sweep.name, runs, 0, values)
 
 
-def _refuse_paths(starts: Mapping[tuple[str | int, ...], Any], document: Document) -> None:
+def _refuse_paths(starts: Mapping[tuple[str | int, ...], object], document: Document) -> None:
     """Refuse an initial Q-table that is named by the path of its recording.
 
     Raises:

@@ -330,7 +330,7 @@ class JobStore:
         self.job(number)
         return self._column(number, _JobRow.submitted)
 
-    def values(self, number: int) -> dict[str, Any]:
+    def values(self, number: int) -> dict[str, object]:
         """Return the configuration or sweep of a job, every value present."""
         return dict(read_yaml(self._column(number, _JobRow.values), f"job {number}").value)
 

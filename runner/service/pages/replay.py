@@ -385,7 +385,7 @@ def _step(part: Mapping[str, Any], t: int) -> ShownStep:
 def _facts(episode: Mapping[str, Any], i: int) -> list[tuple[str, str]]:
     """Return what is known of frame i of a part of an episode, by name, for readers without scripts."""
 
-    def named(one: Mapping[str, Any]) -> str:
+    def named(one: Mapping[str, object]) -> str:
         name = f"{one['agent']} {one['name']}".strip().replace("_", " ")
         return name[0].upper() + name[1:]
 
