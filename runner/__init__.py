@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from runner.api import run, run_all
     from runner.config import ExperimentConfig
     from runner.debugging.what_if import what_if
+    from runner.debugging.when import when
     from runner.errors import RunnerError
     from runner.execution.rerecord import evaluate, rerecord
     from runner.execution.resume import resume
@@ -65,6 +66,7 @@ __all__ = [
     "run_all",
     "verify",
     "what_if",
+    "when",
 ]
 
 _HOME = {
@@ -90,6 +92,7 @@ _HOME = {
     "run_all": "runner.api",
     "verify": "runner.execution.verify",
     "what_if": "runner.debugging.what_if",
+    "when": "runner.debugging.when",
 }
 """The module of each public name that is not a module itself."""
 

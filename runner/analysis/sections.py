@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from html import escape
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,21 @@ def markdown(made: Sequence[Section]) -> Iterator[str]:
         for lines in section.diffs:
             fence = "`" * max([3, *(len(run) + 1 for line in lines for run in re.findall("`{3,}", line))])
             yield from (f"{fence}diff", *lines, fence, "")
+
+
+def html(made: Sequence[Section]) -> str:
+    """Return sections as HTML that depends on no style sheet, as notebooks display it."""
+    parts = []
+    for section in made:
+        parts += [f"<h3>{escape(section.title)}</h3>"]
+        parts += [f"<p>{escape(sentence)}</p>" for sentence in section.sentences]
+        for grid in section.grids:
+            head = "".join(f'<th scope="col">{escape(heading)}</th>' for heading in grid.headings)
+            rows = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in grid.rows]
+            body = "".join(f"<tr>{row}</tr>" for row in rows)
+            parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
+        parts += [f"<pre>{escape(chr(10).join(lines))}</pre>" for lines in section.diffs]
+    return "\n".join(parts)
 
 
 def _row(cells: tuple[str, ...]) -> str:

@@ -69,3 +69,7 @@ class StepRef:
     def outcome(self) -> StepRef:
         """The frame after the step, which shows its outcome."""
         return dataclasses.replace(self, t=self.t + 1)
+
+    def replay_address(self, run_id: str) -> str:
+        """Return the page of the replay of a run at the frame after the step."""
+        return f"/runs/{run_id}/replay/{self.episode_path}?t={self.outcome.t}"

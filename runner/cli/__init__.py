@@ -48,6 +48,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     },
     "Debug": {
         "branch": ("branch", "Take another action at a recorded step, and play on."),
+        "when": ("when", "Find the training steps after which something holds, such as a Q-value."),
     },
     "Manage": {
         "label": ("catalogue", "Change the name, note and tags of a run."),

@@ -9,8 +9,8 @@ compiled kernel indexes its arrays by what they say, without any check of its ow
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Final, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from runner.errors import RecordingError
 from runner.learning import kernel
 from runner.learning.learner import Held, Learner, held_of, kinds_of
 from runner.learning.ledger import UNKNOWN_OUTCOME, UPDATE
+from runner.learning.watching import Changes, Watch, begin, empty_changes, joined, replay_watched
 from runner.recording import schema
 from runner.recording.messages import QTable
 from runner.recording.reader import Recording
@@ -144,6 +145,40 @@ class StepReplay:
         Raises:
             RecordingError: steps are missing, or the environment cannot have such steps.
         """
+        if probe is not None:
+            _check_probe(probe, self._mdp)
+        for state, part in self._segments(steps):
+            records = steps[part].view(np.recarray)
+            if trace is not None:
+                kernel.replay(*state, records, rows[part], trace.updates[part], trace.learner)
+            elif probe is None:
+                kernel.replay(*state, records, rows[part])
+            else:
+                kernel.replay_probed(*state, records, rows[part], *probe.between(part.start, part.stop))
+
+    def begin_watch(self, watch: Watch) -> Changes:
+        """Follow the greedy paths of `watch`, and return the watched values as they are now, as one row."""
+        changes = empty_changes(watch, 1)
+        begin(self._learner.model, self._learner.tables, watch, changes)
+        return changes
+
+    def watch(self, steps: NDArray[np.void], watch: Watch) -> Changes:
+        """Apply updates as `apply` does, and return the watched values after each that could change them.
+
+        Args:
+            steps: as for `apply`.
+            watch: `begin_watch` was called with it at `step`, or this method for the steps before.
+        """
+        found = [(empty_changes(watch, 0), 0)]
+        for state, part in self._segments(steps):
+            changes = empty_changes(watch, part.stop - part.start)
+            filled = replay_watched(*state, steps[part].view(np.recarray), _NO_ROWS, watch, changes)
+            changes.row[:filled] += part.start
+            found.append((changes, filled))
+        return joined(found)
+
+    def _segments(self, steps: NDArray[np.void]) -> Iterator[tuple[tuple[Any, ...], slice]]:
+        """Yield the kernel's arguments for the parts of a block in order, and move forward after each."""
         if not len(steps):
             return
         first, last = int(steps["step"][0]), int(steps["step"][-1])
@@ -155,20 +190,12 @@ class StepReplay:
                 f"those from {self.step} on; `dualtaxi verify` checks the whole recording."
             )
         check_steps(steps, self._mdp, self._where)
-        if probe is not None:
-            _check_probe(probe, self._mdp)
         at = 0
         while at < len(steps):
             segment = self._learner.segment_at(self.step)
             stop = min(len(steps), at + segment.stop - self.step)
             state = (self._learner.seed, self._learner.model, self._learner.tables, segment.rules)
-            records = steps[at:stop].view(np.recarray)
-            if trace is not None:
-                kernel.replay(*state, records, rows[at:stop], trace.updates[at:stop], trace.learner)
-            elif probe is None:
-                kernel.replay(*state, records, rows[at:stop])
-            else:
-                kernel.replay_probed(*state, records, rows[at:stop], *probe.between(at, stop))
+            yield state, slice(at, stop)
             self.step += stop - at
             at = stop
 

@@ -51,11 +51,6 @@ def link(path: str, values: Mapping[str, object]) -> str:
     return f"{path}?{urlencode(query, doseq=True)}" if query else path
 
 
-def replay_address(run_id: str, step: StepRef) -> str:
-    """Return the page of the replay at the frame after a step."""
-    return f"/runs/{run_id}/replay/{step.episode_path}?t={step.outcome.t}"
-
-
 def places_in(runs: Sequence[Run], step: StepRef) -> list[StepRef]:
     """Return the step in each of two runs: a branch has its parent's episode as its only one."""
     alone = StepRef(0, step.t, None if step.after is None else 0)

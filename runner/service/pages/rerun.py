@@ -22,7 +22,7 @@ from runner.analysis.step_reference import StepRef
 from runner.export.reports.rendering import View
 from runner.export.rerun import viewer as native_viewer
 from runner.service import fragments
-from runner.service.addresses import link, replay_address
+from runner.service.addresses import link
 from runner.service.api.replay import LONG
 from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
 from runner.service.guard import POLICY
@@ -69,7 +69,7 @@ def viewer(request: Request, run: RecordedRun, at: Annotated[str, Query(max_leng
     """Show the Rerun viewer, opened at a step."""
     step = StepRef.parse(at) if at else None
     content = f"{step.episode_name}, step {step.t}." if step else OVERVIEW
-    back = replay_address(run.run_id, step) if step else ""
+    back = step.replay_address(run.run_id) if step else ""
     frame = link(f"/runs/{run.run_id}/rerun/frame", {"at": at})
     return page(request, _RerunView(head_of(run), "rerun", content, back, frame))
 

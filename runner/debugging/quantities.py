@@ -1,0 +1,346 @@
+"""The quantities of a job's training: their names in expressions, and their values after each step.
+
+q[STATE, ACTION]       a Q-value; max(q[STATE]) and min(q[STATE]) those of a state
+greedy[STATE]          the greedy action
+greedy_success[STATE]  whether the greedy path from there has an event of success within the step limit
+visits[STATE]          how often a step began in the state; visits[STATE, ACTION] with this action
+step, episode          numbers of the training step and of its episode
+reward                 of the training step
+epsilon                the probability of exploring at the training step
+
+With a table for each agent, `q.taxi_1[...]`, `reward.taxi_1`, `greedy.taxi_1[...]` and `visits.taxi_1[...]`
+are the agent's own; `greedy[...]` and `visits[...]` are then of joint actions.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.config import from_mapping
+from runner.debugging.expressions import Array, Columns, Parser, Term
+from runner.environments.naming import action_names, actions_in_words, states_in_words
+from runner.errors import RunnerError, nearest
+from runner.learning.learner import rules_of
+from runner.learning.watching import Changes, Watch, explorations
+from runner.recording import schema
+from runner.recording.reader import Recording
+from runner.replay.tables import TableReplay
+
+NAMES: Final = ("q", "greedy", "greedy_success", "visits", "step", "episode", "reward", "epsilon")
+_INDEXED: Final = NAMES[:4]
+JOINT: Final = -1
+"""Stands for the learner of a joint action."""
+MAX_CELLS: Final = 4_096
+"""The most Q-values of an expression."""
+MAX_PATH_STATES: Final = 1 << 24
+"""The most states of all greedy paths of an expression."""
+_VALUES_AT_ONCE: Final = 1 << 20
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What is read after each step."""
+
+    name: str
+    learner: int = 0
+    """`JOINT` for joint actions."""
+    state: int = -1
+    action: int = -1
+    """-1 for all."""
+
+
+class JobVocabulary:
+    """Finds the quantities that an expression names; `quantities` lists them.
+
+    Args:
+        recording: of a job.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self._mdp = recording.mdp
+        self._learners = recording.agents
+        self._learns = from_mapping(recording.config).algorithm != "random"
+        joint, own = [str(name) for name in actions_in_words(self._mdp)], action_names(self._mdp)
+        self._joint = joint
+        self._own = [joint]
+        if len(self._learners) > 1:
+            self._own = own or [
+                [f"action {action}" for action in range(count)] for count in self._mdp.action_counts
+            ]
+        self._state_names = [str(name) for name in states_in_words(self._mdp)]
+        self.quantities: dict[Quantity, None] = {}
+
+    @property
+    def states(self) -> tuple[tuple[int, str], ...]:
+        """The states of the quantities, with their names."""
+        numbers = sorted({each.state for each in self.quantities if each.state >= 0})
+        return tuple((number, self._state_names[number]) for number in numbers)
+
+    def resolve(self, parser: Parser, node: ast.expr) -> Term:
+        """Return the quantity that a node names.
+
+        Raises:
+            RunnerError: there is none.
+        """
+        head = node.value if isinstance(node, ast.Subscript) else node
+        base = head.value if isinstance(head, ast.Attribute) else head
+        if not isinstance(base, ast.Name) or base.id not in NAMES:
+            found = parser.text_of(base)
+            hint = nearest(found, NAMES)
+            raise parser.error(base, f"found {found[:60]}, expected one of {', '.join(NAMES)}.{hint}")
+        name, agent = base.id, head.attr if isinstance(head, ast.Attribute) else None
+        self._check_algorithm(parser, base, name)
+        learner = self._learner(parser, head, name, agent)
+        if name not in _INDEXED:
+            if isinstance(node, ast.Subscript):
+                raise parser.error(node, f"found {name} with an index, expected {name} alone.")
+            return self._term(Quantity(name, learner))
+        if not isinstance(node, ast.Subscript):
+            example = f"{name}[STATE, ACTION]" if name == "q" else f"{name}[STATE]"
+            raise parser.error(node, f"found {parser.text_of(node)} without a state, expected {example}.")
+        return self._term(Quantity(name, learner, *self._place(parser, node, name, learner)))
+
+    def _check_algorithm(self, parser: Parser, node: ast.expr, name: str) -> None:
+        if name in _INDEXED[:3] and not self._learns:
+            raise parser.error(
+                node,
+                f"found {name}, but random agents learn no Q-values; visits and reward remain.",
+            )
+        if name == "greedy_success":
+            if not self._mdp.success_events:
+                raise parser.error(node, "found greedy_success, but the environment names no success events.")
+            if (self._mdp.probability[..., 1:] > 0).any():
+                raise parser.error(
+                    node,
+                    "found greedy_success, but actions of this environment have several outcomes, so that a "
+                    "greedy path is not one path; greedy[STATE] is the action in each state.",
+                )
+
+    def _learner(self, parser: Parser, node: ast.expr, name: str, agent: str | None) -> int:
+        several = len(self._learners) > 1
+        if agent is not None:
+            if name not in ("q", "greedy", "visits", "reward"):
+                raise parser.error(node, f"found {name} of an agent, expected {name} alone.")
+            if agent not in self._learners:
+                expected = " or ".join(f"{name}.{each}" for each in self._learners)
+                hint = nearest(agent, self._learners)
+                raise parser.error(node, f"found {name}.{agent}, expected {expected}.{hint}")
+            return self._learners.index(agent)
+        if several and name in ("q", "reward"):
+            expected = " or ".join(f"{name}.{each}" for each in self._learners)
+            raise parser.error(node, f"found {name} of {len(self._learners)} agents, expected {expected}.")
+        return JOINT if several else 0
+
+    def _place(self, parser: Parser, node: ast.Subscript, name: str, learner: int) -> tuple[int, int]:
+        """Return the state and the action of an index; action -1 if it has none."""
+        parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        takes = 2 if name in ("q", "visits") else 1
+        if not 1 <= len(parts) <= takes:
+            raise parser.error(
+                node,
+                f"found {len(parts)} values, expected {'STATE, ACTION' if takes == 2 else 'STATE'}.",
+            )
+        state = parser.number_of(parts[0], self._state_names, "state")
+        if len(parts) == 1:
+            return state, -1
+        return state, parser.number_of(parts[1], self._actions(learner), "action")
+
+    def _actions(self, learner: int) -> list[str]:
+        return self._joint if learner == JOINT else self._own[learner]
+
+    def _term(self, quantity: Quantity) -> Term:
+        self.quantities[quantity] = None
+        kind: Literal["number", "condition", "row"] = "number"
+        if quantity.name == "greedy_success":
+            kind = "condition"
+        elif quantity.name == "q" and quantity.action < 0:
+            kind = "row"
+        return Term(
+            kind,
+            lambda columns: columns[quantity],
+            self._actions(quantity.learner) if quantity.name == "greedy" else (),
+            quantity.name in ("greedy", "visits", "step", "episode"),
+        )
+
+
+class JobColumns:
+    """The values of quantities after training steps, in blocks of which only the changes are taken.
+
+    Args:
+        recording: of a job.
+        quantities: what to read.
+        start: the first training step; the tables are those before it.
+
+    Raises:
+        RunnerError: the quantities are too many.
+        RecordingError: the tables before `start` are not known.
+    """
+
+    def __init__(self, recording: Recording, quantities: list[Quantity], start: int) -> None:
+        self._quantities = quantities
+        self._mdp = recording.mdp
+        config = from_mapping(recording.config)
+        starts = sorted({0, *(branch.step for branch in config.branches)})
+        self._segments = [(start, rules_of(config.from_step(start))) for start in starts]
+        """The rules of the training, each from a step on."""
+        several = len(recording.agents) > 1
+        self._widths = list(self._mdp.action_counts) if several else [self._mdp.joint_actions]
+        self._cells: dict[Quantity, slice] = {}
+        self._greedy: dict[Quantity, list[int]] = {}
+        self._paths = [each for each in quantities if each.name == "greedy_success"]
+        names = {each.name for each in quantities}
+        by_step = "epsilon" in names and (
+            len(starts) > 1 or any(rules.epsilon[1] == 1.0 for _, rules in self._segments)
+        )
+        self._every_step = by_step or bool(names & {"step", "reward"})
+        self._by_episode = bool(names & {"episode", "epsilon"})
+        self._watch = self._new_watch()
+        self._visits = {each: 0 for each in quantities if each.name == "visits"}
+        for block in recording.blocks(schema.TRAIN_STEP, 0, start) if self._visits and start else ():
+            for each in self._visits:
+                self._visits[each] += int(np.count_nonzero(self._visited(each, block)))
+        self._replay = TableReplay(recording, start) if names & set(_INDEXED[:3]) else None
+        self._last = self._first()
+
+    def _new_watch(self) -> Watch:
+        offsets = [self._mdp.states * sum(self._widths[:i]) for i in range(len(self._widths))]
+        cells: list[int] = []
+        greedy: list[tuple[int, int]] = []
+        states = np.zeros(self._mdp.states, np.bool_)
+        for each in self._quantities:
+            if each.name == "q":
+                width = self._widths[each.learner]
+                row = offsets[each.learner] + each.state * width
+                own = range(row, row + width) if each.action < 0 else [row + each.action]
+                self._cells[each] = slice(len(cells), len(cells) + len(own))
+                cells += own
+            elif each.name == "greedy":
+                learners = range(len(self._widths)) if each.learner == JOINT else [each.learner]
+                self._greedy[each] = [len(greedy) + k for k in range(len(learners))]
+                greedy += [(i, each.state) for i in learners]
+            if each.name in ("q", "greedy"):
+                states[each.state] = True
+        if len(cells) > MAX_CELLS or len(self._paths) * self._mdp.states > MAX_PATH_STATES:
+            raise RunnerError(
+                f"expression: needs {len(cells):,} Q-values and {len(self._paths)} greedy paths through "
+                f"{self._mdp.states:,} states, expected at most {MAX_CELLS:,} values and {MAX_PATH_STATES:,} "
+                "states on paths; ask for parts of it."
+            )
+        paths = len(self._paths), self._mdp.states
+        return Watch(
+            states=states,
+            cells=np.array(cells, np.int64),
+            greedy=np.array(greedy, np.int64).reshape(-1, 2),
+            starts=np.array([each.state for each in self._paths], np.int64),
+            success=np.uint32(self._mdp.success_mask),
+            path=np.zeros(paths, np.int32),
+            length=np.zeros(len(self._paths), np.int64),
+            on_path=np.zeros(paths, np.bool_),
+            succeeds=np.zeros(len(self._paths), np.bool_),
+        )
+
+    @property
+    def last(self) -> Columns:
+        """The values now, one row each; NaN for those of a step before the first step."""
+        return self._last
+
+    def take(self, block: NDArray[np.void], needed: int) -> Iterator[tuple[NDArray[np.int64], Columns]]:
+        """Yield the steps after which quantities may have changed, as places in a block, and their values.
+
+        The values have a row more, before the others: those before the first of the steps.
+
+        Args:
+            block: the training steps that follow.
+            needed: a place in the block that is included in any case; -1 for none.
+        """
+        width = max(len(self._watch.cells), 1)
+        size = max(_VALUES_AT_ONCE // width, 1)
+        for first in range(0, len(block), size):
+            part = block[first : first + size]
+            places, columns = self._part(part, needed - first)
+            if len(places):
+                whole = {key: np.concatenate([self._last[key], column]) for key, column in columns.items()}
+                self._last = {key: column[-1:] for key, column in whole.items()}
+                yield places + first, whole
+
+    def _part(self, block: NDArray[np.void], needed: int) -> tuple[NDArray[np.int64], Columns]:
+        changes = None if self._replay is None else self._replay.watch(block, self._watch)
+        visits = {each: self._visited(each, block) for each in self._visits}
+        if self._every_step:
+            places = np.arange(len(block))
+        else:
+            found = [np.flatnonzero(mask) for mask in visits.values()]
+            if changes is not None:
+                found.append(changes.row)
+            if self._by_episode:
+                found.append(np.flatnonzero(block["t"] == 0))
+            if 0 <= needed < len(block):
+                found.append(np.array([needed]))
+            places = np.unique(np.concatenate(found)) if found else np.empty(0, np.int64)
+        columns: dict[Quantity, Array] = {}
+        if len(places):
+            columns = self._of_steps(block[places])
+            if changes is not None:
+                columns |= self._of_tables(changes, places)
+        for each, mask in visits.items():
+            if len(places):
+                columns[each] = (self._visits[each] + np.cumsum(mask)[places]).astype(np.float64)
+            self._visits[each] += int(np.count_nonzero(mask))
+        return places, columns
+
+    def _of_steps(self, steps: NDArray[np.void]) -> dict[Quantity, Array]:
+        columns: dict[Quantity, Array] = {}
+        for each in self._quantities:
+            if each.name in ("step", "episode"):
+                columns[each] = steps[each.name].astype(np.float64)
+            elif each.name == "reward":
+                columns[each] = steps["rewards"][:, each.learner].astype(np.float64)
+            elif each.name == "epsilon":
+                columns[each] = np.empty(len(steps))
+                for start, rules in self._segments:
+                    own = steps[steps["step"] >= start]
+                    numbers = (np.ascontiguousarray(own[name], np.int64) for name in ("episode", "step"))
+                    columns[each][len(steps) - len(own) :] = explorations(rules, *numbers)
+        return columns
+
+    def _of_tables(self, changes: Changes, places: NDArray[np.int64]) -> dict[Quantity, Array]:
+        """Return the values at places in a block, each that of the last change before or at it."""
+        at = np.searchsorted(changes.row, places, side="right")
+        values = self._table_values(changes)
+        return {key: np.concatenate([self._last[key], value])[at] for key, value in values.items()}
+
+    def _table_values(self, changes: Changes) -> dict[Quantity, Array]:
+        columns: dict[Quantity, Array] = {}
+        for each, cells in self._cells.items():
+            columns[each] = changes.q[:, cells] if each.action < 0 else changes.q[:, cells.start]
+        for each, own in self._greedy.items():
+            strides = [math.prod(self._widths[i + 1 :]) for i in range(len(own))] if len(own) > 1 else [1]
+            columns[each] = (changes.greedy[:, own] * np.array(strides)).sum(axis=1).astype(np.float64)
+        for p, each in enumerate(self._paths):
+            columns[each] = changes.succeeds[:, p]
+        return columns
+
+    def _first(self) -> Columns:
+        columns: dict[Quantity, Array] = {each: np.full(1, np.nan) for each in self._quantities}
+        for each, visits in self._visits.items():
+            columns[each] = np.full(1, float(visits))
+        if self._replay is not None:
+            columns |= self._table_values(self._replay.begin_watch(self._watch))
+        return columns
+
+    def _visited(self, quantity: Quantity, steps: NDArray[np.void]) -> NDArray[np.bool_]:
+        mask = steps["state"] == quantity.state
+        if quantity.action < 0:
+            return np.asarray(mask)
+        actions = steps["action"]
+        if quantity.learner != JOINT and len(self._widths) > 1:
+            own = self._mdp.own_actions[:, quantity.learner]
+            actions = own[np.minimum(actions, len(own) - 1)]
+        return np.asarray(mask & (actions == quantity.action))

@@ -1,0 +1,340 @@
+"""When something became true in training, exactly: an expression evaluated after every recorded step.
+
+    found = runner.when(run, 'greedy[300] == "pickup + east"')
+    print(found.first.at)                     # the step, as the replay finds it
+    for interval in runner.when(run, "max(q[300]) > 20", every=True).intervals:
+        print(interval.start.step, interval.end and interval.end.step)
+
+`runner.debugging.quantities` lists what an expression may contain.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from runner.analysis.sections import Grid, Section, html
+from runner.analysis.step_reference import StepRef
+from runner.archive.places import at_hand
+from runner.debugging.expressions import Array, Columns, Expression, Parser, Term
+from runner.debugging.quantities import JobColumns, JobVocabulary
+from runner.errors import RecordingError, RunnerError
+from runner.export.contents import require_steps
+from runner.recording import schema
+from runner.recording.reader import Recording, open_recording
+from runner.runs.run import Run
+from runner.util.humanize import UNKNOWN, counted
+
+MAX_INTERVALS: Final = 10_000
+"""The most intervals of a result; further ones are counted."""
+
+Scalar = float | int | bool | str | None
+
+
+@dataclass(frozen=True)
+class Value:
+    """A part of the expression before and after a step."""
+
+    expression: str
+    before: Scalar
+    """None for a number that is NaN or belongs to a step before the first one, and for conditions then."""
+    after: Scalar
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A training step at which the expression changed."""
+
+    step: int
+    """The number of the training step, from 0."""
+    episode: int
+    t: int
+    values: tuple[Value, ...]
+    """The quantities of the expression, and the conditions that it combines."""
+
+    @property
+    def at(self) -> StepRef:
+        """The step, as replays are addressed."""
+        return StepRef(self.episode, self.t)
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Training steps after each of which the expression holds."""
+
+    start: Moment
+    """The first of them."""
+    end: Moment | None
+    """The step after which it no longer holds; None if it holds to the end, or only `start` was searched."""
+
+
+@dataclass(frozen=True)
+class When:
+    """When an expression held."""
+
+    run_id: str
+    expression: str
+    every: bool
+    """Whether all intervals were searched, or only the beginning of the first."""
+    searched: tuple[int, int]
+    """The first and the last training step after which it was evaluated."""
+    held_before: bool | None
+    """Whether it held before the first of them; None if it depends on a step before the first one."""
+    intervals: tuple[Interval, ...]
+    """At most 10,000; the first one only unless `every`."""
+    count: int
+    """The number of all intervals that were found."""
+    steps: int | None
+    """The number of steps after which it holds; None unless `every`."""
+    last: Moment
+    """The last step of the search."""
+    states: tuple[tuple[int, str], ...]
+    """The states in the expression, with their names."""
+
+    @property
+    def first(self) -> Moment | None:
+        """The first step after which the expression holds; None if there is none."""
+        return self.intervals[0].start if self.intervals else None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the result as JSON can hold it; each moment with its step reference as `at`."""
+        found = asdict(self)
+        for moment in (found["last"], *(each[k] for each in found["intervals"] for k in ("start", "end"))):
+            if moment is not None:
+                at = StepRef(moment["episode"], moment["t"])
+                moment |= {"at": str(at), "replay": at.replay_address(self.run_id)}
+        return found
+
+    def _repr_html_(self) -> str:
+        return html([section_of(self)])
+
+
+def when(
+    run: Run,
+    expression: str,
+    *,
+    every: bool = False,
+    first: int | str | StepRef | None = None,
+    last: int | str | StepRef | None = None,
+    report: Callable[[int], None] = lambda _: None,
+) -> When:
+    """Return the first training step after which an expression holds, or every interval in which it does.
+
+    Args:
+        run: a run that was trained here, with its steps.
+        expression: such as `q[300, "north + east"] > 5 and visits[300] >= 100`.
+        every: search all intervals.
+        first: the first training step to evaluate it after: its number, or EPISODE:T; by default step 0.
+        last: the last one; by default that of the run.
+        report: called with the number of steps searched so far.
+
+    Raises:
+        RunnerError: the expression is invalid, with a mark at its place; or the run is a loop.
+        RecordingError: there is no such step, steps are not recorded, or the recording is damaged.
+    """
+    with open_recording(at_hand(run).recording) as recording:
+        return when_in(recording, expression, every, first, last, report)
+
+
+def when_in(
+    recording: Recording,
+    expression: str,
+    every: bool = False,
+    first: int | str | StepRef | None = None,
+    last: int | str | StepRef | None = None,
+    report: Callable[[int], None] = lambda _: None,
+) -> When:
+    """Return when an expression held in the training of an open recording; see `when`."""
+    recording.require_job("`when`", "A loop has no Q-tables; `dualtaxi plot` shows what it logged.")
+    vocabulary = JobVocabulary(recording)
+    parsed = Parser(expression, vocabulary.resolve).parse()
+    require_steps(recording, "search")
+    steps = recording.count(schema.TRAIN_STEP)
+    start = _step_number(recording, first, steps, 0)
+    stop = _step_number(recording, last, steps, steps - 1) + 1
+    if start >= stop:
+        raise RunnerError(f"found first step {start:,} and last step {stop - 1:,}, expected them in order.")
+    columns = JobColumns(recording, list(vocabulary.quantities), max(start - 1, 0))
+    for block in recording.blocks(schema.TRAIN_STEP, start - 1, start) if start else ():
+        deque(columns.take(block, 0), maxlen=0)  # what was known before the first step
+    terms = parsed.terms
+    with np.errstate(all="ignore"):
+        held_before = bool(_values(parsed.condition, columns.last)[0])
+        knows = not any(np.isnan(_values(term, columns.last)).any() for term in terms)
+        found = _search(recording, parsed, columns, every, start, stop, report)
+    starts, ends = found.moments[::2], found.moments[1::2]
+    return When(
+        run_id=recording.run_id,
+        expression=parsed.text,
+        every=every,
+        searched=(start, found.last.step),
+        held_before=held_before if knows else None,
+        intervals=tuple(map(Interval, starts, [*ends, None])),
+        count=found.count,
+        steps=found.steps if every else None,
+        last=found.last,
+        states=vocabulary.states,
+    )
+
+
+@dataclass(frozen=True)
+class _Found:
+    moments: list[Moment]
+    """The steps at which the expression begins and ceases to hold, in turn."""
+    count: int
+    steps: int
+    last: Moment
+
+
+def _search(
+    recording: Recording,
+    expression: Expression,
+    columns: JobColumns,
+    every: bool,
+    start: int,
+    stop: int,
+    report: Callable[[int], None],
+) -> _Found:
+    """Evaluate an expression after the steps from `start` to before `stop`; unless `every`, to the first."""
+    moments: list[Moment] = []
+    count = steps = 0
+    holds, expected = False, start
+    for block in recording.blocks(schema.TRAIN_STEP, start, stop):
+        first = int(block["step"][0])
+        _check_lost(recording, expected, first)
+        expected = first + len(block)
+        for places, values in columns.take(block, 0 if first == start else -1):
+            held = _values(expression.condition, values).copy()
+            held[0] = holds  # what holds before `start` begins at `start`
+            holds = bool(held[-1])
+            changed = np.flatnonzero(held[1:] != held[:-1])
+            if not len(changed):
+                continue
+            numbers, begins = block["step"][places[changed]], held[1:][changed]
+            count += int(np.count_nonzero(begins))
+            steps += int(numbers[~begins].sum()) - int(numbers[begins].sum())
+            listed = changed[: 2 * MAX_INTERVALS - len(moments) if every else 1].tolist()
+            if listed:
+                parts = [(term, _values(term, values)) for term in expression.terms]
+                moments += [_moment(block[places[k]], parts, k, k + 1) for k in listed]
+            if not every:
+                return _Found(moments, 1, 0, moments[0])
+        report(expected - start)
+    _check_lost(recording, expected, stop)
+    parts = [(term, _values(term, columns.last)) for term in expression.terms]
+    return _Found(moments, count, steps + stop * holds, _moment(block[-1], parts, 0, 0))
+
+
+def _values(term: Term, columns: Columns) -> Array:
+    """Return the values of a term in all rows of the columns."""
+    rows = len(next(iter(columns.values())))
+    return np.broadcast_to(term.evaluate(columns), rows)
+
+
+def _moment(step: np.void, parts: Sequence[tuple[Term, Array]], before: int, after: int) -> Moment:
+    known = [not any(np.isnan(column[row]) for _, column in parts) for row in (before, after)]
+    values = [
+        Value(term.text, _scalar(term, column[before], known[0]), _scalar(term, column[after], known[1]))
+        for term, column in parts
+    ]
+    return Moment(int(step["step"]), int(step["episode"]), int(step["t"]), tuple(values))
+
+
+def _scalar(term: Term, value: np.float64 | np.bool_, is_known: bool) -> Scalar:
+    if term.kind == "condition":
+        return bool(value) if is_known else None
+    if np.isnan(value):
+        return None
+    if term.names:
+        return term.names[int(value)]
+    return int(value) if term.is_whole else float(value)
+
+
+def _check_lost(recording: Recording, expected: int, found: int) -> None:
+    if found != expected:
+        raise RecordingError(
+            f"{recording.path}: training steps {expected:,} to {found - 1:,} were lost, so what holds after "
+            "them is unknown; search up to the step before, or from one after the next Q-table."
+        )
+
+
+def _step_number(recording: Recording, at: int | str | StepRef | None, steps: int, default: int) -> int:
+    """Return the number of a training step."""
+    if at is None:
+        return default
+    if isinstance(at, str) and not at.isdecimal():
+        at = StepRef.parse(at)
+    if isinstance(at, StepRef):
+        if at.after is not None:
+            raise RunnerError(f"found {at}, expected a step of training: its number, or EPISODE:T.")
+        span = recording.episode_span("train", at.episode)
+        if at.t >= len(span):
+            raise RunnerError(
+                f"found step {at.t} of training episode {at.episode}, expected one of 0 to {len(span) - 1}."
+            )
+        return span[at.t]
+    if not 0 <= int(at) < steps:
+        raise RunnerError(f"found training step {int(at):,}, expected one of 0 to {steps - 1:,}.")
+    return int(at)
+
+
+# --- as text ----------------------------------------------------------------------------------------------
+
+
+def section_of(found: When, intervals: int = MAX_INTERVALS) -> Section:
+    """Return a result as sentences and tables: the first moment, and up to this number of intervals."""
+    first, last = found.searched
+    sentences = [f"State {number}: {name}." for number, name in found.states]
+    if found.first is None:
+        sentences.append(f"It holds after none of the training steps {first:,} to {last:,}.")
+        return Section(found.expression, sentences, [_values_grid("at the end", found.last, False)])
+    where = _named(found.first)
+    if not found.every:
+        sentences.append(f"It holds first after {where}.")
+    else:
+        sentences.append(
+            f"It holds after {found.steps:,} of the training steps {first:,} to {last:,}, in "
+            f"{counted(found.count, 'interval')}; first after {where}."
+        )
+    if found.held_before and found.first.step == first:
+        sentences.append("It held before that step too.")
+    grids = [_values_grid("first", found.first, True)]
+    if found.every:
+        shown = found.intervals[:intervals]
+        grids.append(_intervals_grid(shown, last))
+        if len(shown) < found.count:
+            sentences.append(f"The first {len(shown):,} intervals are listed.")
+    return Section(found.expression, sentences, grids)
+
+
+def _named(moment: Moment) -> str:
+    return f"training step {moment.step:,}, step {moment.t:,} of episode {moment.episode:,} ({moment.at})"
+
+
+def _values_grid(heading: str, moment: Moment, with_before: bool) -> Grid:
+    if not with_before:
+        return Grid((heading, "value"), [(each.expression, _text(each.after)) for each in moment.values])
+    rows = [(each.expression, _text(each.before), _text(each.after)) for each in moment.values]
+    return Grid((heading, "before", "after"), rows)
+
+
+def _intervals_grid(intervals: Sequence[Interval], last: int) -> Grid:
+    rows = []
+    for each in intervals:
+        end = each.end
+        steps = (last + 1 if end is None else end.step) - each.start.step
+        lost = (UNKNOWN, UNKNOWN) if end is None else (f"{end.step:,}", str(end.at))
+        rows.append((f"{each.start.step:,}", str(each.start.at), *lost, f"{steps:,}"))
+    return Grid(("from step", "episode:t", "lost at step", "episode:t", "steps"), rows)
+
+
+def _text(value: Scalar) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return f"{value:,.6g}"
+    return UNKNOWN if value is None else f"{value:,}" if isinstance(value, int) else value

@@ -1,0 +1,174 @@
+"""Replaying recorded steps while watching some values of the tables: only their changes are reported."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.learning.algorithms import Index, Rules, Tables, exploring
+from runner.learning.kernel import replay
+from runner.learning.model import Model
+
+
+class Watch(NamedTuple):
+    """The values to watch, and the greedy paths from P start states."""
+
+    states: NDArray[np.bool_]
+    """[S]: the states whose updates are reported."""
+    cells: NDArray[np.int64]
+    """[n]: places in `Tables.q`."""
+    greedy: NDArray[np.int64]
+    """[m, 2]: a learner and a state each."""
+    starts: NDArray[np.int64]
+    """[P]: where the greedy paths start."""
+    success: np.uint32
+    """The bits of an event mask that mean success."""
+    path: NDArray[np.int32]
+    """[P, S]: the states on each path, in order."""
+    length: NDArray[np.int64]
+    """[P]: how many there are."""
+    on_path: NDArray[np.bool_]
+    """[P, S]: whether a state is on the path."""
+    succeeds: NDArray[np.bool_]
+    """[P]: whether the path has an event of success."""
+
+
+class Changes(NamedTuple):
+    """The watched values after the steps of a block that could change them, a row for each."""
+
+    row: NDArray[np.int64]
+    """[k]: the step, as its place in the block, ascending."""
+    q: NDArray[np.float64]
+    """[k, n]."""
+    greedy: NDArray[np.int32]
+    """[k, m]."""
+    succeeds: NDArray[np.bool_]
+    """[k, P]."""
+
+
+def empty_changes(watch: Watch, rows: int) -> Changes:
+    """Return changes to be filled, of up to this number of rows."""
+    return Changes(
+        np.empty(rows, np.int64),
+        np.empty((rows, len(watch.cells))),
+        np.empty((rows, len(watch.greedy)), np.int32),
+        np.empty((rows, len(watch.starts)), np.bool_),
+    )
+
+
+def joined(parts: Sequence[tuple[Changes, int]]) -> Changes:
+    """Return the filled rows of changes, each with their number, one after the other."""
+    columns = zip(*([array[:rows] for array in changes] for changes, rows in parts), strict=True)
+    return Changes(*map(np.concatenate, columns))
+
+
+@numba.njit(cache=True, nogil=True)
+def _joint_greedy(model: Model, tables: Tables, state: int) -> int:
+    action = 0
+    for i in range(len(model.width)):
+        action += np.int64(tables.greedy[i, state]) * model.stride[i]
+    return action
+
+
+@numba.njit(cache=True, nogil=True)
+def _follow(model: Model, tables: Tables, watch: Watch, p: int) -> None:
+    """Follow the greedy path number p through a deterministic environment, to its end or into a cycle.
+
+    A path that returns to one of its states goes round for ever, and so has no success.
+    """
+    for k in range(watch.length[p]):
+        watch.on_path[p, watch.path[p, k]] = False
+    watch.succeeds[p] = False
+    state, n = watch.starts[p], 0
+    while not watch.on_path[p, state] and (model.step_limit == 0 or n < model.step_limit):
+        watch.on_path[p, state] = True
+        watch.path[p, n] = state
+        n += 1
+        pair = state * len(model.own_action) + _joint_greedy(model, tables, state)
+        outcome = pair * model.cumulative.shape[1]
+        kind = model.outcome_class[outcome]
+        if model.event_mask[model.event_class[kind]] & watch.success:
+            watch.succeeds[p] = True
+            break
+        if model.terminated[kind]:
+            break
+        state = np.int64(model.next_state[outcome])
+    watch.length[p] = n
+
+
+@numba.njit(cache=True, nogil=True)
+def _read(tables: Tables, watch: Watch, changes: Changes, k: int) -> None:
+    """Fill row k of `changes` with the watched values as they are now."""
+    for n in range(len(watch.cells)):
+        changes.q[k, n] = tables.q[watch.cells[n]]
+    for m in range(len(watch.greedy)):
+        changes.greedy[k, m] = tables.greedy[watch.greedy[m, 0], watch.greedy[m, 1]]
+    for p in range(len(watch.starts)):
+        changes.succeeds[k, p] = watch.succeeds[p]
+
+
+@numba.njit(cache=True, nogil=True)
+def begin(model: Model, tables: Tables, watch: Watch, changes: Changes) -> None:
+    """Follow all greedy paths, and fill the first row of `changes`."""
+    for p in range(len(watch.starts)):
+        _follow(model, tables, watch, p)
+    _read(tables, watch, changes, 0)
+
+
+@numba.njit(cache=True, nogil=True)
+def replay_watched(
+    seed: np.uint64,
+    model: Model,
+    tables: Tables,
+    rules: Rules,
+    steps: NDArray[np.void],
+    rows: NDArray[np.float64],
+    watch: Watch,
+    changes: Changes,
+) -> int:
+    """Replay steps, fill `changes`, which has a row for each step, and return how many rows were filled.
+
+    An update changes values of its step's state only. So a greedy path is followed again only when the greedy
+    action changed in one of its states.
+    """
+    at = filled = 0
+    for k in range(len(steps)):
+        state = Index(steps[k].state)
+        is_on_path = False
+        for p in range(len(watch.starts)):
+            is_on_path |= watch.on_path[p, state]
+        is_changed = watch.states[state]
+        if not is_on_path and not is_changed:
+            continue
+        before = 0
+        if is_on_path:
+            replay(seed, model, tables, rules, steps[at:k], rows)
+            at = k
+            before = _joint_greedy(model, tables, state)
+        replay(seed, model, tables, rules, steps[at : k + 1], rows)
+        at = k + 1
+        if is_on_path and _joint_greedy(model, tables, state) != before:
+            for p in range(len(watch.starts)):
+                if watch.on_path[p, state]:
+                    succeeded = watch.succeeds[p]
+                    _follow(model, tables, watch, p)
+                    is_changed |= watch.succeeds[p] != succeeded
+        if is_changed:
+            changes.row[filled] = k
+            _read(tables, watch, changes, filled)
+            filled += 1
+    replay(seed, model, tables, rules, steps[at:], rows)
+    return filled
+
+
+@numba.njit(cache=True, nogil=True)
+def explorations(rules: Rules, episodes: NDArray[np.int64], steps: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the probability of exploring at training steps of these episodes, [n]."""
+    found = np.empty(len(steps))
+    for k in range(len(steps)):
+        found[k] = exploring(rules, episodes[k], steps[k])
+    return found
