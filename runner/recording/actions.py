@@ -51,16 +51,16 @@ class EpisodeDigests:
     """The running digests of the episodes of some environments, over what their steps brought."""
 
     def __init__(self) -> None:
-        self._running: dict[int, Any] = {}
+        self._running: dict[int, blake3] = {}
 
     def add(
         self,
         environment: int,
-        t: NDArray[Any],
-        observations: NDArray[Any],
-        rewards: NDArray[Any],
-        terminated: NDArray[Any],
-        truncated: NDArray[Any],
+        t: NDArray[np.integer],
+        observations: Array,
+        rewards: NDArray[np.float64],
+        terminated: NDArray[np.bool_],
+        truncated: NDArray[np.bool_],
         at: Iterable[int] = (),
     ) -> Iterator[tuple[int, bytes]]:
         """Yield rows of consecutive steps of an environment, each with the digest of its episode so far.

@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 import zstandard
-from numpy.typing import NDArray
 
 from runner.environments.mdp import MAX_ARRAYS_BYTES
 from runner.errors import RecordingError
@@ -46,7 +45,7 @@ def unpack_array(data: bytes, max_bytes: int, where: str) -> Array:
         raise RecordingError(f"{where}: holds no array ({error}).") from error
 
 
-def _read_array(stream: Any, max_bytes: int, where: str) -> NDArray[Any]:
+def _read_array(stream: Any, max_bytes: int, where: str) -> Array:
     """Return the array in a `.npy` file of version 1.0, whose header is text in a fixed form."""
     prefix, length = stream.read(len(_PREFIX)), int.from_bytes(stream.read(2), "little")
     header = _HEADER.fullmatch(stream.read(min(length, _MAX_HEADER_BYTES)))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 from functools import lru_cache
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
@@ -61,7 +61,7 @@ def record_dtype(message: MessageType, sizes: Sizes) -> np.dtype[np.void]:
 
     Fields named `tag…` hold protobuf's constant bytes (see `blank_records`).
     """
-    layout: list[Any] = list(HEADER)
+    layout: list[tuple[object, ...]] = list(HEADER)
     for field, value in zip(message.fields, _value_dtypes(message, sizes), strict=True):
         layout.append((f"tag_{field.name}", "u1", (len(_tag(field, value)),)))
         layout.append((field.name, value))
@@ -140,7 +140,7 @@ def topic_sizes(
         action: dtype of an action, for `Transition`.
         observation: dtype of an observation, for `Transition` and `Reset`.
     """
-    known: dict[MessageType, tuple[int | np.dtype[Any] | None, ...]] = {
+    known: dict[MessageType, tuple[int | np.dtype[np.generic] | None, ...]] = {
         STEP: (learners,),
         EPISODE: (learners, events),
         TRANSITION: (action, observation, learners),

@@ -8,7 +8,6 @@ a block at a time, and compared.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from runner.recording.schema import RESET_ONLY
 from runner.util.arrays import Array
 
 Floats = NDArray[np.float64]
-Expected = dict[str, NDArray[Any]]
+Expected = dict[str, Array]
 
 
 @dataclass
@@ -213,7 +212,7 @@ class _Phase:
     def _check_observations(self, b: Block) -> None:
         """Compare the states before steps with those after the steps, or resets, before them."""
         rows, number, reset_only, names = b.rows, b.number, b.reset_only, b.rows.dtype.names or ()
-        observed: NDArray[Any] | None = None
+        observed: Array | None = None
         if b.resets is not None and "observation" in (b.resets.dtype.names or ()):
             observed = np.zeros(len(rows), b.resets.dtype["observation"])
             observed[b.reset_rows] = b.resets["observation"]  # of several at one place the last counts

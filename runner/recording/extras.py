@@ -25,6 +25,7 @@ from runner.recording.blocks import Sizes, record_dtype
 from runner.recording.metadata import json_object
 from runner.recording.spaces import dtype_of
 from runner.recording.topic_chunks import TopicChunks
+from runner.util.arrays import Array, MaskedArray
 from runner.util.values import is_text
 
 MAX_NAMES: Final = 256
@@ -101,7 +102,7 @@ def read_layouts(columns: Iterable[tuple[int, str]], where: str) -> list[ExtraLa
     return layouts
 
 
-def _values_dtype(description: dict[str, object], what: str) -> np.dtype[np.generic]:
+def _values_dtype(description: dict[str, object], what: str) -> np.dtype[Any]:
     parts = description.get("spaces")
     if description.get("type") != "Dict" or not isinstance(parts, dict) or not 0 < len(parts) <= MAX_NAMES:
         raise RecordingError(f"{what}: found no mapping of 1 to {MAX_NAMES} names.")
@@ -118,7 +119,7 @@ def _values_dtype(description: dict[str, object], what: str) -> np.dtype[np.gene
     return values
 
 
-class Extras(Mapping[str, np.dtype[Any]]):
+class Extras(Mapping[str, np.dtype[np.generic]]):
     """The extras of a phase: a mapping of the names to their dtypes, which include the shapes.
 
     Args:
@@ -138,7 +139,7 @@ class Extras(Mapping[str, np.dtype[Any]]):
         self._where = where
         self._dtypes = {name: part.values[name] for part, _ in parts for name in part.names}
 
-    def __getitem__(self, name: str) -> np.dtype[Any]:
+    def __getitem__(self, name: str) -> np.dtype[np.generic]:
         return self._dtypes[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -167,7 +168,7 @@ class Extras(Mapping[str, np.dtype[Any]]):
             end = None if stop is None else chunks.first_from("step", stop)
             yield from (block for block in chunks.blocks(first, end) if len(block))
 
-    def of_episode(self, episode: int) -> dict[str, np.ma.MaskedArray[Any, Any]]:
+    def of_episode(self, episode: int) -> dict[str, MaskedArray]:
         """Return the extras along an episode by name, [T, *shape] each, masked where a step has none.
 
         They stand in the order of `Recording.episode_steps`.
@@ -177,7 +178,7 @@ class Extras(Mapping[str, np.dtype[Any]]):
         """
         return self.at(np.array(self._episode_span(episode)))
 
-    def at(self, steps: NDArray[np.int64]) -> dict[str, np.ma.MaskedArray[Any, Any]]:
+    def at(self, steps: NDArray[np.int64]) -> dict[str, MaskedArray]:
         """Return the extras of steps, given by their numbers, ascending; as `of_episode`.
 
         Raises:
@@ -208,7 +209,7 @@ def _column(flags: NDArray[np.bool_], dimensions: int) -> NDArray[np.bool_]:
     return flags.reshape(-1, *[1] * (dimensions - 1))
 
 
-def filled(values: np.ma.MaskedArray[Any, Any]) -> NDArray[Any]:
+def filled(values: MaskedArray) -> Array:
     """Return extras as a plain array: NaN where there is none, for which whole numbers become floats."""
     if not np.ma.is_masked(values):
         return np.asarray(values.data)

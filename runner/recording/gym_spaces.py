@@ -10,7 +10,7 @@ import string
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
 from gymnasium import spaces
@@ -18,12 +18,12 @@ from gymnasium import spaces
 from runner.environments.gym_types import Space
 from runner.errors import EnvironmentNotUsable
 from runner.recording.gym_json import registered, structure_of, text_of
-from runner.recording.spaces import MAX_VALUE_BYTES
+from runner.recording.spaces import MAX_VALUE_BYTES, Description
 from runner.util.jsonable import as_json
 from runner.util.values import is_text
 
-Description = Mapping[str, Any]
 Keys = tuple[str | int, ...]
+SpaceT = TypeVar("SpaceT", bound=Space)
 _MAX_TEXT: Final = 4096
 """Declared length of the values of spaces that have no length of their own."""
 _MAX_BOUNDS: Final = 64
@@ -36,9 +36,9 @@ class Part:
 
     keys: Keys
     """Keys of the `Dict`s and `Tuple`s around it, from the outermost in."""
-    dtype: np.dtype[Any] | None
+    dtype: np.dtype[np.generic] | None
     """The dtype of an array with its shape; None for values that are recorded as text."""
-    text: Callable[[Any], str] | None = None
+    text: Callable[[object], str] | None = None
     """Returns the text of a value; None for an array."""
 
     @property
@@ -83,13 +83,12 @@ def restore_space(description: Description) -> Space:
     return _BY_NAME[description["type"]].restore(description)
 
 
-def widened(space: Space, value: Any) -> Space:
+def widened(space: Space, value: object) -> Space:
     """Return an action space in whose dtypes an action, or a batch of actions, is exact.
 
     Only floating-point actions widen a space: whole numbers that it cannot hold are a mistake.
     """
-    wide: Space = _kind(space).widened(space, value)
-    return wide
+    return _kind(space).widened(space, value)
 
 
 def can_widen(space: Space) -> bool:
@@ -97,30 +96,30 @@ def can_widen(space: Space) -> bool:
     return _kind(space).can_widen(space)
 
 
-class _Kind:
+class _Kind(Generic[SpaceT]):
     """A space whose values have no layout; they are recorded as JSON text."""
 
-    def parts(self, space: Space, where: str, keys: Keys) -> Iterator[Part]:  # noqa: ARG002
+    def parts(self, space: SpaceT, where: str, keys: Keys) -> Iterator[Part]:  # noqa: ARG002
         yield Part(keys, None, partial(text_of, space))
 
-    def describe(self, space: Space) -> dict[str, object]:
+    def describe(self, space: SpaceT) -> dict[str, object]:
         return {"type": "Text", "max_length": _MAX_TEXT, **structure_of(space, describe_space)}
 
     def restore(self, description: Description) -> Space:
         raise KeyError(description["type"])
 
-    def widened(self, space: Any, value: Any) -> Any:  # noqa: ARG002
+    def widened(self, space: SpaceT, value: object) -> Space:  # noqa: ARG002
         return space
 
-    def can_widen(self, space: Space) -> bool:  # noqa: ARG002
+    def can_widen(self, space: SpaceT) -> bool:  # noqa: ARG002
         return False
 
 
-class _Text(_Kind):
-    def parts(self, space: Space, where: str, keys: Keys) -> Iterator[Part]:  # noqa: ARG002
+class _Text(_Kind[spaces.Text]):
+    def parts(self, space: spaces.Text, where: str, keys: Keys) -> Iterator[Part]:  # noqa: ARG002
         yield Part(keys, None, _checked_text)
 
-    def describe(self, space: Any) -> dict[str, Any]:
+    def describe(self, space: spaces.Text) -> dict[str, object]:
         return {"type": "Text", "max_length": int(space.max_length)}
 
     def restore(self, description: Description) -> Space:
@@ -134,8 +133,8 @@ def _checked_text(value: object) -> str:
     return value
 
 
-class _Dict(_Kind):
-    def parts(self, space: Any, where: str, keys: Keys) -> Iterator[Part]:
+class _Dict(_Kind[spaces.Dict]):
+    def parts(self, space: spaces.Dict, where: str, keys: Keys) -> Iterator[Part]:
         for key, part in space.spaces.items():
             if not is_text(str(key)):
                 raise EnvironmentNotUsable(
@@ -143,14 +142,14 @@ class _Dict(_Kind):
                 )
             yield from _kind(part).parts(part, where, (*keys, key))
 
-    def describe(self, space: Any) -> dict[str, Any]:
+    def describe(self, space: spaces.Dict) -> dict[str, object]:
         parts = {str(key): describe_space(part) for key, part in space.spaces.items()}
         return {"type": "Dict", "spaces": parts}
 
     def restore(self, description: Description) -> Space:
         return spaces.Dict({name: restore_space(part) for name, part in description["spaces"].items()})
 
-    def widened(self, space: Any, value: Any) -> Any:
+    def widened(self, space: spaces.Dict, value: object) -> Space:
         if not isinstance(value, Mapping):
             return space
         parts = {
@@ -159,37 +158,37 @@ class _Dict(_Kind):
         is_same = all(parts[key] is space.spaces[key] for key in parts)
         return space if is_same else spaces.Dict(parts)
 
-    def can_widen(self, space: Any) -> bool:
+    def can_widen(self, space: spaces.Dict) -> bool:
         return any(map(can_widen, space.spaces.values()))
 
 
-class _Tuple(_Kind):
-    def parts(self, space: Any, where: str, keys: Keys) -> Iterator[Part]:
+class _Tuple(_Kind["spaces.Tuple[Any]"]):
+    def parts(self, space: spaces.Tuple[Any], where: str, keys: Keys) -> Iterator[Part]:
         for i, part in enumerate(space.spaces):
             yield from _kind(part).parts(part, where, (*keys, i))
 
-    def describe(self, space: Any) -> dict[str, Any]:
+    def describe(self, space: spaces.Tuple[Any]) -> dict[str, object]:
         return {"type": "Tuple", "spaces": [describe_space(part) for part in space.spaces]}
 
     def restore(self, description: Description) -> Space:
         return spaces.Tuple([restore_space(part) for part in description["spaces"]])
 
-    def widened(self, space: Any, value: Any) -> Any:
+    def widened(self, space: spaces.Tuple[Any], value: object) -> Space:
         if not isinstance(value, Sequence):
             return space
         parts = tuple(widened(part, own) for part, own in zip(space.spaces, value, strict=False))
         return space if all(map(lambda a, b: a is b, parts, space.spaces)) else spaces.Tuple(parts)
 
-    def can_widen(self, space: Any) -> bool:
+    def can_widen(self, space: spaces.Tuple[Any]) -> bool:
         return any(map(can_widen, space.spaces))
 
 
-class _Box(_Kind):
+class _Box(_Kind[SpaceT]):
     """A box, and any space of another library whose values are arrays of one shape and dtype."""
 
     name = "Box"
 
-    def parts(self, space: Space, where: str, keys: Keys) -> Iterator[Part]:
+    def parts(self, space: SpaceT, where: str, keys: Keys) -> Iterator[Part]:
         dtype = np.dtype(space.dtype)
         if dtype.kind not in "biuf" or dtype.itemsize > 8:
             raise EnvironmentNotUsable(
@@ -197,12 +196,12 @@ class _Box(_Kind):
             )
         yield Part(keys, np.dtype((dtype.newbyteorder("<"), space.shape or ())))
 
-    def describe(self, space: Any) -> dict[str, Any]:
+    def describe(self, space: SpaceT) -> dict[str, object]:
         dtype = np.dtype(space.dtype).newbyteorder("<").str
         shape = [int(n) for n in space.shape or ()]
         return {"type": self.name, "dtype": dtype, "shape": shape, **self.details(space)}
 
-    def details(self, space: Any) -> dict[str, Any]:
+    def details(self, space: SpaceT) -> dict[str, object]:
         return {name: _bound(getattr(space, name, None)) for name in ("low", "high")}
 
     def restore(self, description: Description) -> Space:
@@ -217,45 +216,45 @@ class _Box(_Kind):
         )
         return spaces.Box(low, high, shape, dtype.type)
 
-    def widened(self, space: Any, value: Any) -> Any:
+    def widened(self, space: SpaceT, value: object) -> Space:
         try:
             found = np.asarray(value).dtype
         except (TypeError, ValueError):
             return space
-        if not self.can_widen(space) or found.kind != "f" or found.itemsize > 8:
+        if not isinstance(space, spaces.Box) or found.kind != "f" or found.itemsize > 8:
             return space
         if np.can_cast(found, space.dtype):
             return space
         return spaces.Box(space.low.astype(found), space.high.astype(found), dtype=found.type)
 
-    def can_widen(self, space: object) -> bool:
+    def can_widen(self, space: SpaceT) -> bool:
         return isinstance(space, spaces.Box) and not np.can_cast(np.float64, space.dtype)
 
 
-class _Discrete(_Box):
+class _Discrete(_Box[spaces.Discrete]):
     name = "Discrete"
 
-    def details(self, space: Any) -> dict[str, Any]:
+    def details(self, space: spaces.Discrete) -> dict[str, object]:
         return {"n": int(space.n), "start": int(space.start)}
 
     def restore(self, description: Description) -> Space:
         return spaces.Discrete(int(description["n"]), start=int(description["start"]))
 
 
-class _MultiDiscrete(_Box):
+class _MultiDiscrete(_Box[spaces.MultiDiscrete]):
     name = "MultiDiscrete"
 
-    def details(self, space: Any) -> dict[str, Any]:
+    def details(self, space: spaces.MultiDiscrete) -> dict[str, object]:
         return {"nvec": np.asarray(space.nvec).tolist()}
 
     def restore(self, description: Description) -> Space:
         return spaces.MultiDiscrete(np.array(description["nvec"]), dtype=_dtype(description).type)
 
 
-class _MultiBinary(_Box):
+class _MultiBinary(_Box[spaces.MultiBinary]):
     name = "MultiBinary"
 
-    def details(self, space: Any) -> dict[str, Any]:  # noqa: ARG002
+    def details(self, space: spaces.MultiBinary) -> dict[str, object]:  # noqa: ARG002
         return {}
 
     def restore(self, description: Description) -> Space:
@@ -263,8 +262,8 @@ class _MultiBinary(_Box):
         return spaces.MultiBinary(shape[0] if len(shape) == 1 else shape)
 
 
-_JSON: Final = _Kind()
-_KINDS: Final[dict[type[Space], _Kind]] = {
+_JSON: Final = _Kind[Space]()
+_KINDS: Final[dict[type[Space], _Kind[Any]]] = {
     spaces.Dict: _Dict(),
     spaces.Tuple: _Tuple(),
     spaces.Text: _Text(),
@@ -274,12 +273,12 @@ _KINDS: Final[dict[type[Space], _Kind]] = {
     spaces.Discrete: _Discrete(),
     spaces.MultiDiscrete: _MultiDiscrete(),
     spaces.MultiBinary: _MultiBinary(),
-    spaces.Box: _Box(),
+    spaces.Box: _Box[Space](),
 }
 _BY_NAME: Final = {kind.__name__: own for kind, own in _KINDS.items()}
 
 
-def _kind(space: Space) -> _Kind:
+def _kind(space: Space) -> _Kind[Any]:
     if registered(space) is not None:
         return _JSON
     for kind, own in _KINDS.items():

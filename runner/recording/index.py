@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import Any, BinaryIO, Final, NamedTuple, TypeVar
+from typing import BinaryIO, Final, NamedTuple, TypeVar
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -27,13 +27,13 @@ from mcap.records import (
     Statistics,
 )
 from mcap.writer import MCAP0_MAGIC
-from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
 from runner.recording.chunks import CHUNK_HEAD, MAX_CHUNK_BYTES
 from runner.recording.records import IN_DATA, MAX_NAME_BYTES, MAX_NAMED, check_unpacked_size, record_heads
 from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, TOPIC_OF
+from runner.util.arrays import Records
 
 K = TypeVar("K")
 T = TypeVar("T")
@@ -118,7 +118,7 @@ class ChunkTable:
         self._packed[-_ENTRY.size :] = _ENTRY.pack(*last._replace(channel=channel))
 
     @property
-    def columns(self) -> NDArray[Any]:
+    def columns(self) -> Records:
         """All chunks as a structured array with the fields of `ChunkEntry`: a view."""
         return np.frombuffer(self._packed, _ENTRY_COLUMNS)
 

@@ -20,6 +20,7 @@ from runner.recording import schema
 from runner.recording.blocks import varint
 from runner.recording.schema import LOG_LEVELS, STEP_NANOSECONDS, MessageType
 from runner.recording.spaces import NUMBERS
+from runner.util.arrays import Array
 
 
 @cache
@@ -201,7 +202,7 @@ class Snapshot:
     phase: str
     step: int
     episode: int
-    values: NDArray[Any]
+    values: Array
 
 
 def decode_array(payload: bytes) -> Snapshot:

@@ -10,8 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Final
 
-from numpy.typing import NDArray
-
 from runner.environments.mdp import MAX_AGENTS, MAX_ARRAYS_BYTES, MAX_EVENTS, Mdp, from_parts
 from runner.errors import RecordingError
 from runner.recording import schema
@@ -23,6 +21,7 @@ from runner.recording.records import MAX_METADATA_BYTES
 from runner.recording.schema import Topic
 from runner.recording.spaces import dtype_of, leaves_of
 from runner.recording.writer import RecordingFile, storage_error
+from runner.util.arrays import Array
 from runner.util.values import MAX_JSON_DEPTH, is_too_deep, is_whole, without_surrogates
 
 REQUIRED_RECORDS: Final = frozenset({"run", "config", "provenance"})
@@ -204,9 +203,7 @@ def lost_ranges(repair: Mapping[str, object], path: str) -> dict[str, list[list[
 # --- the environment ----------------------------------------------------------------------------------
 
 
-def environment_attachments(
-    description: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
-) -> Attachments:
+def environment_attachments(description: Mapping[str, Any], arrays: Mapping[str, Array]) -> Attachments:
     """Return the attachments that describe an environment: its description, and its arrays if it has any."""
     text = _indented(json.dumps({**description, "arrays": sorted(arrays)}, sort_keys=True))
     return {"environment.json": ("application/json", text.encode())} | {
@@ -252,7 +249,7 @@ def environment_of(description: Mapping[str, Any], attachment: Callable[[str], b
             f"{path}: has no transition table of {description.get('env_id')}, which is not tabular: it was "
             "recorded from a loop over it; `dualtaxi view` shows what was recorded."
         )
-    arrays: dict[str, NDArray[Any]] = {}
+    arrays: dict[str, Array] = {}
     for name in description["arrays"]:
         data = attachment(f"environment/{name}.npy.zst")
         budget = MAX_ARRAYS_BYTES - sum(array.nbytes for array in arrays.values())

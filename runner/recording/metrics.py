@@ -11,8 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from runner.util.arrays import Records
+
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    import numpy as np
+from numpy.typing import NDArray
 
 Better = Literal["higher", "lower", "lower_to_goal", None]
 """Which values are better; `lower_to_goal` only where episodes have a goal, None where nobody can say."""
@@ -49,7 +52,7 @@ class EvaluationMetric(Metric):
     """What the environment must define for the metric to be known."""
     lowest: float = -math.inf
     highest: float = math.inf
-    of_trials: Callable[[NDArray[Any]], NDArray[Any]]
+    of_trials: Callable[[Records], NDArray[Any]]
     """Returns the value of each trial, [trials] or [trials, agents], from its `Episode` records."""
 
     @property
@@ -164,12 +167,12 @@ def defined_metrics(has_success: bool, has_penalties: bool) -> tuple[EvaluationM
     return tuple(metric for metric in METRICS if defined[metric.requires])
 
 
-def is_usable(values: NDArray[Any]) -> NDArray[Any]:
+def is_usable(values: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which values are finite and small enough that sums of them stay finite."""
     return abs(values) <= LARGEST  # false for NaN
 
 
-def finite_mean(values: NDArray[Any]) -> float | None:
+def finite_mean(values: NDArray[np.float64]) -> float | None:
     """Return the mean of the values that are finite and no larger than `LARGEST`; None without any."""
     usable = is_usable(values)
     return float(values[usable].mean()) if usable.any() else None

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from runner.recording.pipeline import MessageBatches, Pipeline
 from runner.recording.reference import Reference
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
+from runner.util.arrays import Records
 from runner.util.packing import Packing
 
 FLUSH_SECONDS: Final = 0.5
@@ -325,7 +326,7 @@ class Recorder:
         """
         lane, block = self._lanes[topic], self._open(topic)
         known = self._reference.remaining(topic) > 0
-        fresh: Any = block.records[block.filled : block.filled + len(positions)]
+        fresh: Records = block.records[block.filled : block.filled + len(positions)]
         times = positions * np.uint64(STEP_NANOSECONDS)
         fresh["log_time"] = times
         fresh["publish_time"] = times

@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import Any, BinaryIO, Final, NamedTuple
+from typing import BinaryIO, Final, NamedTuple
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -183,7 +183,7 @@ def _checked_messages(records: bytes, where: str) -> tuple[int, NDArray[np.uint6
             raise RecordingError(f"{where}: its messages differ in size")
         block = np.frombuffer(records, np.dtype([*HEADER, ("data", "u1", (size - HEADER_BYTES,))]))
         offsets = np.arange(len(block), dtype=np.uint64) * np.uint64(size)
-        lengths: Any = length
+        lengths: int | NDArray[np.uint64] = length
     else:
         starts, at = [], 0
         while at + HEADER_BYTES <= len(records):

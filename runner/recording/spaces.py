@@ -34,6 +34,9 @@ NUMBERS: Final = re.compile(r"(?:\|[biu]1|<[iu][248]|<f[248])")
 _ARRAYS: Final = ("Box", "Discrete", "MultiBinary", "MultiDiscrete")
 _LENGTH: Final = struct.Struct("<I")
 
+Description = Mapping[str, Any]
+"""A space as JSON."""
+
 
 @dataclass(frozen=True)
 class Leaf:
@@ -41,7 +44,7 @@ class Leaf:
 
     path: tuple[str, ...]
     """Keys of `Dict`s and numbers of `Tuple`s, from the outermost in."""
-    dtype: np.dtype[Any] | None
+    dtype: np.dtype[np.generic] | None
     """Of its value, its shape included; None for a text."""
 
 
@@ -63,7 +66,7 @@ def leaves_of(description: object, where: str) -> list[Leaf]:
     return leaves
 
 
-def dtype_of(description: Any, where: str) -> np.dtype[Any] | None:
+def dtype_of(description: Any, where: str) -> np.dtype[np.generic] | None:
     """Return the dtype of a space's values, `Dict` and `Tuple` as fields; None if their size varies.
 
     Raises:
@@ -74,7 +77,7 @@ def dtype_of(description: Any, where: str) -> np.dtype[Any] | None:
     return _dtype(description)
 
 
-def decode(description: Mapping[str, Any], data: bytes, where: str) -> Any:
+def decode(description: Description, data: bytes, where: str) -> Any:
     """Return the value that stands in these bytes: dictionaries, tuples, texts and arrays.
 
     Raises:
@@ -95,7 +98,7 @@ def encode_text(text: str) -> bytes:
     return _LENGTH.pack(len(encoded)) + encoded
 
 
-def _parts(description: Mapping[str, Any]) -> list[tuple[str, Any]] | None:
+def _parts(description: Description) -> list[tuple[str, Description]] | None:
     """Return the parts of a `Dict` or `Tuple` by name; None for a leaf."""
     kind = description["type"]
     if kind == "Dict":
@@ -132,7 +135,7 @@ def _leaf_dtype(description: Mapping[str, object]) -> np.dtype[np.generic] | Non
     return np.dtype((dtype, tuple(shape)))
 
 
-def _dtype(description: Mapping[str, Any]) -> np.dtype[Any]:
+def _dtype(description: Description) -> np.dtype[np.generic]:
     parts = _parts(description)
     if parts is None:
         leaf = _leaf_dtype(description)
@@ -141,7 +144,7 @@ def _dtype(description: Mapping[str, Any]) -> np.dtype[Any]:
     return np.dtype([(name, _dtype(part)) for name, part in parts])
 
 
-def _value(description: Mapping[str, Any], data: bytes, at: int) -> tuple[Any, int]:
+def _value(description: Description, data: bytes, at: int) -> tuple[Any, int]:
     """Return the value at an offset, and the offset behind it."""
     parts = _parts(description)
     if parts is not None:

@@ -7,3 +7,5 @@ Array = NDArray[np.generic]
 """An array whose element type is known only at run time, such as a column of a recording."""
 Records = NDArray[np.void]
 """Structured records, such as messages of one topic."""
+MaskedArray = np.ma.MaskedArray[tuple[int, ...], np.dtype[np.generic]]
+"""The same with values missing."""
