@@ -34,7 +34,7 @@ from runner.recording.recorder import BLOCK_BYTES, capacity_of
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
 from runner.replay.snapshots import DerivedTables, SnapshotVisitor
-from runner.replay.tables import StepReplay
+from runner.replay.step_replay import StepReplay
 from runner.util.files import storage_errors
 from runner.util.packing import Packing
 

@@ -28,7 +28,7 @@ from runner.recording import schema
 from runner.recording.messages import decode_q_table, encode_q_table
 from runner.recording.reader import Recording
 from runner.replay.snapshots import DerivedTables, SnapshotVisitor
-from runner.replay.tables import StepReplay
+from runner.replay.step_replay import StepReplay
 from runner.runs.checkpoints import read_checkpoints
 
 ROWS_A_GROUP: Final = 1 << 18

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.learning.learner import held_of
-from runner.replay.tables import StepReplay
+from runner.replay.step_replay import StepReplay
 
 
 class DerivedTables:

@@ -17,7 +17,8 @@ from runner.environments.mdp import Mdp
 from runner.export.rerun.scene import Placements
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
-from runner.replay.tables import StateProbe, TableReplay, known_steps
+from runner.replay.step_replay import StateProbe
+from runner.replay.tables import TableReplay, known_steps
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,9 +40,9 @@ def applied(monkeypatch):
     counts = []
     original = tables.StepReplay.apply
 
-    def apply(self, steps, *rest):
+    def apply(self, steps, *rest, **named):
         counts.append(len(steps))
-        original(self, steps, *rest)
+        original(self, steps, *rest, **named)
 
     monkeypatch.setattr(tables.StepReplay, "apply", apply)
     return counts

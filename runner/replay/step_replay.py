@@ -1,0 +1,215 @@
+"""The tables of a run's learners, moved forward by its training steps.
+
+Every replay of recorded steps goes through `StepReplay`. It checks the steps first, because the compiled
+kernel indexes its arrays by what they say, without any check of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.config import from_mapping
+from runner.environments.mdp import Mdp
+from runner.errors import RecordingError
+from runner.learning import kernel
+from runner.learning.learner import Held, Learner
+from runner.learning.watching import Changes, Watch, begin, empty_changes, joined, replay_watched
+from runner.replay.steps import check_steps
+from runner.util.arrays import Array
+
+NO_ROWS: Final = np.empty((0, 0, 0))
+
+
+class StateProbe(NamedTuple):
+    """Values and greedy actions of some states, read before some of the steps of a block."""
+
+    before: NDArray[np.int64]
+    """[k]: rows of the block, ascending."""
+    states: NDArray[np.int32]
+    """[k, n]: the states that are read before each of these rows; -1 for none."""
+    value: NDArray[np.float32]
+    """[k, learners, n]: filled with the highest value of each state; nan for none."""
+    greedy: NDArray[np.int32]
+    """[k, learners, n]: filled with the greedy action in each state; -1 for none."""
+
+    def between(self, start: int, stop: int) -> StateProbe:
+        """Return the part of the probe for rows `start` to `stop` of the block, as a block of their own."""
+        part = slice(*np.searchsorted(self.before, (start, stop)))
+        return StateProbe(self.before[part] - start, self.states[part], self.value[part], self.greedy[part])
+
+
+class Trace(NamedTuple):
+    """What decides the weights of one learner's updates, see `learning.ledger`."""
+
+    updates: NDArray[np.void]
+    """[steps] of `UPDATE`: filled."""
+    learner: int
+
+
+class StepReplay:
+    """The tables of a run's learners, moved forward by its training steps in order.
+
+    Args:
+        config: the run's resolved configuration, as its recording holds it.
+        mdp: its environment.
+        seed: the seed of its job.
+        where: the recording or archive that the steps are from, for errors.
+    """
+
+    def __init__(self, config: Mapping[str, object], mdp: Mdp, seed: int, where: str) -> None:
+        self._mdp = mdp
+        self._where = where
+        self._learner = Learner(from_mapping(config), mdp, seed)
+        self.step = 0
+        """Training steps that the tables have learned from."""
+
+    @property
+    def learner(self) -> Learner:
+        """The learner with the tables at `step`."""
+        return self._learner
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """The names of the learners."""
+        return self._learner.agents
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The names of what each learner holds, in the order of a snapshot."""
+        return self._learner.kinds
+
+    @property
+    def tables(self) -> list[NDArray[np.float64]]:
+        """The Q-tables at `step`, [states, actions] per learner: views that `apply` changes."""
+        return [self._learner.table(i) for i in range(len(self.agents))]
+
+    @property
+    def held(self) -> list[Held]:
+        """All tables of each learner at `step`, by name: views that `apply` changes; `q` is its Q-table."""
+        return [self._learner.held(i) for i in range(len(self.agents))]
+
+    @property
+    def own_actions(self) -> NDArray[np.int32]:
+        """Each learner's part of a joint action, [joint actions, learners]."""
+        return self._learner.model.own_action
+
+    @property
+    def greedy(self) -> NDArray[np.int32]:
+        """The greedy actions at `step`, [learners, states]: the lowest of the best ones."""
+        return self._learner.tables.greedy
+
+    def snapshot(self) -> list[NDArray[np.float64]]:
+        """Return all tables in the order of a snapshot, those of one kind together: views."""
+        return self._learner.snapshot()
+
+    def rewind(self, step: int, held: list[Held]) -> None:
+        """Set all tables to those of a step."""
+        self._learner.set_held(held)
+        self.step = step
+
+    def empty_rows(self, count: int) -> NDArray[np.float64]:
+        """Return an array for the values seen in `count` steps: nan, [count, learners, most actions]."""
+        widths = self._learner.model.width
+        return np.full((count, len(widths), max(widths)), np.nan)
+
+    def apply(
+        self,
+        steps: NDArray[np.void],
+        rows: NDArray[np.float64] = NO_ROWS,
+        probe: StateProbe | None = None,
+        trace: Trace | None = None,
+    ) -> None:
+        """Apply the updates of the training steps that follow.
+
+        Args:
+            steps: a block of records; the first is step number `self.step`.
+            rows: filled with each learner's values of a step's state before its update, [steps, learners,
+                most actions]; empty if they are not needed.
+            probe: states to look at on the way.
+            trace: filled with what decides the weights of the updates; not together with `probe`.
+
+        Raises:
+            RecordingError: steps are missing, or the environment cannot have such steps.
+        """
+        if probe is not None:
+            _check_probe(probe, self._mdp)
+        for state, part in self._segments(steps):
+            records = steps[part].view(np.recarray)
+            if trace is not None:
+                kernel.replay(*state, records, rows[part], trace.updates[part], trace.learner)
+            elif probe is None:
+                kernel.replay(*state, records, rows[part])
+            else:
+                kernel.replay_probed(*state, records, rows[part], *probe.between(part.start, part.stop))
+
+    def begin_watch(self, watch: Watch) -> Changes:
+        """Follow the greedy paths of `watch`, and return the watched values as they are now, as one row."""
+        changes = empty_changes(watch, 1)
+        begin(self._learner.model, self._learner.tables, watch, changes)
+        return changes
+
+    def watch(self, steps: NDArray[np.void], watch: Watch) -> Changes:
+        """Apply updates as `apply` does, and return the watched values after each that could change them.
+
+        Args:
+            steps: as for `apply`.
+            watch: `begin_watch` was called with it at `step`, or this method for the steps before.
+        """
+        found = [(empty_changes(watch, 0), 0)]
+        for state, part in self._segments(steps):
+            changes = empty_changes(watch, part.stop - part.start)
+            filled = replay_watched(*state, steps[part].view(np.recarray), NO_ROWS, watch, changes)
+            changes.row[:filled] += part.start
+            found.append((changes, filled))
+        return joined(found)
+
+    def _segments(self, steps: NDArray[np.void]) -> Iterator[tuple[tuple[Any, ...], slice]]:
+        """Yield the kernel's arguments for the parts of a block in order, and move forward after each."""
+        if not len(steps):
+            return
+        first, last = int(steps["step"][0]), int(steps["step"][-1])
+        if first > self.step:
+            raise self._lost(first)
+        if first < self.step or last != first + len(steps) - 1:
+            raise RecordingError(
+                f"{self._where}: found training steps {first} to {last} in a block of {len(steps)}, expected "
+                f"those from {self.step} on; `dualtaxi verify` checks the whole recording."
+            )
+        check_steps(steps, self._mdp, self._where)
+        at = 0
+        while at < len(steps):
+            segment = self._learner.segment_at(self.step)
+            stop = min(len(steps), at + segment.stop - self.step)
+            state = (self._learner.seed, self._learner.model, self._learner.tables, segment.rules)
+            yield state, slice(at, stop)
+            self.step += stop - at
+            at = stop
+
+    def values_in(self, states: Array) -> NDArray[np.float64]:
+        """Return each learner's values in these states now, [states, learners, most actions]."""
+        rows = self.empty_rows(len(states))
+        for i, table in enumerate(self.tables):
+            rows[:, i, : table.shape[1]] = table[states]
+        return rows
+
+    def read(self, probe: StateProbe) -> None:
+        """Fill a probe with the values and greedy actions as they are now, for all of its rows."""
+        _check_probe(probe, self._mdp)
+        for k in range(len(probe.states)):
+            kernel.read_states(self._learner.tables, probe.states[k], probe.value[k], probe.greedy[k])
+
+    def _lost(self, found: int) -> RecordingError:
+        return RecordingError(
+            f"{self._where}: training steps {self.step} to {found - 1} were lost, so the Q-tables after them "
+            "are unknown until the next snapshot; `dualtaxi resume` trains the run again."
+        )
+
+
+def _check_probe(probe: StateProbe, mdp: Mdp) -> None:
+    """Refuse states that the tables do not have: compiled code would read outside of them."""
+    if probe.states.size and not -1 <= probe.states.min() <= probe.states.max() < mdp.states:
+        raise IndexError(f"found states up to {probe.states.max()}, expected less than {mdp.states}.")
