@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from runner.config import ExperimentConfig
     from runner.debugging.what_if import what_if
     from runner.debugging.when import when
+    from runner.debugging.why import why
     from runner.errors import RunnerError
     from runner.execution.rerecord import evaluate, rerecord
     from runner.execution.resume import resume
@@ -67,6 +68,7 @@ __all__ = [
     "verify",
     "what_if",
     "when",
+    "why",
 ]
 
 _HOME = {
@@ -91,6 +93,7 @@ _HOME = {
     "run": "runner.api",
     "run_all": "runner.api",
     "verify": "runner.execution.verify",
+    "why": "runner.debugging.why",
     "what_if": "runner.debugging.what_if",
     "when": "runner.debugging.when",
 }

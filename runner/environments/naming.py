@@ -86,6 +86,15 @@ def agent_of(mdp: Mdp, name: str) -> int:
     return known[name]
 
 
+def state_of(mdp: Mdp, text: str) -> int:
+    """Return a state from its name, such as `taxi 1 (0,0), passenger at B`, or its number.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    return _numbered(text, [str(name) for name in states_in_words(mdp)], "a state", 1)
+
+
 def own_action(mdp: Mdp, agent: int, text: str) -> int:
     """Return an agent's action from its name or its number.
 
@@ -105,16 +114,16 @@ def joint_action(mdp: Mdp, text: str) -> int:
     return _numbered(text, [str(name) for name in actions_in_words(mdp)], "a joint action")
 
 
-def _numbered(text: str, names: list[str], what: str) -> int:
-    """Return the number that a text is, or that it names."""
+def _numbered(text: str, names: list[str], what: str, listed: int = MAX_LISTED) -> int:
+    """Return the number that a text is, or that it names; an error lists some names."""
     if text.isascii() and text.isdecimal() and int(text[:12]) < len(names):
         return int(text)
-    wanted = spoken(text.strip())
+    wanted = " + ".join(part.strip() for part in spoken(text).split("+"))
     if wanted in names:
         return names.index(wanted)
-    listed = ", ".join(names[:MAX_LISTED]) + (", ..." if len(names) > MAX_LISTED else "")
+    examples = "; ".join(names[:listed]) + ("; ..." if len(names) > listed else "")
     raise ConfigError(
-        f"found {text[:60]!r}, expected {what}: {listed}; or a number from 0 to {len(names) - 1}."
+        f"found {text[:60]!r}, expected {what}: {examples}; or a number from 0 to {len(names) - 1}."
         f"{nearest(wanted, names)}"
     )
 

@@ -32,6 +32,9 @@ from runner.learning.schedules import schedule_value
 UPDATE: Final = np.dtype([("outcome", "<u4"), ("bootstrapped", "<i4"), ("episode", "<i8"), ("second", "?")])
 """What decides the weights of a learner's update: the outcome of the step, as an index of `Model.next_state`,
 its episode, and what `algorithms.learn` returns."""
+SHARE: Final = np.dtype([("step", "<i8"), ("weight", "<f8"), ("distance", "<f8"), ("contribution", "<f8")])
+"""A step and the weight of its reward; how many steps lie between the states of the Q-value and of the step,
+on average over the ways by which the reward came; and what the reward adds to the Q-value."""
 UNKNOWN_OUTCOME: Final = 2**32 - 1
 """The outcome of a step that the environment cannot have."""
 
@@ -80,8 +83,7 @@ def spread(
     updates: NDArray[np.void],
     ledger: Ledger,
     stretch: int,
-    weights: NDArray[np.float64],
-    distances: NDArray[np.float64],
+    shares: NDArray[np.void],
 ) -> None:
     """Spread the weights of learner i's values over the updates of a block, from the last to the first.
 
@@ -93,8 +95,7 @@ def spread(
         updates: of the steps, [N].
         ledger: as it is after these steps; it is moved to before them.
         stretch: episodes of a stretch.
-        weights: [N], filled with the weight of each step's reward.
-        distances: [N], filled with its distance, where it has a weight.
+        shares: [N] of `SHARE`, 0 but for `step`; filled where a step's reward has a weight.
     """
     algorithm = len(rules.algorithm)
     width = model.width[i]
@@ -110,7 +111,6 @@ def spread(
             learned, other = (SECOND, FIRST) if update.second else (FIRST, SECOND)
         weight = ledger.weights[learned, cell]
         if weight == 0.0:
-            weights[k] = 0.0
             continue
         distance = ledger.distances[learned, cell]
         episode, step = update.episode, first + k
@@ -120,12 +120,13 @@ def spread(
             rate = schedule_value(rules.step_size, episode, step)
 
         # The reward.
-        reward = model.rewards[model.outcome_class[update.outcome], i]
-        weights[k] = weight * rate
-        distances[k] = distance / weight
-        ledger.outcomes[update.outcome] += weights[k]
-        ledger.episodes[episode // stretch, 0] += weights[k]
-        ledger.episodes[episode // stretch, 1] += weights[k] * reward
+        share = shares[k]
+        share.weight = weight * rate
+        share.distance = distance / weight
+        share.contribution = share.weight * model.rewards[model.outcome_class[update.outcome], i]
+        ledger.outcomes[update.outcome] += share.weight
+        ledger.episodes[episode // stretch, 0] += share.weight
+        ledger.episodes[episode // stretch, 1] += share.contribution
 
         # The old value, and the values of the next state.
         ledger.weights[learned, cell] = weight * (1.0 - rate)

@@ -28,7 +28,7 @@ def updates_of(config, mdp, steps, i):
 
 
 def spread(learner, updates, i, state, action, block):
-    """Return the weights of all steps in a Q-value, their distances, and the ledger before the first step."""
+    """Return the shares of all steps in a Q-value, and the ledger before the first step."""
     cells = learner.table(i).size
     tables = 2 if "q_2" in learner.kinds else 1
     found = ledger.Ledger(
@@ -38,14 +38,11 @@ def spread(learner, updates, i, state, action, block):
         np.zeros((len(updates), 2)),
     )
     found.weights[:, state * learner.model.width[i] + action] = 1 / tables
-    weights, distances = np.zeros(len(updates)), np.zeros(len(updates))
+    shares = np.zeros(len(updates), ledger.SHARE)
     for first in reversed(range(0, len(updates), block)):
         part = slice(first, first + block)
-        ledger.spread(
-            *(learner.model, learner.rules, i, first, updates[part], found, 1),
-            *(weights[part], distances[part]),
-        )
-    return weights, distances, found
+        ledger.spread(learner.model, learner.rules, i, first, updates[part], found, 1, shares[part])
+    return shares, found
 
 
 @pytest.mark.parametrize("rules", LEARNING)
@@ -59,8 +56,8 @@ def test_the_weights_are_those_that_plain_python_follows_forwards(rules):
         for state, action in {(step.state, twin._own(step.action)[i]) for step in twin.training.steps[-9:]}:
             expected = twin.tables[i][state][action]
             assert learner.table(i)[state, action] == expected.value
-            weights, _, found = spread(learner, updates, i, state, action, block=77)
-            named = {("step", number): weight for number, weight in enumerate(weights)}
+            shares, found = spread(learner, updates, i, state, action, block=77)
+            named = {("step", number): weight for number, weight in enumerate(shares["weight"])}
             width = learner.model.width[i]
             for table, cells in enumerate(found.weights):
                 named |= {("initial", table, *divmod(k, width)): weight for k, weight in enumerate(cells)}
@@ -74,11 +71,12 @@ def test_the_weights_by_outcome_and_by_episode_are_sums_over_the_steps():
     steps = train(Learner(config, mdp, 2), 10**6, STEPS, block=1000).steps
     learner, updates = updates_of(config, mdp, steps, 0)
     last = steps[-1]
-    weights, _, found = spread(learner, updates, 0, int(last["state"]), int(last["action"]), block=1000)
-    rewards = steps["rewards"][:, 0]
+    shares, found = spread(learner, updates, 0, int(last["state"]), int(last["action"]), block=1000)
+    weights, contributions = shares["weight"], shares["contribution"]
+    assert contributions == pytest.approx(weights * steps["rewards"][:, 0])
     for episode in np.unique(steps["episode"]):
         own = steps["episode"] == episode
-        expected = weights[own].sum(), (weights[own] * rewards[own]).sum()
+        expected = weights[own].sum(), contributions[own].sum()
         assert found.episodes[episode] == pytest.approx(expected)
     for outcome in np.unique(updates["outcome"]):
         assert found.outcomes[outcome] == pytest.approx(weights[updates["outcome"] == outcome].sum())
@@ -91,11 +89,11 @@ def test_distances_count_the_steps_between():
     config, mdp = experiment(corridor)
     steps = train(Learner(config, mdp, 3), 10**6, 300, block=1000).steps
     learner, updates = updates_of(config, mdp, steps, 0)
-    weights, distances, _ = spread(learner, updates, 0, 0, 1, block=1000)
-    counted = weights > 0
-    assert counted.any()
-    # With full steps a value is one chain of bootstraps, so its discounted weights tell its distances.
-    assert weights[counted] == pytest.approx(0.95 ** distances[counted])
+    shares, _ = spread(learner, updates, 0, 0, 1, block=1000)
+    counted = shares[shares["weight"] > 0]
+    assert len(counted)
+    # With full steps a value is one chain of bootstraps, whose discounted weights have their distances.
+    assert counted["weight"] == pytest.approx(0.95 ** counted["distance"])
 
 
 def test_a_step_that_the_environment_cannot_have_is_marked():

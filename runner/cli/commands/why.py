@@ -1,0 +1,76 @@
+"""`dualtaxi why`: the rewards and initial values that a Q-value is the sum of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from runner.cli import Command
+from runner.cli.options import STEP, json_option, recordings_option, run_argument
+from runner.cli.output import draw, facts, print_json, print_sections
+from runner.cli.progress import steps_line
+from runner.cli.runs import command_for, compilation_notice, find_recorded
+
+if TYPE_CHECKING:
+    from runner.analysis.step_reference import StepRef
+
+
+@click.command("why", cls=Command)
+@run_argument
+@click.option("--state", metavar="S", help="The state, by number or name.  [default: that of --at]")
+@click.option("--action", metavar="A", help="The action, by number or name.  [default: that of --at]")
+@click.option("--agent", metavar="NAME", help="Whose Q-table, where each agent has its own.")
+@click.option(
+    "--at",
+    type=STEP,
+    metavar="STEP",
+    help="Explain the value before this step: EPISODE:T, or eval:N:TRIAL:T.  [default: after all training]",
+)
+@click.option(
+    "--limit",
+    type=click.IntRange(1, 1000),
+    default=10,
+    show_default=True,
+    metavar="N",
+    help="Number of steps to list.",
+)
+@recordings_option
+@json_option
+def why_command(
+    run_name: str,
+    state: str | None,
+    action: str | None,
+    agent: str | None,
+    at: StepRef | None,
+    limit: int,
+    recordings: Path | None,
+    as_json: bool,
+) -> None:
+    """Show where a Q-value of RUN comes from: the recorded rewards and initial values that it is the sum of.
+
+    Each update is linear in the tables once its greedy action is known, so a value is exactly a weighted sum
+    of the rewards before it and of the initial values. It is listed by reward, by episode, and by the steps
+    that add or take most. This is a decomposition along the path that training took, not a counterfactual:
+    `dualtaxi branch` shows what would have happened otherwise. In Python: runner.why().
+
+    Examples:
+      dualtaxi why @latest --state 300 --action north+south
+      dualtaxi why rivals --state 300 --action pickup --agent taxi_2 --at 2000:0
+      dualtaxi why k3v9m2xq --at eval:3000:7:5 --limit 30
+    """
+    from runner.debugging.why import why
+    from runner.debugging.why_text import facts_of, sections_of
+
+    run = find_recorded(run_name, recordings)
+    with compilation_notice(), steps_line("reading") as report:
+        found = why(run, state=state, action=action, agent=agent, at=at, limit=limit, report=report)
+    if as_json:
+        print_json(found.as_json())
+        return
+    rows = facts_of(found)
+    if found.steps:
+        rows["next"] = command_for(run, "view", "--at", found.steps[0].at)
+    draw(facts(rows))
+    print_sections(sections_of(found), as_markdown=False)

@@ -1,0 +1,155 @@
+"""The weights of one Q-value of a run: how much of each recorded reward and each initial value it has.
+
+The recorded steps are replayed once, and what decides the weights of each update goes into a temporary file.
+That file is then read from its end, which gives the weights: see `learning.ledger`. So memory does not grow
+with the run.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import RecordingError
+from runner.learning.ledger import SHARE, UPDATE, Ledger, spread
+from runner.recording.reader import Recording
+from runner.replay.tables import TableReplay
+from runner.util.files import storage_errors
+
+STRETCHES: Final = 20
+"""The most stretches of equally many episodes by which weights are counted."""
+STEPS_AT_ONCE: Final = 1 << 18
+
+
+class Cell(NamedTuple):
+    """The place of a Q-value."""
+
+    learner: int
+    state: int
+    action: int
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """The weights of a Q-value."""
+
+    value: float
+    """The Q-value in the replayed table."""
+    initial: NDArray[np.float64]
+    """[tables, S * width]: of the initial values."""
+    initial_values: NDArray[np.float64]
+    """[tables, S * width]."""
+    outcomes: NDArray[np.float64]
+    """[outcomes]: of the rewards of all steps with this outcome, an index of `Model.next_state`."""
+    episodes: NDArray[np.float64]
+    """[stretches, 2]: of the rewards in each stretch of episodes, and what these add to the Q-value."""
+    stretch: int
+    """Episodes of a stretch."""
+    last_episode: int
+    """The episode of the last step."""
+    counted: int
+    """Number of steps whose rewards have a weight."""
+    largest: NDArray[np.void]
+    """[limit] of `SHARE`: the steps that add or take most, these first."""
+
+
+def weights_of(
+    recording: Recording, cell: Cell, stop: int, limit: int, report: Callable[[int], None]
+) -> Weights:
+    """Return the weights of a Q-value after a number of training steps.
+
+    Args:
+        recording: of a job that learns.
+        cell: the Q-value.
+        stop: the number of training steps.
+        limit: the most steps in `Weights.largest`.
+        report: called with the number of steps read so far.
+
+    Raises:
+        RecordingError: the steps are not recorded, or the environment cannot have them.
+        StorageError: the temporary file cannot be written.
+    """
+    replay = TableReplay(recording)
+    learner, model = replay.learner, replay.learner.model
+    tables = ("q_1", "q_2") if "q_2" in replay.kinds else ("q",)
+    initial_values = np.stack([replay.held[cell.learner][name].reshape(-1) for name in tables])
+    with tempfile.TemporaryFile() as spool:
+        episode = 0
+        with storage_errors(Path(tempfile.gettempdir()), "set TMPDIR to a folder with more space"):
+            for updates in _updates(recording, replay, cell.learner, stop):
+                spool.write(updates.view(np.uint8).data)
+                episode = int(updates["episode"][-1])
+                report(replay.step)
+        stretch = episode // STRETCHES + 1
+        ledger = Ledger(
+            np.zeros_like(initial_values),
+            np.zeros_like(initial_values),
+            np.zeros(len(model.next_state)),
+            np.zeros((episode // stretch + 1, 2)),
+        )
+        ledger.weights[:, cell.state * model.width[cell.learner] + cell.action] = 1 / len(tables)
+        counted, largest = 0, np.empty(0, SHARE)
+        for start in reversed(range(0, stop, STEPS_AT_ONCE)):
+            updates = np.empty(min(STEPS_AT_ONCE, stop - start), UPDATE)
+            spool.seek(start * UPDATE.itemsize)
+            spool.readinto(updates.view(np.uint8).data)
+            shares = np.zeros(len(updates), SHARE)
+            shares["step"] = np.arange(start, start + len(updates))
+            end = start + len(updates)
+            while end > start:  # from branch to branch: each changes the rules
+                segment = learner.segment_at(end - 1)
+                first = max(segment.start, start)
+                part = slice(first - start, end - start)
+                spread(
+                    model, segment.rules, cell.learner, first, updates[part], ledger, stretch, shares[part]
+                )
+                end = first
+            counted += int(np.count_nonzero(shares["weight"]))
+            largest = _largest(largest, shares, limit)
+    return Weights(
+        value=float(replay.tables[cell.learner][cell.state, cell.action]),
+        initial=ledger.weights,
+        initial_values=initial_values,
+        outcomes=ledger.outcomes,
+        episodes=ledger.episodes,
+        stretch=stretch,
+        last_episode=episode,
+        counted=counted,
+        largest=largest,
+    )
+
+
+def _updates(
+    recording: Recording, replay: TableReplay, learner: int, stop: int
+) -> Iterator[NDArray[np.void]]:
+    """Yield what decides the weights of a learner's updates up to a step, in parts of `STEPS_AT_ONCE`.
+
+    Raises:
+        RecordingError: the numbers of the steps' episodes decrease; compiled code uses them as indices.
+    """
+    episode = 0
+    while replay.step < stop:
+        first = replay.step
+        updates = replay.updates(min(first + STEPS_AT_ONCE, stop), learner)
+        episodes = updates["episode"]
+        if episodes[0] < episode or (episodes[1:] < episodes[:-1]).any():
+            raise RecordingError(
+                f"{recording.path}: found decreasing numbers of episodes from training step {first} on; "
+                "`dualtaxi verify` checks the whole recording."
+            )
+        episode = episodes[-1]
+        yield updates
+
+
+def _largest(known: NDArray[np.void], shares: NDArray[np.void], limit: int) -> NDArray[np.void]:
+    """Return the shares that add or take most, of those that are known and further ones."""
+    sizes = np.abs(shares["contribution"])
+    least = abs(known["contribution"][-1]) if len(known) == limit else 0.0
+    both = np.concatenate([known, shares[(sizes > 0) & (sizes >= least)]])
+    return both[np.lexsort((both["step"], -np.abs(both["contribution"])))[:limit]]

@@ -1,0 +1,394 @@
+"""Why a Q-value is what it is: the recorded rewards and the initial values that it is a weighted sum of.
+
+    found = runner.why(run, state=300, action="north + south")
+    for step in found.steps:
+        print(step.at, step.reward, step.weight, step.contribution)
+
+An update is linear in the tables once it is known which of their values it takes, and the recording
+determines that. So the sum is exact: it is the value, but for the rounding of both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.analysis.step_reference import StepRef
+from runner.archive.places import at_hand
+from runner.debugging.weights import Cell, Weights, weights_of
+from runner.drawing import svg
+from runner.drawing.svg_moves import Move, moves_map
+from runner.environments.mdp import Mdp, events_of
+from runner.environments.naming import (
+    actions_in_words,
+    events_in_words,
+    exploration_in_words,
+    joint_action,
+    numbered_actions,
+    own_action,
+    spoken,
+    state_of,
+    states_in_words,
+)
+from runner.errors import ConfigError, RecordingError, RunnerError, nearest
+from runner.export.episodes import place_of
+from runner.recording import schema
+from runner.recording.reader import Recording, open_recording
+from runner.replay.steps import check_steps, last_step
+from runner.runs.run import Run
+
+EXPLANATION: Final = (
+    "This is a decomposition along the path that training took, not a counterfactual: `dualtaxi branch` "
+    "shows what would have happened after another action or with other settings."
+)
+POLICY_NOTE: Final = (
+    "WoLF-PHC acts by a policy, which is no such sum: its moves have a fixed size. This is the Q-value that "
+    "tells the policy where to move."
+)
+LIMIT: Final = 10
+MAX_LIMIT: Final = 1000
+"""The most steps of an answer."""
+MAX_KINDS: Final = 100
+"""Kinds of rewards, the rest of which are counted together."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a Q-value."""
+
+    weight: float
+    """The sum of the weights of its rewards or initial values."""
+    contribution: float
+    """What it adds to the Q-value: each reward or initial value, times its weight."""
+
+
+@dataclass(frozen=True)
+class RewardPart(Part):
+    """What rewards of one kind add to a Q-value."""
+
+    reward: float | None
+    """None for all kinds that are not named."""
+    events: str
+    """What happened in these steps; may be empty."""
+
+
+@dataclass(frozen=True)
+class EpisodesPart(Part):
+    """What the rewards of a stretch of episodes add to a Q-value."""
+
+    start: int
+    stop: int
+    """The episode after the last one."""
+
+
+@dataclass(frozen=True)
+class StepPart(Part):
+    """What the reward of one step adds to a Q-value."""
+
+    at: str
+    """The step as a reference, `EPISODE:T`."""
+    step: int
+    """Its number in training."""
+    episode: int
+    state: int
+    state_in_words: str
+    action: int
+    """The joint action."""
+    action_in_words: str
+    next_state: int
+    reward: float
+    """The learner's own."""
+    events: str
+    explored: str
+    """Which learners explored; may be empty."""
+    distance: float
+    """Steps from the state of the Q-value to this one, on average over the ways by which the reward came."""
+
+
+@dataclass(frozen=True)
+class Why:
+    """A Q-value as a sum."""
+
+    run_id: str
+    agent: str
+    """The learner whose table it is in."""
+    state: int
+    state_in_words: str
+    action: int
+    action_in_words: str
+    step: int
+    """Training steps that the table has learned from."""
+    value: float
+    """The Q-value in the table."""
+    total: float
+    """The sum of all contributions."""
+    counted: int
+    """Number of steps whose rewards have a weight."""
+    rewarded: Part
+    """All rewards."""
+    initial: Part
+    """The initial values."""
+    rewards: tuple[RewardPart, ...]
+    """The parts by kind of reward, those that add or take most first."""
+    episodes: tuple[EpisodesPart, ...]
+    """The parts by stretches of equally many episodes, in order."""
+    steps: tuple[StepPart, ...]
+    """The steps that add or take most, these first."""
+    moves: tuple[Move, ...]
+    """Where the things that the learner moves went, by weight; empty without a scene."""
+    note: str
+    """What the sum does not explain of the run's algorithm; may be empty."""
+    picture: str = field(repr=False)
+    """The moves on the grid, as SVG; empty without a scene."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all fields but the picture as JSON can hold them."""
+        fields = asdict(self) | {"moves": [move._asdict() for move in self.moves]}
+        del fields["picture"]
+        return fields
+
+    def _repr_html_(self) -> str:
+        from runner.debugging.why_page import why_frame
+
+        return why_frame(self)
+
+
+def why(
+    run: Run,
+    *,
+    state: int | str | None = None,
+    action: int | str | None = None,
+    agent: str | None = None,
+    at: str | StepRef | None = None,
+    limit: int = LIMIT,
+    report: Callable[[int], None] = lambda _: None,
+) -> Why:
+    """Return where a Q-value of a run comes from.
+
+    Args:
+        run: a run that was trained here, with its steps.
+        state: the number of the state, or its name; by default that of the step `at`.
+        action: the learner's own action, or the joint one of a joint table: its number, or its name such as
+            `north + east`; by default the one taken at the step `at`.
+        agent: the learner; required where there are several.
+        at: the step before which the value is explained: `EPISODE:T` of training, or `eval:N:TRIAL:T`; by
+            default after all of training.
+        limit: the most steps to name, up to 1,000.
+        report: called with the number of steps read so far.
+
+    Raises:
+        ConfigError: there is no such state, action or agent, or the limit is too high.
+        RecordingError: there is no such step, the steps were not recorded, or the recording is damaged.
+        RunnerError: the run was recorded from a loop, or its algorithm has no Q-values.
+        StorageError: the folder of temporary files cannot be written.
+    """
+    with open_recording(at_hand(run).recording) as recording:
+        at = StepRef.parse(at) if isinstance(at, str) else at
+        state, action = (None if given is None else str(given) for given in (state, action))
+        return why_in(recording, state, action, agent, at, limit, report)
+
+
+def why_in(
+    recording: Recording,
+    state: str | None = None,
+    action: str | None = None,
+    agent: str | None = None,
+    at: StepRef | None = None,
+    limit: int = LIMIT,
+    report: Callable[[int], None] = lambda _: None,
+) -> Why:
+    """Return where a Q-value comes from, as `why` does, from an open recording."""
+    recording.require_job(
+        "where a Q-value comes from",
+        "`dualtaxi values` shows what a loop's checkpoint expects along a recorded episode.",
+    )
+    algorithm = recording.config["algorithm"]
+    if algorithm == "random":
+        raise RunnerError(
+            f"{recording.path}: has no Q-values, as its algorithm is `random`, which learns nothing; choose "
+            "a run of another algorithm."
+        )
+    if not 1 <= limit <= MAX_LIMIT:
+        raise ConfigError(f"limit: found {limit}, expected 1 to {MAX_LIMIT:,}.")
+    mdp = recording.mdp
+    learner = _learner(recording, agent)
+    is_joint = len(recording.agents) < len(mdp.agents)
+    names = actions_in_words(mdp) if is_joint else numbered_actions(mdp)[learner]
+    if state is None or action is None:
+        taken = _step_at(recording, at)
+        state = str(taken["state"]) if state is None else state
+        own = taken["action"] if is_joint else mdp.own_actions[taken["action"], learner]
+        action = str(own) if action is None else action
+    cell = Cell(
+        learner,
+        state_of(mdp, state),
+        joint_action(mdp, action) if is_joint else own_action(mdp, learner, action),
+    )
+    stop = last_step(recording) if at is None else _steps_before(recording, at)
+    weights = weights_of(recording, cell, stop, limit, report)
+    rewarded = Part(*(float(total) for total in weights.episodes.sum(axis=0)))
+    initial = Part(float(weights.initial.sum()), float((weights.initial * weights.initial_values).sum()))
+    moves = tuple(_moves(mdp, weights.outcomes, "" if is_joint else mdp.agents[learner]))
+    return Why(
+        run_id=recording.run_id,
+        agent=recording.agents[learner],
+        state=cell.state,
+        state_in_words=str(states_in_words(mdp)[cell.state]),
+        action=cell.action,
+        action_in_words=str(names[cell.action]),
+        step=stop,
+        value=weights.value,
+        total=rewarded.contribution + initial.contribution,
+        counted=weights.counted,
+        rewarded=rewarded,
+        initial=initial,
+        rewards=tuple(_by_reward(mdp, weights, cell.learner, len(recording.agents))),
+        episodes=tuple(
+            EpisodesPart(
+                weight,
+                contribution,
+                k * weights.stretch,
+                min((k + 1) * weights.stretch, weights.last_episode + 1),
+            )
+            for k, (weight, contribution) in enumerate(weights.episodes.tolist())
+        ),
+        steps=tuple(_steps(recording, weights.largest, learner)),
+        moves=moves,
+        note=POLICY_NOTE if algorithm == "wolf_phc" else "",
+        picture=_picture(mdp, cell.state, moves),
+    )
+
+
+def _learner(recording: Recording, agent: str | None) -> int:
+    """Return the number of the learner with a name, or of the only one."""
+    learners = recording.agents
+    if agent is None and len(learners) == 1:
+        return 0
+    names = [name for name in learners if agent in (name, spoken(name))]
+    if not names:
+        found = "no agent" if agent is None else f"the agent {agent[:60]!r}"
+        raise ConfigError(
+            f"agent: found {found}, expected {' or '.join(learners)}, whose Q-table has the value."
+            f"{nearest(agent or '', learners)}"
+        )
+    return learners.index(names[0])
+
+
+def _step_at(recording: Recording, at: StepRef | None) -> NDArray[np.void]:
+    """Return the record of a step.
+
+    Raises:
+        ConfigError: none is given.
+        RecordingError: there is no such step.
+    """
+    if at is None:
+        raise ConfigError(
+            "found no state or no action, expected both, or a step (`at`) whose state and action are meant."
+        )
+    place = place_of(recording, (at.episode,) if at.after is None else (at.after, at.episode))
+    span = recording.episode_span(place.phase, place.number)
+    found = []
+    if at.t < len(span):
+        topic = recording.topic(f"/{place.phase}/step")
+        found = list(recording.blocks(topic, span.start + at.t, span.start + at.t + 1))
+    if not found:
+        raise _no_step(recording, at, len(span))
+    check_steps(found[0], recording.mdp, str(recording.path), schema.PHASE_NAMES[place.phase])
+    step: NDArray[np.void] = found[0][0]
+    return step
+
+
+def _no_step(recording: Recording, at: StepRef, steps: int) -> RecordingError:
+    return RecordingError(
+        f"{recording.path}: found no step {at.t:,} in {at.episode_name.lower()}, which has {steps:,}, from 0."
+    )
+
+
+def _steps_before(recording: Recording, at: StepRef) -> int:
+    """Return the training steps that the tables at a step have learned from.
+
+    Raises:
+        RecordingError: there is no such step.
+    """
+    if at.after is not None:
+        return place_of(recording, (at.after, at.episode)).table_step
+    span = recording.episode_span("train", at.episode)
+    if at.t > len(span):
+        raise _no_step(recording, at, len(span))
+    return span.start + at.t
+
+
+def _by_reward(mdp: Mdp, weights: Weights, learner: int, learners: int) -> Iterator[RewardPart]:
+    """Yield the parts of a Q-value by kind of reward."""
+    at = np.unravel_index(np.flatnonzero(weights.outcomes), mdp.next_state.shape)
+    kinds = np.stack([mdp.rewards_of(learners)[(*at, learner)], mdp.events[at]], axis=1)
+    found, kind_of = np.unique(kinds, axis=0, return_inverse=True)
+    sums = np.bincount(kind_of.reshape(-1), weights.outcomes[weights.outcomes != 0], minlength=len(found))
+    parts = sorted(
+        (
+            RewardPart(weight, weight * reward, reward, events_in_words(mdp, int(events)))
+            for weight, (reward, events) in zip(sums.tolist(), found.tolist(), strict=True)
+        ),
+        key=lambda part: (-abs(part.contribution), -part.weight),
+    )
+    yield from parts[:MAX_KINDS]
+    if rest := parts[MAX_KINDS:]:
+        yield RewardPart(sum(part.weight for part in rest), sum(part.contribution for part in rest), None, "")
+
+
+def _steps(recording: Recording, largest: NDArray[np.void], learner: int) -> Iterator[StepPart]:
+    """Yield the steps of some shares, in their order."""
+    mdp = recording.mdp
+    states, actions = states_in_words(mdp), actions_in_words(mdp)
+    records = {}
+    for step in sorted(largest["step"].tolist()):  # each chunk is read once
+        (records[step],) = next(recording.blocks(schema.TRAIN_STEP, step, step + 1))
+    for share in largest:
+        record = records[int(share["step"])]
+        state, action = int(record["state"]), int(record["action"])
+        episode, t = int(record["episode"]), int(record["t"])
+        yield StepPart(
+            weight=float(share["weight"]),
+            contribution=float(share["contribution"]),
+            at=str(StepRef(episode, t)),
+            step=int(share["step"]),
+            episode=episode,
+            state=state,
+            state_in_words=str(states[state]),
+            action=action,
+            action_in_words=str(actions[action]),
+            next_state=int(record["next_state"]),
+            reward=float(record["rewards"][learner]),
+            events=events_in_words(mdp, int(events_of(mdp, record.reshape(1))[0])),
+            explored=exploration_in_words(int(record["explored"]), recording.agents),
+            distance=float(share["distance"]),
+        )
+
+
+def _moves(mdp: Mdp, outcomes: NDArray[np.float64], agent: str) -> Iterator[Move]:
+    """Yield the weight of the moves of an agent, or of all agents if it is empty, thing by thing."""
+    if mdp.scene is None or mdp.scene_cells is None:
+        return
+    found = np.flatnonzero(outcomes)
+    state, action, k = np.unravel_index(found, mdp.next_state.shape)
+    next_state = mdp.next_state[state, action, k]
+    for number, thing in enumerate(mdp.scene["things"]):
+        if thing["kind"] == "mover" and (not agent or thing.get("agent") in (None, agent)):
+            cells = np.stack([mdp.scene_cells[state, number], mdp.scene_cells[next_state, number]], axis=1)
+            pairs, pair_of = np.unique(cells, axis=0, return_inverse=True)
+            sums = np.bincount(pair_of.reshape(-1), outcomes[found], minlength=len(pairs))
+            for (start, stop), weight in zip(pairs.tolist(), sums.tolist(), strict=True):
+                yield Move(number, start, stop, weight)
+
+
+def _picture(mdp: Mdp, state: int, moves: Sequence[Move]) -> str:
+    """Return the moves on the grid, with the things as they are in a state; empty without a scene."""
+    drawing = svg.drawing_of(mdp)
+    if drawing is None or mdp.scene is None:
+        return ""
+    place = drawing.places(mdp, np.array([state]))[0]
+    return moves_map(mdp.scene, moves, place, "The moves by which the value was learned, by weight")
