@@ -93,9 +93,9 @@ _HOME = {
     "run": "runner.api",
     "run_all": "runner.api",
     "verify": "runner.execution.verify",
-    "why": "runner.debugging.why",
     "what_if": "runner.debugging.what_if",
     "when": "runner.debugging.when",
+    "why": "runner.debugging.why",
 }
 """The module of each public name that is not a module itself."""
 

@@ -13,7 +13,7 @@ MAX_ROWS: Final = 12
 
 
 def facts_of(found: Why) -> dict[str, str]:
-    """Return what was asked, and the value, by name."""
+    """Return the run, the state, the action and the value as text, by name."""
     return {
         "run": found.run_id,
         "state": f"{found.state}: {found.state_in_words}",
