@@ -118,7 +118,11 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f" Did you mean {close[0]!r}?" if close else ""
 
 
+def shortened(text: str, limit: int) -> str:
+    """Return a text of at most `limit` characters, which ends with an ellipsis if it was longer."""
+    return text if len(text) <= limit else f"{text[: limit - 1]}…"
+
+
 def truncated_message(error: BaseException | str) -> str:
     """Return the message of an error that is stored with a run, truncated if it is very long."""
-    text = str(error)
-    return text if len(text) <= MAX_MESSAGE else f"{text[: MAX_MESSAGE - 1]}…"
+    return shortened(str(error), MAX_MESSAGE)

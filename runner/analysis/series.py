@@ -21,7 +21,7 @@ from runner.analysis.evaluations import (
     training_records,
 )
 from runner.environments.naming import event_in_words, spoken
-from runner.errors import RunnerError
+from runner.errors import RunnerError, shortened
 from runner.recording import schema
 from runner.recording.metrics import LARGEST, METRIC_OF, METRICS, SHARES, finite_mean, is_usable
 from runner.recording.reader import Recording
@@ -115,8 +115,7 @@ def title_of(metric: str) -> tuple[str, str]:
         return f"Event: {event_in_words(metric.removeprefix('event.'))}", "times per trial, mean"
     if metric.startswith(LOGGED):
         name = " ".join(metric.removeprefix(LOGGED).split())
-        name = name if len(name) <= _MAX_TITLE else name[: _MAX_TITLE - 1] + "…"
-        return f"Logged: {name}", "as logged, mean"
+        return f"Logged: {shortened(name, _MAX_TITLE)}", "as logged, mean"
     return METRIC_OF[metric].title, METRIC_OF[metric].unit
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from runner.config.values import MAX_DEPTH, Path
-from runner.errors import ConfigError
+from runner.errors import ConfigError, shortened
 
 MAX_NODES = 100_000
 """The most values of a text, with its aliases expanded."""
@@ -211,7 +211,7 @@ class _Builder:
 
 
 def _shown(text: str) -> str:
-    short = text if len(text) <= _LONGEST else text[:_LONGEST] + "…"
+    short = shortened(text, _LONGEST)
     return short if short.isprintable() else repr(short)
 
 

@@ -29,7 +29,7 @@ from runner.config.schema import schema_at
 from runner.config.sections import Recording
 from runner.config.shipped import config_path, suggestion
 from runner.config.values import MAX_DEPTH, Path, Section
-from runner.errors import ConfigError
+from runner.errors import ConfigError, shortened
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN
 
 MAX_BYTES: Final = 1 << 20
@@ -245,7 +245,7 @@ def _rivals(path: tuple[str, ...], value: object) -> tuple[str, ...]:
 
 
 def _parse(text: str) -> tuple[tuple[str, ...], Document]:
-    shown = text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + "…"
+    shown = shortened(text, _MAX_SHOWN)
     source = "--set " + (shown if shown.isprintable() else repr(shown))
     key, separator, value = text.partition("=")
     path = tuple(key.strip().split("."))

@@ -11,7 +11,7 @@ from pydantic_core import ErrorDetails
 from runner.config.document import Document, Place, Problem
 from runner.config.schema import Schema, choices_of, expected, keys_of, schema_at
 from runner.config.values import REFUSED, Path
-from runner.errors import ConfigError, ConfigProblem, nearest
+from runner.errors import ConfigError, ConfigProblem, nearest, shortened
 
 _LONGEST = 60
 _MOST = 200
@@ -92,11 +92,10 @@ def found(value: object) -> str:  # noqa: PLR0911 - one line a kind
         case int() | float():
             return str(value)
         case str():
-            return repr(value if len(value) <= _LONGEST else value[:_LONGEST] + "…")
+            return repr(shortened(value, _LONGEST))
         case Mapping():
-            return (
-                _shortened("a mapping with " + ", ".join(map(_key, value))) if value else "an empty mapping"
-            )
+            names = ", ".join(map(_key, value))
+            return shortened(f"a mapping with {names}", _LONGEST) if value else "an empty mapping"
         case list() | tuple():
             return f"a list of {len(value)}" if value else "an empty list"
         case _:
@@ -158,8 +157,4 @@ def _dotted(path: Path) -> str:
 
 def _key(key: object) -> str:
     plain = isinstance(key, str) and key.isprintable() and not set(key) & set(". :'\"[]")
-    return _shortened(str(key)) if plain and key else _shortened(repr(key))
-
-
-def _shortened(text: str) -> str:
-    return text if len(text) <= _LONGEST else text[:_LONGEST] + "…"
+    return shortened(str(key) if plain and key else repr(key), _LONGEST)

@@ -15,7 +15,7 @@ from itertools import chain, count, islice
 from pathlib import Path
 from typing import Any, Final
 
-from runner.errors import RunnerError
+from runner.errors import RunnerError, shortened
 from runner.export.contents import flat_text
 from runner.export.scalars import created, episodes, measures, times
 from runner.recording.reader import Recording
@@ -125,7 +125,8 @@ def _export(
     for one in stored:
         client.delete_run(one.info.run_id)
     notes += [
-        f"{_short(name)} is called {_short(key)}: MLflow takes no such name."
+        f"{shortened(name, _MAX_SHOWN)!r} is called {shortened(key, _MAX_SHOWN)!r}: "
+        "MLflow takes no such name."
         for name, key in names.items()
         if name != key
     ]
@@ -190,10 +191,6 @@ def _name(name: str, names: dict[str, str]) -> str:
         taken = set(names.values())
         names[name] = next(candidate for candidate in candidates if candidate not in taken)
     return names[name]
-
-
-def _short(name: str) -> str:
-    return repr(name if len(name) <= _MAX_SHOWN else f"{name[: _MAX_SHOWN - 1]}…")
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ from gymnasium.wrappers import StickyAction
 
 from runner.environments.gym_types import Space
 from runner.environments.naming import spoken
-from runner.errors import ConfigError, nearest
+from runner.errors import ConfigError, nearest, shortened
 from runner.recording.gym_json import registered, value_of
 from runner.recording.maker import MAX_NAMES
 from runner.util.values import is_text
@@ -192,5 +192,4 @@ def _discrete(space: spaces.Discrete, given: Any, names: Sequence[str], where: s
 
 
 def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}…"
+    return shortened(repr(value), _MAX_TEXT)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Final, NamedTuple, TypeGuard
 
+from runner.errors import shortened
 from runner.recording.metrics import METRICS
 from runner.util.values import MAX_JSON_DEPTH, is_too_deep
 
@@ -223,8 +224,7 @@ def _quoted(value: object) -> str:
     if isinstance(value, list):
         return "a list"
     with contextlib.suppress(ValueError):  # of a number with too many digits to be shown
-        text = repr(value)
-        return text if len(text) <= _QUOTED else f"{text[: _QUOTED - 1]}…"
+        return shortened(repr(value), _QUOTED)
     return "a number of many digits"
 
 

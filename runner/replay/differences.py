@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.errors import shortened
 from runner.recording.spaces import decode
 from runner.util.arrays import Array
 from runner.util.jsonable import as_json
@@ -131,4 +132,4 @@ def _plain(value: Any) -> Any:
 
 def _short(value: object) -> str:
     text = repr(value) if isinstance(value, str) else str(value)
-    return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}…"
+    return shortened(text, _MAX_TEXT)

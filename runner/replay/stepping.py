@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.environments.gym_types import Space
-from runner.errors import CannotRedo
+from runner.errors import CannotRedo, shortened
 from runner.recording.gym_json import value_of
 from runner.recording.gym_spaces import describe_space
 from runner.recording.gym_values import Put, filler, filler_by_agent, leaves_by_agent, leaves_of, value_bytes
@@ -143,9 +143,10 @@ class Stepper(ABC):
             ]
             is_alike = all(recorded.get(key) == found.get(key) for key in ("n", "space"))
             if shapes[0] != shapes[1] or not is_alike:
+                texts = [shortened(json.dumps(each), _MAX_TEXT) for each in (recorded, found)]
                 raise CannotRedo(
-                    f"The environment has another {name} space than recorded: found {_text(found)}, expected "
-                    f"{_text(recorded)}. It is another environment, or another version."
+                    f"The environment has another {name} space than recorded: found {texts[1]}, expected "
+                    f"{texts[0]}. It is another environment, or another version."
                 )
 
     def _restore(self, state: ResetState, base: Any) -> int | None:
@@ -189,11 +190,6 @@ class Stepper(ABC):
                 "[height, width, 3]."
             )
         return picture.copy()
-
-
-def _text(description: Mapping[str, object]) -> str:
-    text = json.dumps(description)
-    return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}…"
 
 
 class RowStepper(Stepper):

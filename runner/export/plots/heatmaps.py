@@ -9,6 +9,7 @@ import numpy as np
 from runner.analysis.histograms import Histogram
 from runner.drawing import palette
 from runner.environments.naming import spoken
+from runner.errors import shortened
 from runner.export.plots.chart import SMALL, Chart, Scale, labelled, number_on_axis
 from runner.export.plots.curves import HEIGHT, WIDTH, Plot
 
@@ -63,8 +64,7 @@ def heatmap_chart(histogram: Histogram) -> Chart:
         chart.text(x.at(tick), y.start + 11.5, text, "middle", size=8)
     named = [(k + 0.5, name) for k, name in enumerate(histogram.names)]
     for at, name in named[:: -(-rows // 10)] or [(tick, number_on_axis(tick)) for tick in y.ticks]:
-        short = name if len(name) <= _LETTERS else f"{name[: _LETTERS - 1]}…"
-        chart.text(x.start - 5, y.at(at) + 3, short, "end", size=8)
+        chart.text(x.start - 5, y.at(at) + 3, shortened(name, _LETTERS), "end", size=8)
     chart.text(x.start, 14.0, title, size=9.5, bold=True)
     chart.text(x.start, 26.0, f"{histogram.unit}; lightest: {100 * shares.max():.0f} %", size=SMALL)
     chart.text((x.start + x.end) / 2, HEIGHT - 5, histogram.axis.label, "middle")

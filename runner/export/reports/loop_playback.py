@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.environments.naming import spoken
-from runner.errors import RecordingError
+from runner.errors import RecordingError, shortened
 from runner.export.contents import ENDINGS, ending_of
 from runner.export.episodes import EpisodePlace
 from runner.export.reports.episode import outcome_in_words
@@ -66,7 +66,7 @@ class _ShownPart:
         for name in self.path:
             values = [each[int(name) if isinstance(each, tuple) else name] for each in values]
         if self.is_text:
-            return list(map(_short_text, values))
+            return [shortened(value, _MAX_LETTERS) for value in values]
         return np.array(values).reshape(len(values), -1)[:, : len(self.names)]
 
 
@@ -192,11 +192,11 @@ class _Reader:
         agents = self._recording.agents
         if len(agents) == 1:
             in_words = action_in_words(self._recording, self._phase)
-            return {"": [_short_text(in_words(record["action"])) for record in records]}
+            return {"": [shortened(in_words(record["action"]), _MAX_LETTERS) for record in records]}
         words_of = {agent: action_in_words(self._recording, self._phase, agent) for agent in agents}
         return {
             agent: [
-                _short_text(words_of[agent](record["action"][agent]))
+                shortened(words_of[agent](record["action"][agent]), _MAX_LETTERS)
                 if int(record["acted"]) >> i & 1
                 else "–"
                 for record in records
@@ -278,10 +278,6 @@ def _shown_parts(recording: Recording, space: str, limit: int) -> tuple[list[_Sh
     if unseen:
         notes.append(f"{unseen:,} more numbers of each {space} are in the recording")
     return shown, notes
-
-
-def _short_text(text: str) -> str:
-    return text if len(text) <= _MAX_LETTERS else f"{text[:_MAX_LETTERS]}…"
 
 
 def _sizes(shape: tuple[int, ...]) -> str:
