@@ -16,9 +16,9 @@ from runner.analysis.evaluations import (
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.clock import Clock, read_clock
+from runner.recording.metadata import Shard
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import Summary
-from runner.recording.shards import Shard
 from runner.runs.checkpoints import Checkpoint, read_checkpoints
 from runner.runs.run import Run
 

@@ -20,10 +20,10 @@ from runner.errors import CannotRedo, RecordingError
 from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording, open_recording
-from runner.replay.capabilities import why_not_redone
 from runner.replay.differences import Difference
 from runner.replay.engine import Replay
 from runner.replay.environment import MEMORY_BYTES, SECONDS, redo, stream_from_child
+from runner.replay.makers import why_not_redone
 from runner.runs.provenance import Differences
 from runner.util.processes import report_progress
 

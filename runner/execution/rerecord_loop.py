@@ -19,9 +19,9 @@ from runner.recording.reader import Recording, open_recording
 from runner.recording.recorder import Recorder
 from runner.recording.rewriting import rewrite
 from runner.recording.writer import RecordingFile
-from runner.replay.capabilities import why_not_redone
 from runner.replay.engine import Replay
 from runner.replay.environment import stream_from_child
+from runner.replay.makers import why_not_redone
 from runner.replay.recorded import Piece, pieces
 from runner.runs.run import Run
 from runner.util.files import storage_errors

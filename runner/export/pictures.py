@@ -35,7 +35,7 @@ from runner.export.painting import (
 )
 from runner.export.values import Values, action_in_words
 from runner.recording.reader import Recording
-from runner.replay.capabilities import environments_with_frames, why_not_redone
+from runner.replay.makers import environments_with_frames, why_not_redone
 from runner.replay.steps import check_steps, environment_of, frames_every, transitions_of
 
 

@@ -28,10 +28,10 @@ from runner.loops.env import record
 from runner.loops.parallel import record_parallel
 from runner.loops.policies import Policy, from_policy, policy_named
 from runner.recording.reader import Recording, open_recording
-from runner.replay.capabilities import why_not_redone
 from runner.replay.engine import BLOCK_SECONDS, Replay, Report
 from runner.replay.environment import stream_from_child
 from runner.replay.episodes import episode_at
+from runner.replay.makers import why_not_redone
 from runner.replay.stepping import RowStepper
 from runner.replay.steps import transitions_of
 from runner.runs.branches import BranchOrigin

@@ -39,12 +39,11 @@ from runner.recording.messages import (
     frame_place,
     log_level,
 )
-from runner.recording.metadata import json_object, sizes_of, write_result
+from runner.recording.metadata import SHARD_MAKER, Shard, json_object, sizes_of, write_result
 from runner.recording.reader import open_recording
 from runner.recording.recorder import Recorder
 from runner.recording.salvage import DamagedFile
 from runner.recording.schema import STEP_NANOSECONDS, Topic
-from runner.recording.shards import SHARD_MAKER, Shard
 from runner.recording.writer import create_recording
 from runner.runs.listing import run_at
 from runner.runs.run import RECORDING_FILE, SHARDS_FOLDER, Run

@@ -16,16 +16,18 @@ from runner.recording import schema
 from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD, Code, parse_code
 from runner.recording.maker import MAKER_RECORD, EnvironmentMaker, parse_maker
 from runner.recording.metadata import (
+    SHARD_MAKER,
+    Shard,
     environment_description,
     environment_of,
     json_object,
     kind_of,
     lost_ranges,
+    parse_shards,
     spaces_of,
 )
 from runner.recording.run_file import Summary, parse_result
 from runner.recording.schema import Topic
-from runner.recording.shards import SHARD_MAKER, Shard, parse_shards
 
 
 class RunDescription(ABC):

@@ -7,7 +7,7 @@
             ...                           # the environment is not the recorded one; nothing follows
 
 `redo` runs the environment, which is foreign code, in this process; `redo_in_child` in a child process with
-limits on memory and time. `runner.replay.capabilities` says whether a recording can be done again, and
+limits on memory and time. `runner.replay.makers` says whether a recording can be done again, and
 `runner.export.pictures` what its pictures are made from.
 """
 
@@ -23,9 +23,9 @@ from typing import Any, Final
 
 from runner.errors import CannotRedo
 from runner.recording.reader import Recording, open_recording
-from runner.replay.capabilities import why_not_redone
 from runner.replay.engine import Replay, Report
 from runner.replay.episodes import redo_episode
+from runner.replay.makers import why_not_redone
 from runner.replay.redone import RedoneSteps
 from runner.util.processes import CallFailed, ChildProcess, TimedOut, report_progress
 

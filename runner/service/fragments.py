@@ -35,16 +35,16 @@ from runner.drawing import svg
 from runner.errors import RecordingError, RunnerError
 from runner.export.encoded import picture_note
 from runner.export.episodes import last_episode, last_whole_evaluation, typical_trial
-from runner.export.plots.comparisons import letter
 from runner.export.plots.curves import Plot, footnote, panel_plots
 from runner.export.plots.heatmaps import EXPLANATION, heatmap_plots
 from runner.export.plots.machine import machine_facts, machine_plots
 from runner.export.plots.tasks import task_charts
+from runner.export.reports.compare import tasks_legend
 from runner.export.reports.diff import ShownDivergence, difference_view
 from runner.export.reports.episode import trial
 from runner.export.reports.maps import maps_of, stages_of
 from runner.export.reports.playback import playback_of
-from runner.export.reports.rendering import LegendEntry, Link, partials
+from runner.export.reports.rendering import Link, partials
 from runner.export.rerun.location import locate
 from runner.export.rerun.selection import Request
 from runner.recording import schema
@@ -154,11 +154,7 @@ def tasks(paths: Sequence[Path], axis: str, scores: str) -> bytes:
     found = compare_tasks(groups, metric_of_tasks(groups, ()), Moment("last"), table, notes)
     shown = partials()
     plots = [Plot(chart.title, chart.svg(), False) for chart in task_charts(found)]
-    legend = [
-        LegendEntry(letter(i), f"{own.label}: {sum(own.seeds.values())} runs")
-        for i, own in enumerate(found.algorithms)
-    ]
-    html = [shown.charts("tasks", "Normalised scores", TASKS_EXPLANATION, plots, legend)]
+    html = [shown.charts("tasks", "Normalised scores", TASKS_EXPLANATION, plots, tasks_legend(found))]
     html += [
         shown.section(f"tasks-{i}", each.title, each) for i, each in enumerate(task_sections(found)[:-1])
     ]

@@ -195,7 +195,7 @@ def _compare_tasks(
     comparison = compare_tasks(groups, metric_of_tasks(groups, chosen), moment, table, notes)
     page = ""
     if with_page:
-        from runner.export.reports.tasks import render_tasks
+        from runner.export.reports.compare import render_tasks
 
         page = render_tasks(comparison)
     contents = f"{len(groups)} groups in {len(comparison.tasks)} environments"

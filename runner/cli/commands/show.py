@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from runner.analysis.summary import RecordedExtras, RunDetails
+    from runner.recording.metadata import Shard
     from runner.recording.reader import Recording
     from runner.recording.run_file import Summary
-    from runner.recording.shards import Shard
     from runner.runs.branches import BranchOrigin
     from runner.runs.run import Run
 

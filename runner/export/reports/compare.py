@@ -1,4 +1,4 @@
-"""A comparison of groups of runs as one self-contained page."""
+"""Comparisons as self-contained pages: of groups of runs, and of algorithms over environments."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ from typing import ClassVar, NamedTuple
 
 from runner.analysis.compare import Comparison, MetricResult
 from runner.analysis.compare.sections import EXPLANATION, metric_section, summary
+from runner.analysis.compare.task_sections import EXPLANATION as TASKS_EXPLANATION
+from runner.analysis.compare.task_sections import task_sections
+from runner.analysis.compare.tasks import TaskComparison
 from runner.analysis.groups import Group
-from runner.analysis.sections import Grid
+from runner.analysis.sections import Grid, Section
 from runner.export.plots.comparisons import intervals_svg, letter, profile_svg
 from runner.export.plots.curves import Plot, footnote, plots_of
+from runner.export.plots.tasks import task_charts
 from runner.export.reports.rendering import LegendEntry, View, render
 from runner.util.humanize import UNKNOWN
 
@@ -97,3 +101,40 @@ def _metric(metric: MetricResult, labels: list[str]) -> ComparedMetric:
         figures.append(Figure(profile_svg(metric, labels), "Performance profile"))
     anchor = "metric-" + re.sub(r"\W+", "-", metric.name)
     return ComparedMetric(anchor, section.title, section.sentences, section.grids, figures)
+
+
+@dataclass(frozen=True)
+class _TasksView(View):
+    TEMPLATE: ClassVar = "tasks.html"
+    title: str
+    sections: Sequence[Section]
+    legend: list[LegendEntry]
+    charts: list[str]
+    moment: str
+    explanation: str = TASKS_EXPLANATION
+
+
+def render_tasks(comparison: TaskComparison) -> str:
+    """Return the page.
+
+    Raises:
+        MissingExtra: Jinja2 is not installed.
+    """
+    labels = [result.label for result in comparison.algorithms]
+    return render(
+        _TasksView(
+            title=f"{' against '.join(labels)} over {len(comparison.tasks)} environments",
+            sections=task_sections(comparison)[:-1],
+            legend=tasks_legend(comparison),
+            charts=[chart.svg() for chart in task_charts(comparison)],
+            moment=comparison.moment,
+        )
+    )
+
+
+def tasks_legend(comparison: TaskComparison) -> list[LegendEntry]:
+    """Return the legend of charts over environments."""
+    return [
+        LegendEntry(letter(i), f"{result.label}: {sum(result.seeds.values())} runs")
+        for i, result in enumerate(comparison.algorithms)
+    ]
