@@ -117,8 +117,7 @@ _EVALUATION_SIDE = (
     *(Field(each.number, each.field, _DOUBLE, each.per_agent, each.stored_as) for each in METRICS),
 )
 EVAL_METRICS = MessageType(
-    "EvalMetrics",
-    (*_TRAINING_SIDE, *sorted(_EVALUATION_SIDE, key=lambda field: field.number)),
+    "EvalMetrics", (*_TRAINING_SIDE, *sorted(_EVALUATION_SIDE, key=lambda field: field.number))
 )
 OPTIMALITY = MessageType(
     "Optimality",
@@ -209,14 +208,7 @@ RESET_STATE = MessageType(
     ),
 )
 """What a reset without a seed depends on; `reset_states` describes its fields."""
-INFO = MessageType(
-    "Info",
-    (
-        Field(1, "step", _SFIXED64),
-        Field(2, "reset", _BOOL),
-        Field(3, "json", _STRING),
-    ),
-)
+INFO = MessageType("Info", (Field(1, "step", _SFIXED64), Field(2, "reset", _BOOL), Field(3, "json", _STRING)))
 SCALAR = MessageType(
     "Scalar",
     (
@@ -254,12 +246,7 @@ IMAGE = MessageType(
 EXTRA_COLUMNS = MessageType("ExtraColumns", (Field(1, "json", _STRING),))
 """The names of extras, with dtypes and shapes: a description of a `Dict` space."""
 EXTRA = MessageType(
-    "Extra",
-    (
-        Field(1, "values", _BYTES),
-        Field(2, "given", _BYTES),
-        Field(3, "step", _SFIXED64),
-    ),
+    "Extra", (Field(1, "values", _BYTES), Field(2, "given", _BYTES), Field(3, "step", _SFIXED64))
 )
 """The values that a loop recorded with a step, laid out as the latest `ExtraColumns` describes."""
 CHECKPOINT = MessageType(
@@ -277,24 +264,16 @@ CHECKPOINT = MessageType(
 """A reference to content in the store next to the recordings, by its BLAKE3."""
 CLOCK = MessageType("Clock", (Field(1, "started", _DOUBLE), Field(2, "seconds", _DOUBLE)))
 """How much time had passed at its position; `clock` describes its fields."""
+_HOST_FIELDS = (
+    *("started", "seconds", "cpu_percent", "memory_bytes", "host_cpu_percent", "host_memory_bytes"),
+    *("host_memory_total", "disk_read_bytes", "disk_written_bytes", "disk_free_bytes"),
+    *("network_received_bytes", "network_sent_bytes", "gpu_percent", "gpu_memory_bytes", "gpu_memory_total"),
+)
 HOST = MessageType(
     "Host",
-    (
-        Field(1, "started", _DOUBLE),
-        Field(2, "seconds", _DOUBLE),
-        Field(3, "cpu_percent", _DOUBLE),
-        Field(4, "memory_bytes", _DOUBLE),
-        Field(5, "host_cpu_percent", _DOUBLE),
-        Field(6, "host_memory_bytes", _DOUBLE),
-        Field(7, "host_memory_total", _DOUBLE),
-        Field(8, "disk_read_bytes", _DOUBLE),
-        Field(9, "disk_written_bytes", _DOUBLE),
-        Field(10, "disk_free_bytes", _DOUBLE),
-        Field(11, "network_received_bytes", _DOUBLE),
-        Field(12, "network_sent_bytes", _DOUBLE),
-        Field(13, "gpu_percent", _DOUBLE, repeated=True),
-        Field(14, "gpu_memory_bytes", _DOUBLE, repeated=True),
-        Field(15, "gpu_memory_total", _DOUBLE, repeated=True),
+    tuple(
+        Field(number, name, _DOUBLE, repeated=name.startswith("gpu_"))
+        for number, name in enumerate(_HOST_FIELDS, 1)
     ),
 )
 """What the process and its host used at a moment; NaN is unknown. `host` describes its fields."""
@@ -323,49 +302,42 @@ ACTIONS = MessageType(
 
 LOG_LEVELS: Final = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
 
-TRAIN_STEP = Topic("/train/step", 1, STEP, "train")
-EVAL_STEP = Topic("/eval/step", 2, STEP, "eval")
-TRAIN_EPISODE = Topic("/train/episode", 3, EPISODE, "train")
-EVAL_EPISODE = Topic("/eval/episode", 4, EPISODE, "eval")
+
+def _both(name: str, channel: int, message: MessageType, digested: bool = True) -> tuple[Topic, Topic]:
+    """Return the topics of training and evaluation, whose channels follow each other."""
+    train, evaluation = f"/train/{name}", f"/eval/{name}"
+    return (
+        Topic(train, channel, message, "train", digested),
+        Topic(evaluation, channel + 1, message, "eval", digested),
+    )
+
+
+TRAIN_STEP, EVAL_STEP = _both("step", 1, STEP)
+TRAIN_EPISODE, EVAL_EPISODE = _both("episode", 3, EPISODE)
 TRAIN_METRICS_TOPIC = Topic("/train/metrics", 5, TRAIN_METRICS, "train")
 EVAL_METRICS_TOPIC = Topic("/eval/metrics", 6, EVAL_METRICS, "eval")
 Q_TABLE_TOPIC = Topic("/q_table", 7, Q_TABLE)
 LOG_TOPIC = Topic("/log", 8, LOG, digested=False)
 OPTIMALITY_TOPIC = Topic("/eval/optimality", 23, OPTIMALITY, "eval")
 TOPICS: Final = (
-    TRAIN_STEP,
-    EVAL_STEP,
-    TRAIN_EPISODE,
-    EVAL_EPISODE,
-    TRAIN_METRICS_TOPIC,
-    EVAL_METRICS_TOPIC,
-    Q_TABLE_TOPIC,
-    LOG_TOPIC,
-    OPTIMALITY_TOPIC,
+    *(TRAIN_STEP, EVAL_STEP, TRAIN_EPISODE, EVAL_EPISODE, TRAIN_METRICS_TOPIC, EVAL_METRICS_TOPIC),
+    *(Q_TABLE_TOPIC, LOG_TOPIC, OPTIMALITY_TOPIC),
 )
 """The topics of what the runner itself learned, which a job determines."""
 
-TRAIN_TRANSITION = Topic("/train/step", 9, TRANSITION, "train")
-EVAL_TRANSITION = Topic("/eval/step", 10, TRANSITION, "eval")
-TRAIN_TRANSITION_VARIABLE = Topic("/train/step", 11, TRANSITION, "train")
-EVAL_TRANSITION_VARIABLE = Topic("/eval/step", 12, TRANSITION, "eval")
-TRAIN_RESET = Topic("/train/reset", 13, RESET, "train")
-EVAL_RESET = Topic("/eval/reset", 14, RESET, "eval")
-TRAIN_RESET_VARIABLE = Topic("/train/reset", 15, RESET, "train")
-EVAL_RESET_VARIABLE = Topic("/eval/reset", 16, RESET, "eval")
-TRAIN_INFO = Topic("/train/info", 17, INFO, "train")
-EVAL_INFO = Topic("/eval/info", 18, INFO, "eval")
+TRAIN_TRANSITION, EVAL_TRANSITION = _both("step", 9, TRANSITION)
+TRAIN_TRANSITION_VARIABLE, EVAL_TRANSITION_VARIABLE = _both("step", 11, TRANSITION)
+TRAIN_RESET, EVAL_RESET = _both("reset", 13, RESET)
+TRAIN_RESET_VARIABLE, EVAL_RESET_VARIABLE = _both("reset", 15, RESET)
+TRAIN_INFO, EVAL_INFO = _both("info", 17, INFO)
 SCALAR_TOPIC = Topic("/scalar", 19, SCALAR)
 ARRAY_TOPIC = Topic("/array", 20, ARRAY)
-TRAIN_FRAME = Topic("/train/frame", 21, IMAGE, "train", digested=False)
-EVAL_FRAME = Topic("/eval/frame", 22, IMAGE, "eval", digested=False)
+TRAIN_FRAME, EVAL_FRAME = _both("frame", 21, IMAGE, digested=False)
 FIRST_VERSION_CHANNELS: Final = 23
 """The highest channel of the format's first version; topics with higher ones may be missing in a file."""
-TRAIN_RESET_STATE = Topic("/train/reset_state", 24, RESET_STATE, "train", digested=False)
-EVAL_RESET_STATE = Topic("/eval/reset_state", 25, RESET_STATE, "eval", digested=False)
+TRAIN_RESET_STATE, EVAL_RESET_STATE = _both("reset_state", 24, RESET_STATE, digested=False)
 EXTRA_COLUMNS_TOPIC = Topic("/extra", 26, EXTRA_COLUMNS)
-TRAIN_EXTRA = Topic("/train/extra", 27, EXTRA, "train")
-EVAL_EXTRA = Topic("/eval/extra", 28, EXTRA, "eval")
+TRAIN_EXTRA, EVAL_EXTRA = _both("extra", 27, EXTRA)
 CHECKPOINT_TOPIC = Topic("/checkpoint", 29, CHECKPOINT)
 CLOCK_TOPIC = Topic("/clock", 30, CLOCK, digested=False)
 HOST_TOPIC = Topic("/host", 31, HOST, digested=False)
@@ -374,18 +346,14 @@ MACHINE_TOPICS: Final = (CLOCK_TOPIC, HOST_TOPIC, CONSOLE_TOPIC)
 """The topics of how the recording went on its machine: other messages each time a job is run."""
 IMAGE_TOPIC = Topic("/image", 50, IMAGE, digested=False)
 """Pictures that were logged under a name, which is their `frame_id`; a film is an animated WebP."""
-
-TRAIN_ACTIONS = Topic("/train/actions", 40, ACTIONS, "train", digested=False)
-EVAL_ACTIONS = Topic("/eval/actions", 41, ACTIONS, "eval", digested=False)
+TRAIN_ACTIONS, EVAL_ACTIONS = _both("actions", 40, ACTIONS, digested=False)
 
 LOOP_TOPICS: Final = {
     "step": (TRAIN_STEP, EVAL_STEP, TRAIN_RESET, EVAL_RESET),
     "transition": (TRAIN_TRANSITION, EVAL_TRANSITION, TRAIN_RESET, EVAL_RESET),
     "variable": (
-        TRAIN_TRANSITION_VARIABLE,
-        EVAL_TRANSITION_VARIABLE,
-        TRAIN_RESET_VARIABLE,
-        EVAL_RESET_VARIABLE,
+        *(TRAIN_TRANSITION_VARIABLE, EVAL_TRANSITION_VARIABLE),
+        *(TRAIN_RESET_VARIABLE, EVAL_RESET_VARIABLE),
     ),
 }
 """The topics of steps and resets in the recording of a loop, by the kind of its spaces."""
@@ -413,10 +381,7 @@ MESSAGES: Final = tuple(dict.fromkeys(topic.message for topic in ALL_TOPICS))
 
 BLOCK_TOPICS: Final = (TRAIN_STEP, EVAL_STEP, TRAIN_EPISODE, EVAL_EPISODE)
 """The topics of a job whose messages have one size: read and written as blocks."""
-ALL_BLOCK_TOPICS: Final = (
-    *BLOCK_TOPICS,
-    *(TRAIN_TRANSITION, EVAL_TRANSITION, TRAIN_RESET, EVAL_RESET),
-)
+ALL_BLOCK_TOPICS: Final = (*BLOCK_TOPICS, TRAIN_TRANSITION, EVAL_TRANSITION, TRAIN_RESET, EVAL_RESET)
 EXTRA_TOPICS: Final = (TRAIN_EXTRA, EVAL_EXTRA)
 UNIFORM_TOPICS: Final = (*ALL_BLOCK_TOPICS, *EXTRA_TOPICS)
 """The topics whose messages have one size within a chunk."""
