@@ -6,6 +6,7 @@ from fastapi import APIRouter
 
 from runner.service.pages import (
     compare,
+    environments,
     episodes,
     jobs,
     machine,
@@ -23,5 +24,8 @@ from runner.service.pages.rendering import add_error_handlers, refused
 __all__ = ["add_error_handlers", "refused", "router"]
 
 router = APIRouter(include_in_schema=False)
-for _module in (runs, rerun, run, setup, replay, episodes, compare, machine, submit, jobs, sweeps, static):
+for _module in (
+    *(runs, rerun, run, setup, replay, environments, episodes, compare),
+    *(machine, submit, jobs, sweeps, static),
+):
     router.include_router(_module.router)

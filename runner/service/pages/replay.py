@@ -19,9 +19,8 @@ from runner.analysis.evaluations import evaluations_of
 from runner.analysis.step_reference import StepRef
 from runner.drawing import svg
 from runner.errors import RunnerError
-from runner.export.episodes import EpisodePlace, place_of
 from runner.export.reports.rendering import Link, View
-from runner.recording.reader import Recording, open_recording
+from runner.recording.reader import open_recording
 from runner.runs.branches import origin_in
 from runner.runs.run import Run
 from runner.service import fragments
@@ -45,8 +44,6 @@ router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
 
 MAX_BRANCHES: Final = 20
 """Branches of a run that a page lists, the newest."""
-MAX_PANELS: Final = 8
-"""Environments of a vector that a page shows side by side."""
 BEFORE: Final = 250
 """Steps before the requested one in the part that a page shows first, as in `parts.js`."""
 
@@ -106,20 +103,6 @@ class _ReplayView(RunView):
     """How many environments take turns."""
     branches: list[Link]
     """This run next to its parent, and to its branches."""
-
-
-@dataclass(frozen=True)
-class _EnvironmentsView(RunView):
-    TEMPLATE: ClassVar = "run_environments.html"
-    title: str
-    alone: str
-    """Address of the replay of the episode alone."""
-    shown: list[Panel]
-    length: int
-    """Steps of the episode."""
-    t: int
-    left_out: int
-    """Environments that are not shown."""
 
 
 @dataclass(frozen=True)
@@ -207,72 +190,6 @@ async def trial_replay(
 ) -> Response:
     """Show a step of a trial of an evaluation."""
     return await _replay(request, run, cache, processes, streams, catalogue, (after, trial), t)
-
-
-@router.get("/train/{episode}/environments")
-def training_environments(request: Request, run: RecordedRun, episode: Number, t: T = 0) -> Response:
-    """Show all environments of a vector during a training episode of one of them."""
-    return page(request, _environments(run, StepRef(episode, t)))
-
-
-@router.get("/eval/{after}/{trial}/environments")
-def trial_environments(
-    request: Request, run: RecordedRun, after: Number, trial: Number, t: T = 0
-) -> Response:
-    """Show all environments of a vector during a trial of one of them."""
-    return page(request, _environments(run, StepRef(trial, t, after)))
-
-
-def _environments(run: Run, at: StepRef) -> _EnvironmentsView:
-    """Return the page of an episode and those of the other environments at its first step.
-
-    Raises:
-        RecordingError: there is no such episode.
-    """
-    base = f"/runs/{run.run_id}/replay"
-    with open_recording(run.recording) as recording:
-        place = place_of(recording, (at.episode,) if at.after is None else (at.after, at.episode))
-        span = recording.episode_span(place.phase, place.number)
-        # Trials are numbered within their evaluation, whose first one this is.
-        first = place.number - at.episode
-        panels = []
-        for environment, number in _episodes_at(recording, place, span)[:MAX_PANELS]:
-            own = recording.episode_span(place.phase, number)
-            path = replace(at, episode=number - first, t=0).episode_path
-            name = "trial" if at.after is not None else "episode"
-            panel = panel_of(
-                recording,
-                place.phase,
-                f"/api/v1{base}/{path}",
-                f"Environment {environment}: {name} {number - first:,}",
-                offset=own.start // own.step - span.start // span.step,
-                address=f"{base}/{path}",
-            )
-            panels.append(panel)
-        return _EnvironmentsView(
-            run=head_of(run),
-            here="replay",
-            title=place.title[0].upper() + place.title[1:],
-            alone=f"{base}/{at.episode_path}",
-            shown=panels,
-            length=len(span),
-            t=min(at.t, len(span)),
-            left_out=max(0, recording.environments - len(panels)),
-        )
-
-
-def _episodes_at(recording: Recording, place: EpisodePlace, span: range) -> list[tuple[int, int]]:
-    """Return each environment and the number of its episode at the first step of another one, if it ended."""
-    topic, n = recording.topic(f"/{place.phase}/episode"), span.step
-    begin = span.start // n * n
-    found = {span.start % n: place.number}
-    for block in recording.blocks(topic, recording.first_from(topic, "last_step", begin)):
-        for last, number in zip(block["last_step"].tolist(), block["episode"].tolist(), strict=True):
-            if last >= begin:
-                found.setdefault(last % n, number)
-        if len(found) == n:
-            break
-    return sorted(found.items())
 
 
 async def _replay(

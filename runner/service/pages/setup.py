@@ -16,12 +16,7 @@ from runner.recording import schema
 from runner.recording.code import Code
 from runner.recording.messages import log_level
 from runner.recording.reader import Recording, open_recording
-from runner.service.dependencies import (
-    FoundRun,
-    OpenRecording,
-    RecordedRun,
-    SettingsOf,
-)
+from runner.service.dependencies import FoundRun, OpenRecording, RecordedRun, SettingsOf
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import message_of, page
 from runner.util import humanize
