@@ -7,58 +7,30 @@ as if one loop had done all of it, and does not depend on which process was fast
 
 from __future__ import annotations
 
-import json
 import shutil
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-import numpy as np
 from mcap.opcode import Opcode
-from numpy.typing import NDArray
 
 from runner.client.outbox import forget_upload
-from runner.config.loading import packing_from
-from runner.errors import RecordingError, truncated_message
-from runner.loops.copied_extras import CopiedExtras
-from runner.loops.copied_rows import Copied, CopiedMessages, CopiedRows
-from runner.loops.options import PACKING
-from runner.loops.outcomes import Outcomes
-from runner.loops.shard_sources import PHASES, Source
-from runner.recording import schema
-from runner.recording.maker import EnvironmentMaker
-from runner.recording.messages import (
-    decode,
-    encode,
-    encode_image,
-    encode_log,
-    frame_id,
-    frame_place,
-    log_level,
-)
-from runner.recording.metadata import SHARD_MAKER, Shard, json_object, sizes_of, write_result
+from runner.errors import RecordingError
+from runner.loops.fold import Fold, Report, ending_of_run
+from runner.loops.shard_sources import Source
+from runner.recording.metadata import json_object
 from runner.recording.reader import open_recording
-from runner.recording.recorder import Recorder
 from runner.recording.salvage import DamagedFile
-from runner.recording.schema import STEP_NANOSECONDS, Topic
-from runner.recording.writer import create_recording
 from runner.runs.listing import run_at
 from runner.runs.run import RECORDING_FILE, SHARDS_FOLDER, Run
 from runner.runs.shards import ENDS_AS, are_over, handed_over, shards_locked, shards_of
-from runner.util.arrays import Array
 from runner.util.files import open_regular, storage_errors
 
 OWNER_WAITS: Final = 5.0
 """Seconds for which the process that began a run waits, at its end, for the others to end."""
 _POLL_SECONDS: Final = 0.05
-_KEPT: Final = frozenset({"run", "result", "repair"})
-"""The metadata that is not copied from the process that began the run."""
-
-Report = Callable[[int, int], None]
-"""Takes the steps copied so far, and how many there are."""
 
 
 def fold_if_over(run: Run, seconds: float = 0.0, report: Report = lambda *_: None) -> Run:
@@ -94,7 +66,7 @@ def _fold(run: Run, report: Report) -> Run:
         sources = _sources(run, stack)
         is_folded = bool(sources) and bool(sources[0].recording.shards)
         if sources and not is_folded:
-            summary = _Fold(run, sources, report).write(fresh)
+            summary = Fold(run, sources, report).write(fresh)
         elif is_folded:  # by a process that was killed before it said so
             text = sources[0].recording.metadata("result").get("json")
             summary = json_object(text, f"{run.recording}: the result")
@@ -103,16 +75,12 @@ def _fold(run: Run, report: Report) -> Run:
             fresh.replace(run.folder / RECORDING_FILE)
         forget_upload(run)
         facts = {key: value for key, value in run.facts.items() if key != ENDS_AS}
-        run = Run(run.folder, facts).update(status=_status(run), summary={**run.file.summary, **summary})
+        run = Run(run.folder, facts).update(
+            status=ending_of_run(run), summary={**run.file.summary, **summary}
+        )
     if summary is not None:
         shutil.rmtree(run.folder / SHARDS_FOLDER)
     return run
-
-
-def _status(run: Run) -> str:
-    """Return how a run ended whose processes are gone."""
-    status = str(run.facts.get(ENDS_AS) or run.file.status)
-    return status if status in ("finished", "failed") else "interrupted"
 
 
 def _sources(run: Run, stack: ExitStack) -> list[Source]:
@@ -144,276 +112,3 @@ def _has_messages(path: Path) -> bool:
         return False
     with open_regular(path) as stream:
         return any(opcode == Opcode.CHUNK for opcode, _, _ in DamagedFile(stream, path).good_records())
-
-
-class _Fold:
-    """Writes the recordings of several processes into one.
-
-    Args:
-        run: the run.
-        sources: of its processes; that which began it comes first, unless it recorded nothing.
-        report: called while episodes are copied.
-    """
-
-    def __init__(self, run: Run, sources: Sequence[Source], report: Report) -> None:
-        self._run, self._sources, self._report = run, sources, report
-        self._first = first = sources[0].recording
-        self._mdp = first.mdp if first.tabular else None
-        self._outcomes = Outcomes(self._mdp)
-        self._units, self._evaluated = self._ordered()
-        leads = sources[0].is_placed or any(sources[0].taken.values())
-        self._main = sources[0] if leads else max(sources, key=lambda source: sum(source.taken.values()))
-        """The process whose clock becomes that of the run."""
-        self._totals = {phase: sum(source.taken[phase] for source in sources) for phase in PHASES}
-
-    def write(self, fresh: Path) -> dict[str, object]:
-        """Write the new recording; return the summary of the run."""
-        first, started = self._first, time.monotonic()
-        facts = self._facts()
-        chosen = first.config.get("recording") or {}
-        packing = packing_from({key: chosen[key] for key in PACKING if key in chosen}).packing
-        with create_recording(fresh, schema.KINDS[first.kind]) as file:
-            file.add_metadata("run", facts)
-            for name in first.metadata_names:
-                if name not in _KEPT:
-                    file.add_metadata(name, first.metadata(name))
-            for name, maker in self._own_makers().items():
-                file.add_metadata(f"{SHARD_MAKER}/{name}", maker.to_metadata())
-            for name, media_type, data in first.attachments():
-                file.add_attachment(name, media_type, data)
-            self._recorder = recorder = Recorder(
-                file,
-                learners=len(first.agents),
-                events=int(facts["events"]),
-                packing=packing,
-                sizes=sizes_of(facts, str(fresh)),
-                watch=self._outcomes.take_records,
-            )
-            try:
-                off_table = self._copy_units()
-                with tempfile.TemporaryFile(dir=fresh.parent) as spool:
-                    for topic in first.topics:
-                        self._copy_messages(topic, spool)
-                result = recorder.totals(recorder.drain()) | self._outcomes.summary()
-            except BaseException:
-                recorder.abandon()
-                raise
-            result |= {"episodes": recorder.counts["/train/episode"], "steps_recorded": True}
-            if self._mdp is not None:
-                result["rewards_off_table"] = off_table
-            if errors := self._errors():
-                result["error"] = truncated_message("; ".join(errors))
-            write_result(file, _status(self._run), result)
-            before = self._run.file.summary.seconds or 0.0
-            return result | {"seconds": before + round(time.monotonic() - started, 3), "bytes": file.size}
-
-    def _errors(self) -> list[str]:
-        """Return the error of the process that began the run, and those of shards with their names."""
-        own = self._run.file.summary.error
-        failed = [shard for shard in shards_of(self._run) if shard.status == "failed"]
-        others = [f"{shard.run_id} failed: {shard.summary.error or 'of unknown cause'}" for shard in failed]
-        return ([own] if own else []) + others
-
-    def _facts(self) -> dict[str, str]:
-        """Return the metadata record `run`."""
-        shards = [
-            Shard(source.name, source.n, source.recording.status, source.taken["train"], source.taken["eval"])
-            for source in self._sources
-        ]
-        names = {"run_id": self._run.run_id, "name": str(self._run.facts["name"])}
-        seeded = {"seeded": "false"} if not self._run.has_seed else {}
-        run = {key: value for key, value in self._first.run.items() if key != "seeded"}
-        return (
-            run
-            | names
-            | seeded
-            | {"seed": str(self._run.seed), "created": self._run.created_text, "environments": "1"}
-            | {"spaces": self._spaces(), "shards": json.dumps([shard._asdict() for shard in shards])}
-        )
-
-    def _spaces(self) -> str:
-        """Return the description of the spaces, with the widest actions that a process recorded."""
-
-        def width(source: Source) -> int:
-            topic = source.recording.topic("/train/step")
-            dtype = source.recording.dtypes.get(topic)
-            return dtype["action"].itemsize if dtype is not None else 0
-
-        return max(self._sources, key=width).recording.run["spaces"]
-
-    def _own_makers(self) -> dict[str, EnvironmentMaker]:
-        """Return how the environments of shards were made, where it was otherwise than those of the run."""
-        makers = {}
-        for source in self._sources[1:]:
-            maker = source.recording.maker
-            phases = [phase for phase in PHASES if source.stops[phase]]
-            others = [self._first.maker_of(phase) for phase in phases]
-            if maker is not None and any(other is None or not maker.is_like(other) for other in others):
-                makers[source.name] = maker
-        return makers
-
-    # --- the order ------------------------------------------------------------------------------------
-
-    def _ordered(self) -> tuple[NDArray[np.void], tuple[Array, Array]]:
-        """Return the units of all processes in the order of the run, and those of evaluations among them."""
-        for source in self._sources:
-            for phase, units in source.units.items():
-                before = units["first"] - units["environment"]
-                others = units["position"] - before
-                if source.stops["train"]:
-                    units["key"] = self._alongside((before if phase == "train" else others) / source.n)
-                else:
-                    units["key"] = others if source.is_placed else self._alongside(before / source.n)
-        every = np.concatenate([units for source in self._sources for units in source.units.values()])
-        names = ("reset", "phase", "steps", "position", "source", "key")
-        columns = [every[name] if name != "steps" else every["steps"] > 0 for name in names]
-        every = every[np.lexsort(columns)]
-        own = every[every["phase"] == PHASES.index("eval")]
-        return every, (own["key"].copy(), np.concatenate([[0], np.cumsum(own["steps"])]))
-
-    def _alongside(self, times: Array) -> NDArray[np.float64]:
-        """Return the training steps of the run when every process had stepped its environments so often."""
-        total = np.zeros(len(times))
-        for source in self._sources:
-            if stop := source.stops["train"]:
-                total += np.minimum(times * source.n, stop) * (source.taken["train"] / stop)
-        return total
-
-    def _place(self, source: Source, position: int) -> tuple[float, int]:
-        """Return the key and the position in the run of a position that a process counted."""
-        trained, evaluated = (source.phase_steps(phase, position) for phase in PHASES)
-        if source.stops["train"]:
-            key = float(self._alongside(np.array([trained / source.n]))[0])
-        elif source.is_placed:
-            key = float(position - evaluated)
-        else:
-            key = float(self._alongside(np.array([evaluated / source.n]))[0])
-        return key, min(int(key), self._totals["train"]) + self._evaluated_by(key)
-
-    def _evaluated_by(self, key: float) -> int:
-        """Return the evaluation steps of the run in units up to a key."""
-        keys, steps = self._evaluated
-        return int(steps[np.searchsorted(keys, key, side="right")])
-
-    # --- steps ----------------------------------------------------------------------------------------
-
-    def _copy_units(self) -> int:
-        """Copy all resets, steps and extras; return how many rewards the environment's table excludes."""
-        recorder, copied = self._recorder, Copied(self._first.kind, self._mdp)
-        kind = CopiedMessages if copied.kind == "variable" else CopiedRows
-        rows = {phase: kind(recorder, copied, phase) for phase in PHASES}
-        extras = CopiedExtras(recorder, self._sources)
-        active, copied_steps, total = rows["train"], 0, sum(self._totals.values())
-        for unit in self._units:
-            phase, source = PHASES[unit["phase"]], self._sources[unit["source"]]
-            own: Any = rows[phase]
-            if own is not active:
-                active.commit()
-                own.open()
-                active = own
-            unit["new_reset"] = own.resets
-            unit["new_step"] = own.place[0]
-            unit["new_position"] = sum(recorder.steps.values()) + own.filled
-            own.put_reset(source.reset(phase, unit), source.environment + int(unit["environment"]))
-            unit["new_episode"] = own.begun + 1
-            for steps, numbers in source.steps(phase, unit):
-                extras.copy(source, phase, numbers, own.place[0], sum(recorder.steps.values()) + own.filled)
-                own.put(steps)
-                copied_steps += len(numbers)
-                self._report(copied_steps, total)
-        for each in rows.values():
-            each.commit()
-        for source in self._sources:
-            for phase in PHASES:  # the units of each as placed, ordered by environment
-                placed = self._units[
-                    (self._units["source"] == source.number) & (self._units["phase"] == PHASES.index(phase))
-                ]
-                source.units[phase] = placed[np.lexsort((placed["reset"], placed["environment"]))]
-        self._begun = {}
-        for number, phase in enumerate(PHASES):
-            own = self._units[self._units["phase"] == number]
-            self._begun[phase] = own["key"].copy(), own["new_episode"].copy()
-        return sum(each.off_table for each in rows.values())
-
-    # --- messages -------------------------------------------------------------------------------------
-
-    def _copy_messages(self, topic: Topic, spool: Any) -> None:
-        """Copy the messages of a topic, but those of steps, in the order of the run."""
-        if topic in schema.UNIFORM_TOPICS or topic.name.endswith(("/step", "/reset", "/episode")):
-            return
-        if topic == schema.EXTRA_COLUMNS_TOPIC:
-            return
-        spool.seek(0)
-        places: list[tuple[int, int, int, int]] = []
-        for source in self._sources:
-            if topic not in source.recording.topics:
-                continue
-            for position, payload in self._messages(source, topic):
-                places.append((position, len(places), spool.tell(), len(payload)))
-                spool.write(payload)
-        for position, _, offset, length in sorted(places):
-            spool.seek(offset)
-            self._recorder.append(topic, spool.read(length), position)
-            if topic == schema.SCALAR_TOPIC:
-                spool.seek(offset)
-                fields = decode(schema.SCALAR, spool.read(length))
-                self._outcomes.take_logged(fields["name"], fields["value"])
-
-    def _messages(self, source: Source, topic: Topic) -> Iterator[tuple[int, bytes]]:
-        """Yield position and payload in the run of a process's messages of a topic."""
-        phase = topic.phase
-        if topic.message == schema.RESET_STATE:
-            for state in source.recording.reset_states(phase):
-                found = source.units[phase][source.units[phase]["reset"] == state.reset]
-                for unit in found:
-                    environment = source.environment + state.environment
-                    moved = state._replace(reset=int(unit["new_reset"]), environment=environment)
-                    yield int(unit["new_position"]), moved.to_payload()
-            return
-        for fields in source.recording.decoded(topic):
-            position = int(fields.pop("log_time")) // STEP_NANOSECONDS
-            if topic.message == schema.INFO:
-                yield from self._info(source, phase, fields)
-            elif topic.message == schema.IMAGE:
-                yield self._frame(source, phase, position, fields)
-            else:
-                yield from self._moment(source, topic, position, fields)
-
-    def _info(self, source: Source, phase: str, fields: dict[str, Any]) -> Iterator[tuple[int, bytes]]:
-        if not fields["reset"]:
-            if fields["step"] < source.stops[phase]:
-                step, position = source.step_place(phase, fields["step"])
-                yield position, encode(schema.INFO, fields | {"step": step})
-            return
-        for unit in source.resets_at(phase, fields["step"]):
-            own = fields | {"step": int(unit["new_step"])}
-            yield int(unit["new_position"]), encode(schema.INFO, own)
-
-    def _frame(self, source: Source, phase: str, position: int, fields: dict[str, Any]) -> tuple[int, bytes]:
-        environment, is_reset = frame_place(fields)
-        step = source.phase_steps(phase, position)
-        if is_reset:
-            place = int(source.unit_begun(phase, environment, step)["new_position"])
-        else:
-            _, place = source.step_place(phase, max(step - source.n, 0) + environment)
-        return place, encode_image(fields["data"], fields["format"], place, frame_id(phase, None, is_reset))
-
-    def _moment(
-        self, source: Source, topic: Topic, position: int, fields: dict[str, Any]
-    ) -> Iterator[tuple[int, bytes]]:
-        """Yield a message that belongs to a moment: a logged number, a text, an array, a checkpoint."""
-        key, place = self._place(source, position)
-        if topic.message == schema.LOG:
-            seconds, level = place * STEP_NANOSECONDS / 1e9, log_level(fields["level"])
-            yield place, encode_log(fields["message"], seconds, level, fields["name"])
-        elif {"phase", "step", "episode"} <= fields.keys():
-            keys, episodes = self._begun[fields["phase"]]
-            at = int(np.searchsorted(keys, key, side="right")) - 1
-            fields["step"] = place - self._evaluated_by(key)
-            if fields["phase"] == "eval":
-                fields["step"] = self._evaluated_by(key)
-            fields["episode"] = max(int(episodes[at]), 0) if at >= 0 else 0
-            yield place, encode(topic.message, fields)
-        elif source is (self._main if topic == schema.CLOCK_TOPIC else self._sources[0]):
-            # Of a machine or a process, such as what it printed.
-            yield place, encode(topic.message, fields)
