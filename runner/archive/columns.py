@@ -28,6 +28,7 @@ from runner.util.arrays import Array
 
 _TICK: Final = np.uint64(STEP_NANOSECONDS)
 _BLANKS: Final = 16_384
+_cached_blanks = lru_cache(8)(blank_records)
 _INT64, _INT32, _FLOAT, _FLAG = pa.int64(), pa.int32(), pa.float64(), pa.bool_()
 
 
@@ -392,12 +393,7 @@ def _blanks(topic: Topic, sizes: Sizes, n: int) -> Records:
     rounded = -(-n // _BLANKS) * _BLANKS
     if rounded * record_dtype(topic.message, sizes).itemsize > BLOCK_BYTES:
         return blank_records(topic, sizes, n)
-    return _blank(topic, sizes, rounded)[:n].copy()
-
-
-@lru_cache(8)
-def _blank(topic: Topic, sizes: Sizes, n: int) -> Records:
-    return blank_records(topic, sizes, n)
+    return _cached_blanks(topic, sizes, rounded)[:n].copy()
 
 
 def _constant(code: int, n: int, names: tuple[str, ...]) -> pa.DictionaryArray:

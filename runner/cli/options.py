@@ -145,10 +145,6 @@ def _number(text: str) -> int:
     return int(text)
 
 
-def _numbers(text: str) -> tuple[int, ...]:
-    return tuple(map(_number, text.split(",")))
-
-
 def _trial(text: str) -> tuple[int, int]:
     after, colon, trial = text.partition(":")
     return _number(after), _number(trial) if colon else 0
@@ -164,18 +160,11 @@ def _ranges(text: str) -> Ranges:
     return tuple(ranges)
 
 
-def _picture_size(text: str) -> str:
-    width, _, height = text.partition("x")
-    if not 1 <= _number(width) <= 8192 >= _number(height) >= 1:
+def _pair(text: str, limit: int) -> tuple[int, int]:
+    first, _, second = text.partition("x")
+    if not 1 <= _number(first) <= limit >= _number(second) >= 1:
         raise ValueError(text)
-    return text
-
-
-def _grid(text: str) -> tuple[int, int]:
-    rows, _, columns = text.partition("x")
-    if not 1 <= _number(rows) <= 8 >= _number(columns) >= 1:
-        raise ValueError(text)
-    return _number(rows), _number(columns)
+    return _number(first), _number(second)
 
 
 def _step(text: str) -> StepRef:
@@ -201,9 +190,15 @@ SETTING: Final = Completed("setting", _settings)
 FILTER_WORD: Final = Completed("filter", _filter_words)
 TRIAL: Final = Parsed("N:TRIAL", "N:TRIAL, such as 3000:0", _trial)
 RANGES: Final = Parsed("ranges", "START:STOP or N, such as 0:20,49980:50000", _ranges)
-NUMBERS: Final = Parsed("numbers", "numbers such as 1000,49000", _numbers)
-PICTURE_SIZE: Final = Parsed("WxH", "WIDTHxHEIGHT up to 8192x8192, such as 1600x900", _picture_size)
-GRID: Final = Parsed("RxC", "ROWSxCOLUMNS up to 8x8, such as 3x3", _grid)
+NUMBERS: Final = Parsed(
+    "numbers", "numbers such as 1000,49000", lambda text: tuple(map(_number, text.split(",")))
+)
+PICTURE_SIZE: Final = Parsed(
+    "WxH",
+    "WIDTHxHEIGHT up to 8192x8192, such as 1600x900",
+    lambda text: "{}x{}".format(*_pair(text, 8192)),
+)
+GRID: Final = Parsed("RxC", "ROWSxCOLUMNS up to 8x8, such as 3x3", lambda text: _pair(text, 8))
 TARGET: Final = Parsed("METRIC=LEVEL", "METRIC=LEVEL such as success_percent=80", _target)
 AXIS: Final = Parsed("axis", "episodes, steps, updates or time", _axis)
 STEP: Final = Parsed("step", "EPISODE:T, or eval:N:TRIAL:T", _step)

@@ -10,6 +10,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Final
 
+import gymnasium
 import numpy as np
 
 from runner.errors import RecordingError
@@ -191,8 +192,6 @@ def _environment_spec(
     recording: Recording, observations: object, actions: object
 ) -> tuple[object, list[str]]:
     """Return the specification of the environment; None and a note if it cannot be made here."""
-    import gymnasium
-
     env_id, kwargs = recording.environment["env_id"], recording.environment["kwargs"]
     try:
         with warnings.catch_warnings():

@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping
 from numbers import Integral
 from typing import Any, Unpack
 
-from gymnasium import spaces
-
 from runner.environments.mdp import MAX_AGENTS
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, kind_of
@@ -20,6 +18,7 @@ from runner.loops.recorded import RecordedAlone, require_pictures
 from runner.loops.single_rows import AgentRows
 from runner.loops.values import check_phase
 from runner.loops.vector import by_field, require_fixed
+from runner.replay.stepping import game_spaces
 from runner.replay.turns import Turns, is_in_turns
 
 
@@ -208,10 +207,3 @@ def _game(env: Any) -> Described:
         env_id=str(name or type(env).__name__),
         agents=agents,
     )
-
-
-def game_spaces(env: Any) -> tuple[spaces.Dict, spaces.Dict]:
-    """Return the spaces of the observations and actions of all agents of a game."""
-    agents = env.possible_agents
-    observations = spaces.Dict({agent: env.observation_space(agent) for agent in agents})
-    return observations, spaces.Dict({agent: env.action_space(agent) for agent in agents})

@@ -25,12 +25,13 @@ from numpy.typing import NDArray
 from runner.errors import CannotRedo, ConfigError, RecordingError, RunnerError
 from runner.export.minari_episodes import episodes_in
 from runner.loops.env import record
-from runner.loops.parallel import game_spaces, record_parallel
+from runner.loops.parallel import record_parallel
 from runner.loops.values import as_array
 from runner.recording.gym_spaces import restore_space
 from runner.recording.gym_values import element_of
 from runner.recording.reader import Recording, open_recording
 from runner.replay.makers import make_environment, why_not_alone, why_not_made
+from runner.replay.stepping import game_spaces
 from runner.runs.checkpoints import Checkpoint
 from runner.runs.run import Run
 from runner.util.arrays import Array

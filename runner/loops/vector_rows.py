@@ -274,9 +274,9 @@ class VectorRows:
         self._block_resets, self._finals, self._autoreset_states = [], [], {}
 
     def _count(self) -> EpisodeCounts:
-        rows, n = self._filled, self._n
+        rows = self._filled
         over = self._terminated[:rows] | self._truncated[:rows]
-        only_reset = np.zeros((rows, n), np.bool_)
+        only_reset = np.zeros_like(over)
         if self._next_step:
             only_reset[0], only_reset[1:] = self._over, over[:-1]
             for reset in self._block_resets:
@@ -302,7 +302,12 @@ class VectorRows:
             "truncated": truncated,
         }
         if self._discrete:
-            columns["state"] = self._states()
+            states = np.vstack([self._state, self._observations[:rows].astype(np.int64)])
+            states[1:] -= self._state_start
+            for reset in self._block_resets:
+                states[reset.row, reset.which] = reset.observation.astype(np.int64) - self._state_start
+            self._state = states[-1].copy()
+            columns["state"] = states[:-1]
             columns["action"] = self._actions[:rows].astype(np.int64) - self._action_start
             columns["next_state"] = last.astype(np.int64) - self._state_start
         else:
@@ -311,15 +316,6 @@ class VectorRows:
             columns["agents_terminated"], columns["agents_truncated"] = terminated, truncated
         flat = {name: values.reshape(rows * n, *values.shape[2:]) for name, values in columns.items()}
         self._record(self._steps, flat, first + np.arange(1, rows * n + 1))
-
-    def _states(self) -> NDArray[np.int64]:
-        """Return the states before each row; keep those after the last."""
-        states = np.vstack([self._state, self._observations[: self._filled].astype(np.int64)])
-        states[1:] -= self._state_start
-        for reset in self._block_resets:
-            states[reset.row, reset.which] = reset.observation.astype(np.int64) - self._state_start
-        self._state = states[-1].copy()
-        return states[:-1]
 
     def _put_block_resets(self, counts: EpisodeCounts, first: int) -> None:
         """Record the resets between and within the steps of the block, in their order."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from runner.environments.gym_types import Space
@@ -107,14 +108,9 @@ class Stepper(ABC):
         self._learners = len(recording.agents)
         topics = [recording.topic(f"/train/{name}") for name in ("step", "reset")]
         fields = "next_state" if recording.kind == "step" else "next_observation", "observation"
-        found = zip(topics, fields, strict=True)
+        found, known = zip(topics, fields, strict=True), recording.dtypes
         varying = np.dtype(object)
-        self.dtypes = Dtypes(
-            *(
-                recording.dtypes[topic][name] if topic in recording.dtypes else varying
-                for topic, name in found
-            )
-        )
+        self.dtypes = Dtypes(*(known[topic][name] if topic in known else varying for topic, name in found))
 
     @abstractmethod
     def _spaces(self) -> tuple[Space, Space]:
@@ -315,16 +311,13 @@ class GameStepper(RowStepper):
     """A PettingZoo parallel environment."""
 
     def _spaces(self) -> tuple[Space, Space]:
-        from gymnasium import spaces
-
         agents = self.env.possible_agents
         if tuple(map(str, agents)) != self._recording.agents:
             raise CannotRedo(
                 f"The environment has the agents {', '.join(map(str, agents))}, and the recording "
                 f"{', '.join(self._recording.agents)}."
             )
-        observations = spaces.Dict({agent: self.env.observation_space(agent) for agent in agents})
-        return observations, spaces.Dict({agent: self.env.action_space(agent) for agent in agents})
+        return game_spaces(self.env)
 
     def _filler(self, column: Array, is_first: bool = False) -> Put:  # noqa: ARG002
         return filler_by_agent(leaves_by_agent(self.observation_space, "observation"), column)
@@ -332,8 +325,8 @@ class GameStepper(RowStepper):
     def actions(self, rows: NDArray[np.void]) -> Sequence[Any]:
         """Return the actions of recorded steps as the environment takes them."""
         agents = self.env.possible_agents
-        spaces: Any = self.action_space
-        columns = {agent: values_in(spaces[agent], np.array(rows["action"][str(agent)])) for agent in agents}
+        own: Any = self.action_space
+        columns = {agent: values_in(own[agent], np.array(rows["action"][str(agent)])) for agent in agents}
         return [
             {agent: columns[agent][row] for i, agent in enumerate(agents) if acted >> i & 1}
             for row, acted in enumerate(rows["acted"].tolist())
@@ -365,10 +358,15 @@ class GameStepper(RowStepper):
             results.done = row
 
 
+def game_spaces(env: Any) -> tuple[spaces.Dict, spaces.Dict]:
+    """Return the spaces of the observations and actions of all agents of a game."""
+    agents = env.possible_agents
+    observations = spaces.Dict({agent: env.observation_space(agent) for agent in agents})
+    return observations, spaces.Dict({agent: env.action_space(agent) for agent in agents})
+
+
 def values_in(space: Space, column: NDArray[Any]) -> Sequence[Any]:
     """Return the values of a column, one by one, as an environment with this action space takes them."""
-    from gymnasium import spaces
-
     if isinstance(space, spaces.Dict):
         parts = {key: values_in(part, np.array(column[str(key)])) for key, part in space.spaces.items()}
         return [{key: part[row] for key, part in parts.items()} for row in range(len(column))]
@@ -384,8 +382,6 @@ def keyed(space: Space, value: Any) -> Any:
     Raises:
         CannotRedo: values of the space are recorded as text that does not give them back.
     """
-    from gymnasium import spaces
-
     if isinstance(space, spaces.Dict):
         return {key: keyed(part, value[str(key)]) for key, part in space.spaces.items()}
     if isinstance(space, spaces.Tuple):

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from runner.environments.gym_types import Space
@@ -194,8 +195,6 @@ def _calls(resets: Sequence[_Numbered]) -> Iterator[list[_Numbered]]:
 
 def _batches(space: Space, column: NDArray[Any], n: int) -> Sequence[Any]:
     """Return a column of actions as batches of n, as a vector takes them."""
-    from gymnasium import spaces
-
     if isinstance(space, spaces.Dict):
         parts = {key: _batches(part, column[str(key)], n) for key, part in space.spaces.items()}
         return [{key: part[time] for key, part in parts.items()} for time in range(len(column) // n)]

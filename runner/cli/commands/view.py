@@ -13,7 +13,8 @@ from runner.cli import Command
 from runner.cli.commands.export import print_selection
 from runner.cli.options import PICTURE_SIZE, STEP, RunName, force_option, recordings_option, selection_options
 from runner.cli.output import say
-from runner.cli.runs import find_recorded
+from runner.cli.progress import stage_line
+from runner.cli.runs import compilation_notice, find_recorded
 
 if TYPE_CHECKING:
     from runner.analysis.step_reference import StepRef
@@ -86,8 +87,6 @@ def view_command(
     """
     if len(run_names) > 2:
         raise click.UsageError(f"found {len(run_names)} runs, expected one or two.")
-    from runner.cli.progress import stage_line
-    from runner.cli.runs import compilation_notice
     from runner.export.places import require_new
     from runner.export.rerun.viewer import require_rerun
 
@@ -127,7 +126,6 @@ def _show(
     path: Path, location: Location, web: bool, port: int, screenshot: Path | None, picture_size: str
 ) -> None:
     """Show an exported file."""
-    from runner.cli.progress import stage_line
     from runner.export.rerun import viewer
 
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so the viewer is ended too
