@@ -16,7 +16,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, Self
 
@@ -27,9 +27,11 @@ from runner.integrations.hooks import hook_environments
 from runner.integrations.media import Histogram, Image, Table, Video
 from runner.integrations.script import ScriptRun
 from runner.integrations.tensorboard import as_number, forward, step_of
+from runner.integrations.wandb_settings import Config, Summary
+from runner.loops.options import settings_in
 from runner.loops.recorded import ending_of
 from runner.loops.values import warn_user
-from runner.util.jsonable import as_json, as_mapping
+from runner.util.jsonable import as_json
 from runner.util.values import RUN_NAME_PATTERN, flatten
 
 _SUPPORTED: Final = (
@@ -55,74 +57,6 @@ class Settings:
 # --- a run --------------------------------------------------------------------------------------------------
 
 
-class Config(MutableMapping[str, Any]):
-    """The settings of a run: `config["lr"]`, `config.lr`, `config.update({...})`."""
-
-    _run: Tracked
-
-    def __init__(self, tracked: Tracked) -> None:
-        object.__setattr__(self, "_run", tracked)
-
-    def update(self, *settings: Any, **more: Any) -> None:
-        """Take the settings of a mapping, dataclass or namespace."""
-        more.pop("allow_val_change", None)
-        for each in settings:
-            self._run.configure(_mapping(each))
-        self._run.configure(more)
-
-    def setdefaults(self, settings: Any) -> None:
-        """Take the settings that are not there yet."""
-        self._run.configure({key: value for key, value in _mapping(settings).items() if key not in self})
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the settings."""
-        return dict(self._run.script.settings)
-
-    def __getitem__(self, key: str) -> Any:
-        return self._run.script.settings[key]
-
-    def __setitem__(self, key: str, value: object) -> None:
-        self._run.configure({key: value})
-
-    def __delitem__(self, key: str) -> None:
-        raise RunnerError(f"config: {key!r} cannot be removed")
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._run.script.settings)
-
-    def __len__(self) -> int:
-        return len(self._run.script.settings)
-
-    def __getattr__(self, key: str) -> Any:
-        try:
-            return self._run.script.settings[key]
-        except KeyError:
-            raise AttributeError(f"config has no {key!r}, but {', '.join(self) or 'nothing'}") from None
-
-    __setattr__ = __setitem__
-
-
-class Summary(dict[str, Any]):
-    """The last value logged under each name, and what the script puts there, which is logged at the end."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.own: dict[str, Any] = {}
-
-    def __setitem__(self, key: str, value: object) -> None:
-        super().__setitem__(key, value)
-        self.own[key] = value
-
-    def update(self, values: Any = (), **more: Any) -> None:  # type: ignore[override]
-        """Put several values there."""
-        for key, value in {**dict(values), **more}.items():
-            self[key] = value
-
-    def seen(self, key: str, value: object) -> None:
-        """Note a value that was logged."""
-        super().__setitem__(key, value)
-
-
 class Tracked:
     """A run, as `wandb.init` returns it; a context manager."""
 
@@ -141,7 +75,7 @@ class Tracked:
         self.script = script
         self.project, self.group, self.job_type, self.tags = project, group, job_type, tuple(tags)
         self.disabled = is_disabled
-        self.config, self.summary = Config(self), Summary()
+        self.config, self.summary = Config(script, self.configure), Summary()
         script.log_last = self._log_summary
         self.expects_writer = False
         """Whether the script's `SummaryWriter` is to write into the run."""
@@ -361,7 +295,7 @@ def init(
     if is_disabled:
         script.discard()
     run = Tracked(script, project or "", group or "", job_type or "", tags or (), is_disabled)
-    run.configure(_mapping(config))
+    run.configure(settings_in(config))
     if (sync_tensorboard or tensorboard) and not is_disabled:
         script.has_writer, run.expects_writer = forward(), True
     return run
@@ -382,17 +316,6 @@ def _open_run(what: str) -> Tracked:
     if run is None:
         raise RunnerError(f"wandb.{what}: no run is open: call wandb.init() first")
     return run
-
-
-def _mapping(settings: Any) -> Mapping[Any, Any]:
-    if settings is None:
-        return {}
-    mapping = as_mapping(settings)
-    if mapping is None:
-        raise ConfigError(
-            f"config: found {type(settings).__name__}, expected a mapping, dataclass or namespace"
-        )
-    return mapping
 
 
 def _name(name: str | None) -> str | None:
@@ -417,9 +340,7 @@ def _without_effect(name: str) -> Callable[..., None]:
     return do_nothing
 
 
-define_metric, log_code, login, save, setup, unwatch, watch = map(
-    _without_effect, ("define_metric", "log_code", "login", "save", "setup", "unwatch", "watch")
-)
+define_metric, login, log_code, save, setup, unwatch, watch = map(_without_effect, _NO_EFFECT)
 
 
 def __getattr__(name: str) -> Any:

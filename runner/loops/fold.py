@@ -36,6 +36,7 @@ from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import create_recording
 from runner.runs.run import Run
 from runner.runs.shards import ENDS_AS, shards_of
+from runner.util.arrays import Array
 
 _KEPT: Final = frozenset({"run", "result", "repair"})
 """The metadata that is not copied from the process that began the run."""

@@ -75,10 +75,8 @@ def _fold(run: Run, report: Report) -> Run:
             fresh.replace(run.folder / RECORDING_FILE)
         forget_upload(run)
         facts = {key: value for key, value in run.facts.items() if key != ENDS_AS}
-        run = Run(run.folder, facts).update(
-            status=ending_of_run(run), summary={**run.file.summary, **summary}
-        )
-    if summary is not None:
+        summary = {**run.file.summary, **summary}
+        run = Run(run.folder, facts).update(status=ending_of_run(run), summary=summary)
         shutil.rmtree(run.folder / SHARDS_FOLDER)
     return run
 

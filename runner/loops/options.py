@@ -162,13 +162,8 @@ def options_of(
     info, config, seed = options.get("info", ()), options.get("config"), options.get("seed")
     if isinstance(info, str) and info != ALL_INFO:
         raise ConfigError(f"info: found {info!r}, expected a list of names, such as [{info!r}]")
-    mapping = as_mapping({} if config is None else config)
-    if mapping is None:
-        raise ConfigError(
-            f"config: found {type(config).__name__}, expected a mapping, a dataclass or a namespace"
-        )
     try:
-        settings = as_json(mapping)
+        settings = as_json(settings_in(config))
         json.dumps(settings, ensure_ascii=False).encode()
     except (RecursionError, ValueError) as error:
         raise ConfigError(
@@ -195,6 +190,20 @@ def options_of(
         join=None if join is None else find_joined(join, recordings),
         **given_as_is,
     )
+
+
+def settings_in(config: object) -> Mapping[Any, Any]:
+    """Return the user's own settings in a mapping, a dataclass or a namespace; none in None.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    mapping = as_mapping({} if config is None else config)
+    if mapping is None:
+        raise ConfigError(
+            f"config: found {type(config).__name__}, expected a mapping, a dataclass or a namespace"
+        )
+    return mapping
 
 
 def pillow() -> Any:

@@ -1,0 +1,80 @@
+"""The settings and the summary of a run with the shape of wandb's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from typing import Any
+
+from runner.errors import RunnerError
+from runner.integrations.script import ScriptRun
+from runner.loops.options import settings_in
+
+
+class Config(MutableMapping[str, Any]):
+    """The settings of a run: `config["lr"]`, `config.lr`, `config.update({...})`."""
+
+    _script: ScriptRun
+    _configure: Callable[[Mapping[str, Any]], None]
+
+    def __init__(self, script: ScriptRun, configure: Callable[[Mapping[str, Any]], None]) -> None:
+        object.__setattr__(self, "_script", script)
+        object.__setattr__(self, "_configure", configure)
+
+    def update(self, *settings: Any, **more: Any) -> None:
+        """Take the settings of a mapping, dataclass or namespace."""
+        more.pop("allow_val_change", None)
+        for each in settings:
+            self._configure(settings_in(each))
+        self._configure(more)
+
+    def setdefaults(self, settings: Any) -> None:
+        """Take the settings that are not there yet."""
+        self._configure({key: value for key, value in settings_in(settings).items() if key not in self})
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the settings."""
+        return dict(self._script.settings)
+
+    def __getitem__(self, key: str) -> Any:
+        return self._script.settings[key]
+
+    def __setitem__(self, key: str, value: object) -> None:
+        self._configure({key: value})
+
+    def __delitem__(self, key: str) -> None:
+        raise RunnerError(f"config: {key!r} cannot be removed")
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._script.settings)
+
+    def __len__(self) -> int:
+        return len(self._script.settings)
+
+    def __getattr__(self, key: str) -> Any:
+        try:
+            return self._script.settings[key]
+        except KeyError:
+            raise AttributeError(f"config has no {key!r}, but {', '.join(self) or 'nothing'}") from None
+
+    __setattr__ = __setitem__
+
+
+class Summary(dict[str, Any]):
+    """The last value logged under each name, and what the script puts there, which is logged at the end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.own: dict[str, Any] = {}
+
+    def __setitem__(self, key: str, value: object) -> None:
+        super().__setitem__(key, value)
+        self.own[key] = value
+
+    def update(self, values: Any = (), **more: Any) -> None:  # type: ignore[override]
+        """Put several values there."""
+        for key, value in {**dict(values), **more}.items():
+            self[key] = value
+
+    def seen(self, key: str, value: object) -> None:
+        """Note a value that was logged."""
+        super().__setitem__(key, value)
