@@ -1,10 +1,8 @@
-"""Several processes that record one run: joining, the order of what they recorded, killed processes."""
+"""Several processes that record one run: the order of what they recorded, killed processes."""
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -14,56 +12,19 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
-from runner.errors import ConfigError, RunnerError
 from runner.execution.redo import verify_by_redoing
 from runner.execution.verify import verify
 from runner.loops.folding import fold_if_over
 from runner.recording.reader import open_recording
-from runner.runs.listing import list_runs, run_at
-from runner.runs.shards import RUN_VARIABLE, shards_of
+from runner.runs.listing import run_at
+from runner.runs.shards import shards_of
 from tests.runner.loops.making import Rooms, dualtaxi
+from tests.runner.loops.sharing import SPAWN, play, started, work
 
-SPAWN = multiprocessing.get_context("spawn")
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-
-
-def play(rec, steps: int, seed: int | None, delay: float = 0.0, log: bool = True) -> None:
-    """Take steps with random actions in an environment, with resets, extras and logged numbers."""
-    chance, generator = random.Random(), np.random.default_rng(seed)
-    rec.reset(seed=seed)
-    for step in range(steps):
-        if delay and step % 40 == 0:
-            time.sleep(chance.random() * delay)
-        action = int(generator.integers(rec.action_space.n))
-        _, _, terminated, truncated, _ = rec.step(action, {"value": step / 2})
-        if terminated or truncated:
-            rec.reset()
-        if log and step % 50 == 0:
-            rec.log("loss", 1 / (step + 1))
-
-
-def work(run, shard, steps, seed, delay=0.0, env_id="CartPole-v1", phase="train", at=None):
-    """Join a run and take steps, in a process of its own."""
-    env = gymnasium.make(env_id)
-    with runner.record(env, join=run, shard=shard, phase=phase) as rec:
-        if at is not None:
-            rec.at_step(at)
-        play(rec, steps, seed, delay)
-
-
-def run_all(*processes) -> None:
-    for process in processes:
-        process.start()
-    for process in processes:
-        process.join(60)
-        assert process.exitcode == 0
-
-
-def started(*arguments, **keywords):
-    return SPAWN.Process(target=work, args=arguments, kwargs=keywords)
 
 
 def together(folder: Path, delay: float) -> runner.Run:
@@ -363,115 +324,6 @@ def test_a_fold_that_was_killed_is_done_again(tmp_path, monkeypatch):
     assert not shards_of(run)
     with open_recording(run.recording) as recording:
         assert recording.done()["train_steps"] == 200
-
-
-# --- joining ----------------------------------------------------------------------------------------------
-
-
-def test_sixteen_processes_join_at_once(tmp_path):
-    with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="many") as rec:
-        context = multiprocessing.get_context("fork")
-        run_all(*(context.Process(target=work, args=(rec.run, "same", 20, k)) for k in range(16)))
-        names = [shard.run_id for shard in shards_of(rec.run)]
-        assert names == ["same", *(f"same-{n}" for n in range(2, 17))]
-    with open_recording(rec.run.recording) as recording:
-        assert len(recording.shards) == 17
-        assert recording.done()["train_steps"] == 320
-    assert len(list_runs(tmp_path)) == 1
-
-
-def test_a_run_is_joined_by_id_prefix_name_folder_or_variable(tmp_path, monkeypatch):
-    monkeypatch.setenv("DUALTAXI_RECORDINGS", str(tmp_path))
-    with runner.record(gymnasium.make("CartPole-v1"), name="named") as rec:
-        assert os.environ[RUN_VARIABLE] == str(rec.run.folder.absolute())
-        run = rec.run
-        ways = [run.run_id, run.run_id[:5], "named", str(run.folder), run.folder, run, True]
-        for k, way in enumerate(ways):
-            work(way, f"w{k}", 10, k)
-    assert RUN_VARIABLE not in os.environ
-    with open_recording(rec.run.recording) as recording:
-        assert len(recording.shards) == 1 + len(ways)
-
-
-def recorded_here(run):
-    return lambda: runner.record(gymnasium.make("CartPole-v1"), join=run)
-
-
-def test_the_workers_of_an_async_vector_are_named_by_their_numbers(tmp_path):
-    with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="async") as rec:
-        envs = AsyncVectorEnv([recorded_here(rec.run)] * 3, context="fork")
-        envs.action_space.seed(0)
-        envs.reset(seed=0)
-        for _ in range(50):
-            envs.step(envs.action_space.sample())
-        envs.close()
-    with open_recording(rec.run.recording) as recording:
-        names = [shard.name for shard in recording.shards]
-    assert names == ["", *(f"Worker-AsyncVectorEnv-{k}" for k in range(3))]
-
-
-def test_mistakes_of_joining_are_named(tmp_path, monkeypatch):
-    def env():
-        return gymnasium.make("CartPole-v1")
-
-    monkeypatch.delenv(RUN_VARIABLE, raising=False)
-    with pytest.raises(ConfigError, match="found no DUALTAXI_RUN"):
-        runner.record(env(), join=True)
-    with pytest.raises(RunnerError, match="no run 'nothing'"):
-        runner.record(env(), tmp_path, join="nothing")
-    actions = runner.record(env(), tmp_path, steps="actions")
-    with pytest.raises(RunnerError, match="is recorded with steps 'actions', expected all"):
-        runner.record(env(), join=actions.run)
-    actions.close()
-    rec = runner.record(env(), tmp_path, name="mistakes")
-    with pytest.raises(ConfigError, match="expected the spaces and agents of run"):
-        runner.record(gymnasium.make("MountainCar-v0"), join=rec.run)
-    with pytest.raises(ConfigError, match="name, seed or config"):
-        runner.record(env(), join=rec.run, name="other")
-    with pytest.raises(ConfigError, match="without join"):
-        runner.record(env(), shard="w")
-    with pytest.raises(ConfigError, match="1 to 80 letters"):
-        runner.record(env(), join=rec.run, shard="a/b")
-    with pytest.raises(ConfigError, match="1 to 80 letters"):
-        runner.record(env(), join=rec.run, shard=".hidden")  # which nothing would find
-    with pytest.raises(ConfigError, match="join: found 3"):
-        runner.record(env(), join=3)
-    two = runner.record(env(), join=rec.run, shard="w")
-    with pytest.raises(ConfigError, match="at_step: found -1"):
-        two.at_step(-1)
-    two.reset(seed=0)
-    two.step(0)
-    with pytest.raises(RunnerError, match="found training steps of this process"):
-        two.at_step(5)
-    two.close()
-    rec.close()
-    with pytest.raises(RunnerError, match="is finished, expected one that is still being recorded"):
-        runner.record(env(), join=rec.run)
-
-
-def test_a_job_cannot_be_joined(tmp_path):
-    job = runner.run("quick", overrides=["episodes=2", "evaluation=null"], recordings=tmp_path)
-    with pytest.raises(RunnerError, match="is a job"):
-        runner.record(gymnasium.make("Taxi-v4"), join=job)
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
-def test_the_owner_may_end_before_its_shards(tmp_path, monkeypatch):
-    monkeypatch.setattr("runner.loops.loop_run.OWNER_WAITS", 0.1)
-    rec = runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="early")
-    two = runner.record(gymnasium.make("CartPole-v1"), join=rec.run, shard="late")
-    play(two, 50, 1)
-    play(rec, 50, 2)
-    rec.close()
-    assert rec.run.summary.train_steps == 50
-    assert len(shards_of(rec.run)) == 1
-    assert (rec.run.status, run_at(rec.run.folder).status) == ("running", "running")
-    with pytest.raises(RunnerError, match="is finished, expected"):
-        runner.record(gymnasium.make("CartPole-v1"), join=rec.run)
-    play(two, 50, 1)
-    two.close()
-    run = run_at(rec.run.folder)
-    assert (run.status, run.summary.train_steps) == ("finished", 150)
 
 
 def test_games_of_several_agents_share_a_run(tmp_path):

@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING
 import pytest
 import yaml
 from loop_replays import record_loops, serving
+from served import Served
 from starlette.testclient import TestClient
 
 import runner
+from runner.client.outbox import outbox_folder
 from runner.service.app import create_app
 from runner.service.settings import Settings
 
@@ -104,3 +106,26 @@ def page(browser: webdriver.Chrome, served: str) -> Iterator[Callable[[str], web
     log = " ".join(entry["message"] for entry in browser.get_log("performance"))
     requested = set(re.findall(r'"url":"(\w+://[^"/]+)', log))
     assert {address for address in requested if address.startswith(("http", "ws"))} <= {served}
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with Served(tmp_path_factory.mktemp("server") / "runs") as started:
+        yield started
+
+
+@pytest.fixture
+def own_server(tmp_path: Path) -> Iterator[Served]:
+    """Return a server that may be killed; it is not started yet."""
+    made = Served(tmp_path / "theirs")
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+def outbox(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the outbox of this user, who has no token and no server."""
+    for name in ("DUALTAXI_TOKEN", "DUALTAXI_TOKEN_FILE", "DUALTAXI_SERVER"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    return outbox_folder()
