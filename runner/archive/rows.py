@@ -11,7 +11,7 @@ from blake3 import blake3
 from runner.archive import layout
 from runner.archive.columns import Shape
 from runner.recording import schema
-from runner.recording.messages import QTable, decode, encode, encode_image, encode_log, log_level
+from runner.recording.messages import Message, QTable, decode, encode, encode_image, encode_log, log_level
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 
 _WITH_SPACES: Final = (schema.TRANSITION, schema.RESET)
@@ -31,7 +31,7 @@ class PlacedTable:
         return self.table.step
 
 
-def message_row(topic: Topic, payload: bytes, shape: Shape) -> dict[str, object]:
+def message_row(topic: Topic, payload: bytes, shape: Shape) -> Message:
     """Return a message as the values of its columns, but run and position.
 
     Raises:

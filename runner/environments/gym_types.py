@@ -9,3 +9,6 @@ from gymnasium.vector import VectorEnv
 Space = spaces.Space[Any]
 Env = gymnasium.Env[Any, Any]
 AnyVectorEnv = VectorEnv[Any, Any, Any]
+StepResult = tuple[Any, Any, bool, bool, dict[str, Any]]
+VectorStepResult = tuple[Any, Any, Any, Any, dict[str, Any]]
+ResetResult = tuple[Any, dict[str, Any]]

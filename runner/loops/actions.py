@@ -35,7 +35,7 @@ _KNOWN: Final = {
 _KNOWN_IN: Final = ("gymnasium.envs.", "mpe2.")
 
 
-def action_names(env: Any, space: Space) -> tuple[str, ...]:
+def action_names(env: object, space: Space) -> tuple[str, ...]:
     """Return the names of an environment's discrete actions, the least action's first; empty if unknown.
 
     Args:
@@ -48,7 +48,7 @@ def action_names(env: Any, space: Space) -> tuple[str, ...]:
             return ()
         layer = getattr(layer, "env", base)
     kinds = (kind for kind in type(base).__mro__ if kind.__module__.startswith(_KNOWN_IN))
-    names: Any = next((_KNOWN[kind.__name__] for kind in kinds if kind.__name__ in _KNOWN), ())
+    names: tuple[str, ...] = next((_KNOWN[kind.__name__] for kind in kinds if kind.__name__ in _KNOWN), ())
     meanings, named = getattr(base, "get_action_meanings", None), getattr(base, "actions", None)
     if callable(meanings):  # as ALE has
         try:
@@ -74,7 +74,7 @@ def action_in_words(space: Space, action: Any, names: Names) -> str:
     )
 
 
-def parsed_action(space: Space, given: Any, recorded: Any, names: Names) -> Any:
+def parsed_action(space: Space, given: object, recorded: Any, names: Names) -> Any:
     """Return an action in the dtypes of the recorded one.
 
     Args:
@@ -108,7 +108,7 @@ def parsed_action(space: Space, given: Any, recorded: Any, names: Names) -> Any:
     }
 
 
-def _parsed(space: Space, given: Any, recorded: Any, names: Sequence[str], where: str) -> Any:
+def _parsed(space: Space, given: object, recorded: Any, names: Sequence[str], where: str) -> object:
     if isinstance(space, spaces.Dict | spaces.Tuple):
         return _parsed_parts(space, given, recorded, where)
     if isinstance(space, spaces.Discrete):
@@ -149,7 +149,7 @@ def _parsed_json(space: Space, given: object, where: str) -> object:
     raise ConfigError(f"{where}: found {_short(given)}, expected an element of {space}")
 
 
-def _parsed_parts(space: Any, given: Any, recorded: Any, where: str) -> Any:
+def _parsed_parts(space: spaces.Dict | spaces.Tuple[Any], given: object, recorded: Any, where: str) -> object:
     """Return an action of a `Dict` or `Tuple`, whose text is JSON."""
     try:
         values = json.loads(given) if isinstance(given, str) else given

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -85,7 +85,7 @@ class RecordedBatches(Recorded[BatchRows]):
         if "_loop" in vars(self):
             super()._enter(phase)
 
-    def reset(self, observations: Any) -> None:
+    def reset(self, observations: object) -> None:
         """Record that all environments were reset, and these first observations, [N, ...].
 
         It ends episodes in progress. Episodes that ended are followed by resets without it, except with
@@ -147,7 +147,7 @@ class RecordedBatches(Recorded[BatchRows]):
                 raise
             self._loop.fail(error)
 
-    def _record_batch(self, arrays: tuple[Any, ...], finals: Any, extras: Mapping[str, Any]) -> None:
+    def _record_batch(self, arrays: tuple[object, ...], finals: object, extras: Mapping[str, object]) -> None:
         """Record T steps, from the arguments of `batch`."""
         observations, actions, rewards, terminated, truncated = arrays
         paid = np.asarray(as_array(rewards))
@@ -179,7 +179,7 @@ class RecordedBatches(Recorded[BatchRows]):
             if values:
                 self._loop.extras.put_batch(self._phase, self._rows, values)
 
-    def _open_from(self, before: Any, observations: Any, actions: Any) -> None:
+    def _open_from(self, before: object, observations: object, actions: object) -> None:
         """Begin the run of environments that are known from their first batch."""
         shape = next(_arrays(observations)).shape
         if len(shape) < 2:
@@ -193,7 +193,7 @@ class RecordedBatches(Recorded[BatchRows]):
             self.reset(self._first)
         self._first = None
 
-    def _begin_with(self, observations: Any) -> None:
+    def _begin_with(self, observations: object) -> None:
         """Take the observations before a batch: its reset, or those that the last batch ended with."""
         if not self._rows.has_begun:
             self._rows.reset(observations, (), np.ones(self.env.num_envs, np.bool_), {})
@@ -203,7 +203,7 @@ class RecordedBatches(Recorded[BatchRows]):
                 "call reset(first) if the environments were reset in between"
             )
 
-    def _check_finals(self, finals: Any, ends: Flags, observations: Any) -> None:
+    def _check_finals(self, finals: object, ends: Flags, observations: object) -> None:
         if finals is not None and self._mode != AutoresetMode.SAME_STEP:
             raise ConfigError(
                 f'final_observations: found some with autoreset_mode="{self._mode.value}", expected none: '
@@ -220,7 +220,7 @@ class RecordedBatches(Recorded[BatchRows]):
                 "within the step: pass final_observations to record them. This warning is given once."
             )
 
-    def close(self, **kwargs: Any) -> None:
+    def close(self, **kwargs: object) -> None:
         """Close the recording as finished, and environments that were given."""
         if "_loop" in vars(self):
             super().close(**kwargs)
@@ -236,7 +236,7 @@ def record_batches(
     observation_space: object = None,
     action_space: object = None,
     autoreset_mode: AutoresetMode | str | None = None,
-    make: str | Callable[[], Any] | None = None,
+    make: str | Callable[[], object] | None = None,
     **options: Unpack[RunOptions],
 ) -> RecordedBatches:
     """Return a recording of N environments that takes their steps in batches, without an object a step.
@@ -286,7 +286,7 @@ def _numpy(values: object) -> object:
     return as_array(values)
 
 
-def _arrays(values: Any) -> Any:
+def _arrays(values: object) -> Iterator[Any]:
     """Yield the arrays of nested values."""
     if isinstance(values, Mapping | tuple):
         for part in values.values() if isinstance(values, Mapping) else values:

@@ -264,7 +264,7 @@ class _Player:
                 report_progress(task.at.t + count)
         return f"stopped after {task.max_steps:,} steps"
 
-    def _next(self, observation: Any) -> Any:
+    def _next(self, observation: object) -> Any:
         """Return the policy's action; None where the recorded ones run out."""
         if self._function is not None:
             with from_policy(self._task.policy):

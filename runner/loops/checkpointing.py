@@ -70,7 +70,7 @@ def _leaves(values: Mapping[object, object], prefix: str) -> Iterator[tuple[str,
             yield f"{prefix}{key}", value
 
 
-def _safetensors(name: str, values: dict[str, Any]) -> bytes:
+def _safetensors(name: str, values: Mapping[str, Any]) -> bytes:
     if not 0 < len(values) <= _MAX_KEYS:
         raise ConfigError(f"checkpoint: found {len(values):,} arrays for {name!r}, expected at least one")
     torch = sys.modules.get("torch")

@@ -15,7 +15,7 @@ from runner.loops.rows import Rows
 from runner.recording import schema
 from runner.recording.messages import encode
 from runner.recording.recorder import Recorder
-from runner.util.arrays import Array
+from runner.util.arrays import Ints
 
 _STEP_FIELDS: Final = ("state", "action", "next_state")
 _TRANSITION_FIELDS: Final = ("action", "next_observation", "acted", "agents_terminated", "agents_truncated")
@@ -98,19 +98,19 @@ class CopiedRows(_Copies):
         self._reset_block = self._recorder.block(self._resets)
         return len(self._block), len(self._reset_block)
 
-    def _put_reset(self, observation: Any, seed: int | None) -> None:  # noqa: ARG002
+    def _put_reset(self, observation: object, seed: int | None) -> None:  # noqa: ARG002
         self._reset_block["observation"][len(self._reset_rows)] = observation
 
     def _rewards(self, n: int) -> NDArray[np.float64]:
         return np.asarray(self._block["rewards"][:n, 0])
 
-    def _transitions(self, n: int) -> tuple[Array, Array, Array]:
+    def _transitions(self, n: int) -> tuple[Ints, Ints, Ints]:
         if not self._state_fields:
             return super()._transitions(n)
         state, action, after = (self._block[name][:n].astype(np.int64) for name in _STEP_FIELDS)
         return state, action, after
 
-    def _finish_steps(self, n: int, episode: Array, t: Array, before: int) -> None:
+    def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
         block = self._block[:n]
         block["step"] = self._recorder.steps[self._phase] + np.arange(n)
         block["episode"], block["t"] = episode, t
@@ -147,16 +147,16 @@ class CopiedMessages(_Copies):
             self._paid[self.filled] = row["rewards"][0]
             self._count(row["rewards"][0], row["terminated"], row["truncated"])
 
-    def _put_reset(self, observation: Any, seed: int | None) -> None:
+    def _put_reset(self, observation: object, seed: int | None) -> None:
         """Do nothing: the message is complete."""
 
     def _rewards(self, n: int) -> NDArray[np.float64]:
         return self._paid[:n]
 
-    def _finish_steps(self, n: int, episode: Array, t: Array, before: int) -> None:
+    def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
         """Do nothing: the messages are complete."""
 
-    def _finish_resets(self, begins: Array, before: int) -> None:  # noqa: ARG002
+    def _finish_resets(self, begins: Ints, before: int) -> None:  # noqa: ARG002
         self._reset_count += len(self._reset_rows)
 
 

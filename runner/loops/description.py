@@ -33,7 +33,7 @@ class Described:
     observation: Space
     action: Space
     env_id: str
-    kwargs: dict[str, Any] = field(default_factory=dict)
+    kwargs: dict[str, object] = field(default_factory=dict)
     step_limit: int = 0
     agents: tuple[str, ...] = ("agent",)
     """The agents: one reward column each."""
@@ -49,7 +49,7 @@ class Described:
         return self.action if self.wide_action is None else self.wide_action
 
     @cached_property
-    def _spaces(self) -> dict[str, Any]:
+    def _spaces(self) -> dict[str, object]:
         """The descriptions of the environment's own spaces."""
         spaces_of = {"observation": self.observation, "action": self.action}
         return {name: describe_space(space) for name, space in spaces_of.items()}
@@ -135,7 +135,7 @@ def kind_of(observation: Space, action: Space) -> str:
     return "variable" if any(part.dtype is None for part in parts) else "transition"
 
 
-def _tabular(env: Any, kwargs: dict[str, Any], observation: Any, action: Any) -> Mdp | None:
+def _tabular(env: object, kwargs: dict[str, object], observation: Any, action: Any) -> Mdp | None:
     """Return the arrays of an environment if it is tabular and its observations are its states."""
     base = getattr(env, "unwrapped", env)
     if not hasattr(base, "transitions") and not hasattr(base, "P"):

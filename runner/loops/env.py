@@ -10,7 +10,7 @@ from typing import Any, Literal, Unpack
 import gymnasium
 from gymnasium.vector import VectorEnv
 
-from runner.environments.gym_types import Env
+from runner.environments.gym_types import Env, ResetResult, StepResult
 from runner.errors import ConfigError
 from runner.loops.description import describe
 from runner.loops.generators import GeneratorWatch
@@ -49,9 +49,7 @@ class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
         self._take = self._rows.take
         self._lock = self._loop.lock
 
-    def step(
-        self, action: Any, extras: Mapping[str, Any] | None = None
-    ) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Any, extras: Mapping[str, object] | None = None) -> StepResult:
         """Take a step, and record it, with values of your own: `extras={"value": v, "logits": logits}`.
 
         A name keeps the dtype and the shape of its first value; a step need not have all names.
@@ -74,9 +72,7 @@ class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
             self._loop.fail(error)
         return result
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """Reset the environment, and record it: the seed, the options, the observation."""
         return self._recorded_reset(seed, options)
 
@@ -99,7 +95,7 @@ def record(
     frame_format: str = "png",
     into: RecordedEnv | None = None,
     phase: str = "train",
-    make: str | Callable[[], Any] | None = None,
+    make: str | Callable[[], object] | None = None,
     join: Run | str | os.PathLike[str] | Literal[True] | None = None,
     shard: str | None = None,
     on_error: Literal["raise", "warn"] = "raise",

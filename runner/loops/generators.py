@@ -35,7 +35,7 @@ class GeneratorWatch:
         sparse: whether the states of emulators, which take kilobytes, are recorded less often.
     """
 
-    def __init__(self, env: Any, sparse: bool = False) -> None:
+    def __init__(self, env: object, sparse: bool = False) -> None:
         self._steps_a_byte = _SPARSE_STEPS_A_BYTE if sparse else 0
         self._base: Any = getattr(env, "unwrapped", env)
         self._ale: Any = self._base.ale if is_atari(self._base) else None
@@ -93,7 +93,7 @@ class VectorWatch:
     """
 
     def __init__(
-        self, envs: AnyVectorEnv, first: Any, autoreset: AutoresetMode, sparse: bool = False
+        self, envs: AnyVectorEnv, first: object, autoreset: AutoresetMode, sparse: bool = False
     ) -> None:
         base: Any = envs.unwrapped
         self._watches: list[GeneratorWatch] = []

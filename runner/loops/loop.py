@@ -72,7 +72,7 @@ class Loop(Generic[R]):
         described: Described,
         options: Options,
         maker: EnvironmentMaker,
-        make_rows: Callable[[Recorder, Described, str, Callable[[Any], None]], R],
+        make_rows: Callable[[Recorder, Described, str, Callable[[object], None]], R],
         batch: tuple[int, ...] = (),
     ) -> None:
         self._opened = LoopRun(described, options, maker)

@@ -169,7 +169,7 @@ def _custom_vector(base: Any) -> EnvironmentMaker:
         return _with_versions(EnvironmentMaker("vector"), [top], reason)
     try:
         entry_point = entry_point_of(spec.vector_entry_point)
-        fields: dict[str, Any] = {
+        fields: dict[str, object] = {
             "id": spec.id,
             "entry_point": entry_point_of(spec.entry_point) if spec.entry_point else None,
             "vector_entry_point": entry_point,

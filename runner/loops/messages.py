@@ -6,7 +6,7 @@ import json
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
@@ -217,7 +217,7 @@ class Messages:
         self, phase: str, info: Mapping[str, object], options: Mapping[str, object] | None, seed: object
     ) -> None:
         """Record the chosen fields of a reset's info, its options, and a seed too large for its record."""
-        reset: dict[str, Any] = {"options": options} if options else {}
+        reset: dict[str, object] = {"options": options} if options else {}
         if isinstance(seed, int) and seed > MAX_SEED:
             reset["seed"] = {"value": str(seed)}
         if reset or self._options.info:
@@ -247,7 +247,7 @@ class Messages:
             if len(self._states) == _MAX_WAITING:
                 self.commit()
 
-    def frame(self, phase: str, image: Any, is_reset: bool, environment: int | None = None) -> None:
+    def frame(self, phase: str, image: object, is_reset: bool, environment: int | None = None) -> None:
         """Record a picture, [height, width, 3] of uint8; another thread encodes it.
 
         Args:

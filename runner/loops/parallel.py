@@ -45,7 +45,7 @@ class RecordedParallel(RecordedAlone[AgentRows]):
         return self.env.unwrapped
 
     def step(
-        self, actions: Mapping[str, Any], extras: Mapping[str, Mapping[str, Any]] | None = None
+        self, actions: Mapping[str, object], extras: Mapping[str, Mapping[str, object]] | None = None
     ) -> tuple[Any, Any, Any, Any, Any]:
         """Take a step of all agents, and record it, with values of your own by agent and name."""
         result = self.env.step(actions)
@@ -100,7 +100,7 @@ class RecordedAec(RecordedParallel):
             raise AttributeError(name)
         return getattr(self.env.env, name)
 
-    def step(self, action: Any, extras: Mapping[str, Any] | None = None) -> None:  # type: ignore[override]
+    def step(self, action: object, extras: Mapping[str, object] | None = None) -> None:  # type: ignore[override]
         """Take the step of the selected agent, and record it, with values of your own by name."""
         agent = self.env.env.agent_selection
         if action is None:  # it only removes the agent
@@ -120,7 +120,7 @@ def record_parallel(
     recordings: str | os.PathLike[str] | None = None,
     *,
     phase: str = "train",
-    make: str | Callable[[], Any] | None = None,
+    make: str | Callable[[], object] | None = None,
     **options: Unpack[RecordOptions],
 ) -> RecordedParallel:
     """Return a PettingZoo parallel environment, with everything that a loop does with it recorded.

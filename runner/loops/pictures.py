@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +63,6 @@ class Picture:
 def image_bytes(pixels: NDArray[np.uint8], kind: str) -> bytes:
     """Return a picture, [height, width, 3], as `png` (exact) or `jpeg` (smaller, and not exact)."""
     buffer = io.BytesIO()
-    options: dict[str, Any] = {"compress_level": 1} if kind == "png" else {"quality": _JPEG_QUALITY}
+    options: dict[str, int] = {"compress_level": 1} if kind == "png" else {"quality": _JPEG_QUALITY}
     pillow().fromarray(pixels).save(buffer, kind, **options)
     return buffer.getvalue()

@@ -143,7 +143,7 @@ class ValuesAlong:
     """The T recorded actions, nested as their space."""
     rewards: NDArray[np.float64]
     """[T, agents]."""
-    values: Mapping[str, NDArray[Any]]
+    values: Mapping[str, Array]
     """What the policy returned for the observation before each step, by name: [T, ...]."""
 
 
@@ -179,7 +179,7 @@ def values_along(
     make, weights = policy_named(policy), checkpoint.load(trust)
     with from_policy(policy):
         act = make(weights, *own)
-    rows: dict[str, list[NDArray[Any]]] = {}
+    rows: dict[str, list[Array]] = {}
     steps = len(found.rewards)
     for t in range(steps):
         with from_policy(policy):

@@ -8,6 +8,7 @@ import weakref
 from collections.abc import Iterator, Mapping
 from typing import Any, Generic, Literal, Self, TypeVar
 
+from runner.environments.gym_types import ResetResult
 from runner.errors import ConfigError
 from runner.loops.generators import GeneratorWatch
 from runner.loops.loop import Loop, R
@@ -159,7 +160,7 @@ class Recorded(Generic[R]):
         finally:
             self._enter(before)
 
-    def close(self, **kwargs: Any) -> None:
+    def close(self, **kwargs: object) -> None:
         """Close the environment, and the recording as finished unless it belongs to another environment."""
         try:
             self.env.close(**kwargs)
@@ -214,7 +215,7 @@ def _close_abandoned(loop: Loop[Any]) -> None:
     loop.close(*(("interrupted", "") if error is None or is_interactive else ending_of(error)))
 
 
-def given(**arguments: Any) -> dict[str, Any]:
+def given(**arguments: object) -> dict[str, Any]:
     """Return the arguments that are not None: an environment's `reset` may not have the others."""
     return {name: value for name, value in arguments.items() if value is not None}
 
@@ -241,11 +242,11 @@ class RecordedAlone(Recorded[S]):
             self._until_frame = every
             self._messages.frame(self._phase, self.env.render(), is_reset)
 
-    def _recorded_reset(self, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, Any]:
+    def _recorded_reset(self, seed: int | None, options: dict[str, Any] | None) -> ResetResult:
         """Reset the environment, and record it: the seed, the options, the observation."""
         before = frozen_options(options or {})
         state = self._watch.before(self._steps_so_far()) if seed is None else None
-        result: tuple[Any, Any] = self.env.reset(**given(seed=seed, options=options))
+        result: ResetResult = self.env.reset(**given(seed=seed, options=options))
         try:
             state = self._watch.after(state, seed)
             observation, info = result

@@ -38,7 +38,7 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
             raise
         super().__init__(base.num_envs, base.observation_space, base.action_space)
         self.metadata = base.metadata
-        self._actions: Any = None
+        self._actions: object = None
         self.training_steps: Callable[[], int] | None = None
         """Returns after how many training steps the environments evaluate; called at their resets."""
 
@@ -131,7 +131,7 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         return self.base.env_is_wrapped(wrapper_class, indices)
 
 
-def record_vec_env(env: VecEnv, options: dict[str, object]) -> VecEnv:
+def record_vec_env(env: VecEnv, options: dict[str, Any]) -> VecEnv:
     """Return a `VecEnv` whose environments are recorded, as they are inside of all wrappers.
 
     Args:

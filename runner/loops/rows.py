@@ -7,7 +7,7 @@ state before each, the lengths of episodes) is computed for a whole block at onc
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Final, Protocol
+from typing import Final, Protocol, SupportsFloat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from runner.loops.values import warn_user
 from runner.recording import schema
 from runner.recording.gym_values import leaves_of
 from runner.recording.recorder import Recorder
-from runner.util.arrays import Array
+from runner.util.arrays import Ints
 
 MAX_SEED: Final = 2**64 - 1
 """The largest seed that the record of a reset holds."""
@@ -60,7 +60,7 @@ class Rows:
     """
 
     def __init__(
-        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
+        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[object], None]
     ) -> None:
         self._first_action = first_action
         self._set_leaves(described)
@@ -76,13 +76,13 @@ class Rows:
         self._room = 0
         self._begins: list[int] = []
         """Rows at which an episode begins."""
-        self._ends: list[tuple[int, Any, bool, bool]] = []
+        self._ends: list[tuple[int, float | NDArray[np.float64], bool, bool]] = []
         """Rows at which one ends (-1: the last committed), its return, terminated, truncated."""
         self._reset_rows: list[int] = []
         self._seeds: list[int | None] = []
         self._fresh = True
         """Whether the next step begins an episode."""
-        self._return: Any = 0.0
+        self._return: float | NDArray[np.float64] = 0.0
         self._episode = -1
         """The number of the episode in progress at the first row."""
         self._t = 0
@@ -106,7 +106,12 @@ class Rows:
     # --- what a loop does -----------------------------------------------------------------------------
 
     def take(
-        self, action: object, observation: object, reward: object, terminated: object, truncated: object
+        self,
+        action: object,
+        observation: object,
+        reward: SupportsFloat,
+        terminated: object,
+        truncated: object,
     ) -> None:
         """Put down a step."""
         raise NotImplementedError
@@ -116,7 +121,7 @@ class Rows:
         """The number of resets so far."""
         return self._reset_count + len(self._reset_rows)
 
-    def reset(self, observation: Any, seed: int | None) -> None:
+    def reset(self, observation: object, seed: int | None) -> None:
         """Put down a reset; it ends an episode in progress, neither terminated nor truncated."""
         if not self._fresh:
             self._end(self.filled - 1, False, False)
@@ -129,7 +134,7 @@ class Rows:
             self.commit()
             self.open()
 
-    def _count(self, reward: Any, terminated: Any, truncated: Any) -> None:
+    def _count(self, reward: float | NDArray[np.float64], terminated: object, truncated: object) -> None:
         """Count the row that was just put down."""
         row = self.filled
         if self._fresh:
@@ -194,7 +199,7 @@ class Rows:
         self.filled = 0
         self._begins, self._ends, self._reset_rows, self._seeds = [], [], [], []
 
-    def _finish_episodes(self, begins: NDArray[Any], starts: NDArray[Any], before: int) -> None:
+    def _finish_episodes(self, begins: Ints, starts: Ints, before: int) -> None:
         """Hand the records of the episodes that ended to the recorder."""
         rows = np.array([end[0] for end in self._ends], np.int64)
         first = starts[np.searchsorted(begins, rows, side="right")]
@@ -211,7 +216,7 @@ class Rows:
         self._recorder.take(self._episodes, positions.astype(np.uint64))
         self._ended += n
 
-    def _finish_resets(self, begins: Array, before: int) -> None:
+    def _finish_resets(self, begins: Ints, before: int) -> None:
         """Complete the records of resets and hand them to the recorder."""
         n = len(self._reset_rows)
         rows = np.array(self._reset_rows, np.int64)
@@ -230,7 +235,7 @@ class Rows:
         """Take blocks of steps and resets; return the room in each."""
         raise NotImplementedError
 
-    def _put_reset(self, observation: Any, seed: int | None) -> None:
+    def _put_reset(self, observation: object, seed: int | None) -> None:
         """Put down the observation of a reset."""
         raise NotImplementedError
 
@@ -238,12 +243,12 @@ class Rows:
         """Return the rewards of the first n rows."""
         raise NotImplementedError
 
-    def _transitions(self, n: int) -> tuple[Array, Array, Array]:  # noqa: ARG002
+    def _transitions(self, n: int) -> tuple[Ints, Ints, Ints]:  # noqa: ARG002
         """Return state, action and next state of the first n rows; empty arrays without states."""
         nothing = np.empty(0, np.int64)
         return nothing, nothing, nothing
 
-    def _finish_steps(self, n: int, episode: Array, t: Array, before: int) -> None:
+    def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
         """Complete the records of the first n rows and hand them to the recorder."""
         raise NotImplementedError
 
@@ -263,9 +268,9 @@ class EpisodeCounter:
     def count(
         self,
         rewards: NDArray[np.float64],
-        state: NDArray[Any],
-        action: NDArray[Any],
-        next_state: NDArray[Any],
+        state: Ints,
+        action: Ints,
+        next_state: Ints,
     ) -> None:
         """Count the events of rows."""
         if self._mdp is not None:
@@ -274,7 +279,7 @@ class EpisodeCounter:
             self.off_table += int(np.count_nonzero(excluded))
             self._counts = bits.cumsum(axis=0)
 
-    def fill(self, episodes: NDArray[np.void], first: NDArray[Any], last: NDArray[Any]) -> None:
+    def fill(self, episodes: NDArray[np.void], first: Ints, last: Ints) -> None:
         """Fill in the counts of episodes from their first and last rows; rows below 0 are carried."""
         if self._mdp is None:
             return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Any, Final, SupportsFloat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from runner.recording import schema
 from runner.recording.gym_values import filler, filler_by_agent, leaves_by_agent, value_bytes
 from runner.recording.messages import encode
 from runner.recording.recorder import Recorder
-from runner.util.arrays import Array
+from runner.util.arrays import Ints
 
 _DISCRETE: Final = struct.Struct("<qqd??")
 _DISCRETE_DTYPE: Final = np.dtype(
@@ -53,7 +53,7 @@ class BlockRows(Rows):
     def _rewards(self, n: int) -> NDArray[np.float64]:
         return self._scratch["reward"][:n]
 
-    def _finish_steps(self, n: int, episode: Array, t: Array, before: int) -> None:
+    def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
         block, rows = self._block[:n], self._scratch[:n]
         block["rewards"] = rows["reward"].reshape(n, -1)
         block["terminated"], block["truncated"] = rows["terminated"], rows["truncated"]
@@ -82,7 +82,14 @@ class DiscreteRows(BlockRows):
         self._reset_column = self._reset_block["observation"]
         return rooms
 
-    def take(self, action: Any, observation: Any, reward: Any, terminated: Any, truncated: Any) -> None:
+    def take(
+        self,
+        action: object,
+        observation: object,
+        reward: SupportsFloat,
+        terminated: object,
+        truncated: object,
+    ) -> None:
         """Put down a step."""
         if self._state is None:
             require_reset(len(self._reset_rows), self._phase)
@@ -98,10 +105,10 @@ class DiscreteRows(BlockRows):
             _DISCRETE.pack_into(self._bytes, at, action, observation, reward, terminated, truncated)
         self._count(reward, terminated, truncated)
 
-    def _put_reset(self, observation: Any, seed: int | None) -> None:  # noqa: ARG002
+    def _put_reset(self, observation: object, seed: int | None) -> None:  # noqa: ARG002
         self._reset_column[len(self._reset_rows)] = whole_number(observation, "observation")
 
-    def _transitions(self, n: int) -> tuple[Array, Array, Array]:
+    def _transitions(self, n: int) -> tuple[Ints, Ints, Ints]:
         rows = self._scratch[:n]
         next_state = rows["next_state"] - self._state_start
         state = np.empty(n + 1, np.int64)
@@ -117,7 +124,7 @@ class DiscreteRows(BlockRows):
         }
         return self._columns["state"], self._columns["action"], next_state
 
-    def _finish_steps(self, n: int, episode: Array, t: Array, before: int) -> None:
+    def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
         for name, values in self._columns.items():
             if not 0 <= values.min() <= values.max() <= _MAX_STATE:
                 raise RecordingError(
@@ -149,7 +156,14 @@ class ArrayRows(BlockRows):
         self._action = filler(self._action_leaves, self._block["action"])
         self._action(row, action)
 
-    def take(self, action: Any, observation: Any, reward: Any, terminated: Any, truncated: Any) -> None:
+    def take(
+        self,
+        action: object,
+        observation: object,
+        reward: SupportsFloat,
+        terminated: object,
+        truncated: object,
+    ) -> None:
         """Put down a step."""
         row = self.filled
         if not row:
@@ -163,10 +177,10 @@ class ArrayRows(BlockRows):
         _ENDING.pack_into(self._bytes, row * 10, reward, terminated, truncated)
         self._count(reward, terminated, truncated)
 
-    def _put_reset(self, observation: Any, seed: int | None) -> None:  # noqa: ARG002
+    def _put_reset(self, observation: object, seed: int | None) -> None:  # noqa: ARG002
         self._first(len(self._reset_rows), observation)
 
-    def _finish_steps(self, n: int, episode: Array, t: Array, before: int) -> None:
+    def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
         block, rows = self._block[:n], self._scratch[:n]
         block["acted"] = 1
         block["agents_terminated"], block["agents_truncated"] = rows["terminated"], rows["truncated"]
@@ -229,7 +243,7 @@ class AgentRows(BlockRows):
         if over and not self._fresh:  # no agent is left, and none was terminated or truncated
             self._end(self.filled - 1, False, False)
 
-    def _put_reset(self, observation: Mapping[str, Any], seed: int | None) -> None:  # noqa: ARG002
+    def _put_reset(self, observation: Any, seed: int | None) -> None:  # noqa: ARG002
         self._first(len(self._reset_rows), observation)
 
     def _mask(self, flags: Mapping[str, bool]) -> int:
@@ -260,7 +274,12 @@ class VariableRows(Rows):
         return self._episode + len(self._begins) + self._fresh
 
     def take(
-        self, action: object, observation: object, reward: object, terminated: object, truncated: object
+        self,
+        action: object,
+        observation: object,
+        reward: SupportsFloat,
+        terminated: object,
+        truncated: object,
     ) -> None:
         """Put down a step."""
         row, reward = self.filled, lone_number(reward, "reward")
@@ -287,7 +306,7 @@ class VariableRows(Rows):
         self._paid[row] = reward
         self._count(reward, terminated, truncated)
 
-    def _put_reset(self, observation: Any, seed: int | None) -> None:
+    def _put_reset(self, observation: object, seed: int | None) -> None:
         fields = {
             "observation": value_bytes(self._observation_leaves, observation),
             "reset": self._reset_count,
@@ -303,10 +322,10 @@ class VariableRows(Rows):
     def _rewards(self, n: int) -> NDArray[np.float64]:
         return self._paid[:n]
 
-    def _finish_steps(self, n: int, episode: Array, t: Array, before: int) -> None:
+    def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
         """Do nothing: the messages are complete."""
 
-    def _finish_resets(self, begins: Array, before: int) -> None:
+    def _finish_resets(self, begins: Ints, before: int) -> None:
         """Do nothing: the messages are complete."""
 
 

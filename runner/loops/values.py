@@ -23,7 +23,7 @@ MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)
 _PACKAGE: Final = str(Path(__file__).parents[1])
 
 
-def lone_number(value: Any, what: str) -> float:
+def lone_number(value: object, what: str) -> float:
     """Return a number that may stand in an array of one.
 
     Raises:
@@ -32,7 +32,7 @@ def lone_number(value: Any, what: str) -> float:
     return float(_lone(value, what, "iubf", "a number"))
 
 
-def whole_number(value: Any, what: str) -> int:
+def whole_number(value: object, what: str) -> int:
     """Return a whole number that may stand in an array of one.
 
     Raises:
@@ -41,7 +41,7 @@ def whole_number(value: Any, what: str) -> int:
     return int(_lone(value, what, "iub", "a whole number of its Discrete space"))
 
 
-def _lone(value: Any, what: str, kinds: str, expected: str) -> Any:
+def _lone(value: object, what: str, kinds: str, expected: str) -> NDArray[Any]:
     array = np.asarray(value)
     if array.size != 1 or array.dtype.kind not in kinds:
         raise RecordingError(f"found the {what} {value!r}, expected {expected}.")

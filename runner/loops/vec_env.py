@@ -43,7 +43,7 @@ class VecEnvVector(AnyVectorEnv):
         self.native: Any = None
         """What the `VecEnv` returned last, for those who use it as such."""
 
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Any]:  # noqa: ARG002
+    def step(self, actions: object) -> tuple[Any, Any, Any, Any, Any]:  # noqa: ARG002
         """Wait for the steps that `step_async` has begun."""
         observations, rewards, dones, infos = self._step_wait()
         rounded = rewards if self._rewards_dtype is None else rewards.astype(self._rewards_dtype)
@@ -53,7 +53,7 @@ class VecEnvVector(AnyVectorEnv):
             truncated[i] = infos[i].get("TimeLimit.truncated", False)
         return observations, rewards, dones & ~truncated, truncated, infos
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, Any]:  # noqa: ARG002
+    def reset(self, *, seed: object = None, options: object = None) -> tuple[Any, Any]:  # noqa: ARG002
         """Reset all environments, with the seeds and options that the `VecEnv` has for them."""
         self.native = self._reset()
         return self.native, self.base.reset_infos
@@ -71,7 +71,7 @@ class VecEnvVector(AnyVectorEnv):
         if self._rewards_dtype is not None:
             self.base.buf_rews = self.base.buf_rews.astype(self._rewards_dtype)
 
-    def close(self, **kwargs: Any) -> None:  # noqa: ARG002
+    def close(self, **kwargs: object) -> None:  # noqa: ARG002
         """Close the `VecEnv`."""
         self._close()
 

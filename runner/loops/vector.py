@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
-from runner.environments.gym_types import AnyVectorEnv
+from runner.environments.gym_types import AnyVectorEnv, ResetResult, VectorStepResult
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, describe
 from runner.loops.generators import States, VectorWatch
@@ -23,6 +23,7 @@ from runner.loops.makers import checked_make, vector_maker_of
 from runner.loops.options import RecordOptions, options_of
 from runner.loops.recorded import Recorded, given, require_pictures
 from runner.loops.values import check_phase, frozen_options
+from runner.loops.vector_counts import Flags
 from runner.loops.vector_rows import VectorRows
 from runner.replay.stepping_vector import final_observations, spaces_of_one
 
@@ -58,9 +59,7 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
             self._rows.over = over  # the environments are the same ones
             self._watch.phase_began()
 
-    def step(
-        self, actions: Any, extras: Mapping[str, Any] | None = None
-    ) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+    def step(self, actions: Any, extras: Mapping[str, object] | None = None) -> VectorStepResult:
         """Take a step in every environment, and record it, with arrays [N, ...] of your own by name."""
         watch, frames_every = self._watch, self._options.frames_every
         watch.steps += 1
@@ -78,7 +77,12 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
         return result
 
     def _record_step(
-        self, actions: Any, result: Any, extras: Mapping[str, Any] | None, over: Any, states: States | None
+        self,
+        actions: object,
+        result: VectorStepResult,
+        extras: Mapping[str, object] | None,
+        over: Flags | None,
+        states: States | None,
     ) -> None:
         """Record a step of all environments.
 
@@ -112,7 +116,7 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
             else:
                 self._record_frames(ends=ended)
 
-    def _record_frames(self, resets: Any = False, ends: Any = False) -> None:
+    def _record_frames(self, resets: Any = False, ends: Flags | bool = False) -> None:
         """Record pictures of the environments that were reset or whose episode ended, now and then of all."""
         n, every = self.env.num_envs, self._options.frames_every
         resets, is_due = np.broadcast_to(resets, n), np.broadcast_to(resets | np.asarray(ends), n)
@@ -131,7 +135,7 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    ) -> ResetResult:
         """Reset all environments, or those of `options["reset_mask"]`, and record it."""
         n, mask = self.env.num_envs, (options or {}).get("reset_mask")
         others = frozen_options({key: own for key, own in (options or {}).items() if key != "reset_mask"})
@@ -181,7 +185,7 @@ def record_vector(
     frames_of: int | Sequence[int] | None = None,
     autoreset_mode: AutoresetMode | str | None = None,
     phase: str = "train",
-    make: str | Callable[[], Any] | None = None,
+    make: str | Callable[[], object] | None = None,
     **options: Unpack[RecordOptions],
 ) -> RecordedVector:
     """Return a vector environment, with everything that a loop does with it recorded.

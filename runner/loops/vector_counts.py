@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.recording import schema
 from runner.recording.reset_states import ResetState
+from runner.util.arrays import Array
 
 Flags = NDArray[np.bool_]
 
@@ -20,7 +21,7 @@ class ResetsBetween(NamedTuple):
     row: NDArray[np.intp]
     """The row of the block that comes after each."""
     which: NDArray[np.intp]
-    observation: NDArray[Any]
+    observation: Array
     seeds: Sequence[int | None]
     states: Sequence[ResetState | None]
     """What each depended on, where that is to be recorded."""

@@ -23,7 +23,7 @@ from runner.recording.gym_values import filler, leaves_of, put_chosen
 from runner.recording.recorder import Recorder
 from runner.recording.reset_states import ResetState
 from runner.recording.schema import Topic
-from runner.util.arrays import Array
+from runner.util.arrays import Array, Ints
 
 _TRUE: Final = b"\1"
 _MAX_STEPS: Final = 2048
@@ -79,7 +79,7 @@ class VectorRows:
         self._state = np.full(n, -self._state_start)
         """The states before the first row, where both spaces are discrete."""
         self._block_resets: list[ResetsBetween] = []
-        self._finals: list[tuple[Any, NDArray[np.intp], NDArray[Any]]] = []
+        self._finals: list[tuple[Any, NDArray[np.intp], Array]] = []
         """Rows whose observations are of the next episodes; environments, and the last ones of the ended."""
         self._autoreset_states: dict[int, States] = {}
         """Rows with resets in place of steps, and what those depended on."""
@@ -205,7 +205,7 @@ class VectorRows:
             now[reset.which[here]] = reset.observation[here]
         return now
 
-    def reset(self, observation: Any, seeds: Sequence[int | None], which: Flags, states: States) -> None:
+    def reset(self, observation: object, seeds: Sequence[int | None], which: Flags, states: States) -> None:
         """Record a reset of some environments; it ends episodes in progress in them.
 
         Args:
@@ -293,7 +293,7 @@ class VectorRows:
             last = last.copy()
             for row, which, observation in self._finals:
                 last[row, which] = observation
-        columns: dict[str, NDArray[Any]] = {
+        columns: dict[str, Array] = {
             "rewards": self._rewards[:rows, :, np.newaxis],
             "step": first + np.arange(rows * n).reshape(rows, n),
             "episode": self._episode + counts.ended_before[:-1],
@@ -341,7 +341,7 @@ class VectorRows:
 
     def _put_ends(
         self,
-        last: Array,
+        last: Ints,
         length: Array,
         returns: Array,
         terminated: Flags,
@@ -365,7 +365,7 @@ class VectorRows:
         observation: Array,
         seeds: Sequence[int | None],
         states: Sequence[ResetState | None],
-        episode: Array,
+        episode: Ints,
         steps: Array,
     ) -> None:
         """Record resets in their order; `steps` are the steps of the phase before each."""

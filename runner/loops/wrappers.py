@@ -35,7 +35,7 @@ class CannotBeMade(Exception):
     """Why a part of the environment cannot be made again."""
 
 
-def layers_of(env: Any) -> Iterator[Any]:
+def layers_of(env: object) -> Iterator[Any]:
     """Yield an environment's wrappers from the outermost in, and the environment inside of them."""
     innermost = getattr(env, "unwrapped", env)
     while env is not innermost and env is not None:
@@ -45,7 +45,7 @@ def layers_of(env: Any) -> Iterator[Any]:
     yield innermost
 
 
-def wrappers_as_fields(wrappers: Sequence[Any], assumed: list[str]) -> dict[str, Any]:
+def wrappers_as_fields(wrappers: Sequence[Any], assumed: list[str]) -> dict[str, object]:
     """Return the fields of an `EnvSpec` that describe wrappers, given from the innermost out.
 
     The innermost three are fields of their own if they are those of `gymnasium.make`.
@@ -62,7 +62,7 @@ def wrappers_as_fields(wrappers: Sequence[Any], assumed: list[str]) -> dict[str,
     }
 
 
-def only_observes(wrapper: Any) -> bool:
+def only_observes(wrapper: object) -> bool:
     """Return whether a wrapper changes nothing that is recorded, and can be left out."""
     return isinstance(wrapper, _SHOWS_ONLY) or class_name(wrapper) in OBSERVERS
 
@@ -77,7 +77,7 @@ def declared_wrapper_fields(spec: WrapperSpec, assumed: list[str]) -> dict[str, 
     return {"name": spec.name, "entry_point": spec.entry_point, "kwargs": kwargs}
 
 
-def wrapper_fields(wrapper: Any, assumed: list[str]) -> dict[str, Any]:
+def wrapper_fields(wrapper: object, assumed: list[str]) -> dict[str, object]:
     """Return the fields of a `WrapperSpec`; add the wrapper to `assumed` if its arguments are unknown."""
     kind, name = type(wrapper), class_name(wrapper)
     parameters = inspect.signature(kind).parameters
@@ -109,7 +109,7 @@ def default_arguments(kind: type, given: Sequence[str]) -> list[str]:
     return [one.name for one in others]
 
 
-def plain_kwargs(kwargs: Mapping[str, Any], owner: str) -> dict[str, Any]:
+def plain_kwargs(kwargs: Mapping[str, object], owner: str) -> dict[str, object]:
     """Return keyword arguments that JSON can hold.
 
     Raises:
@@ -134,7 +134,7 @@ def _is_plain(value: object) -> bool:
     return value is None or isinstance(value, str | int | float | np.number | np.bool_)
 
 
-def plain_number(value: Any) -> Any:
+def plain_number(value: np.generic) -> object:
     """Return a number of NumPy as JSON holds it."""
     return value.item()
 
@@ -144,12 +144,12 @@ def top_package(module: str) -> str:
     return module.partition(":")[0].partition(".")[0]
 
 
-def class_name(instance: Any) -> str:
+def class_name(instance: object) -> str:
     """Return `module:class` of an instance, cut at the length that a recording holds."""
     return f"{type(instance).__module__}:{type(instance).__qualname__}"[:MAX_TEXT]
 
 
-def entry_point_of(value: Any) -> str:
+def entry_point_of(value: object) -> str:
     """Return the `module:name` from which `gymnasium.make` gets a class or function.
 
     Raises:

@@ -22,6 +22,9 @@ from runner.recording.schema import LOG_LEVELS, STEP_NANOSECONDS, MessageType
 from runner.recording.spaces import NUMBERS
 from runner.util.arrays import Array
 
+Message = dict[str, Any]
+"""The fields of a decoded message by name."""
+
 
 @cache
 def file_descriptor_set(message: MessageType) -> bytes:
@@ -78,7 +81,7 @@ class QTable:
     """[states, actions]."""
 
 
-def encode(message: MessageType, values: Mapping[str, Any]) -> bytes:
+def encode(message: MessageType, values: Mapping[str, object]) -> bytes:
     """Return the message with these field values; a missing field is protobuf's zero."""
     stored = {field.name: field.stored_as for field in message.fields if field.stored_as}
     values = {stored.get(name, name): value for name, value in values.items()}
@@ -122,7 +125,7 @@ def _scalar_struct(before_value: int, before_step: int) -> struct.Struct:
     return struct.Struct(f"<{before_value}sd{before_step}sqcq")
 
 
-def decode(message: MessageType, payload: bytes) -> dict[str, Any]:
+def decode(message: MessageType, payload: bytes) -> Message:
     """Return the values of a message's fields; repeated ones as lists.
 
     Raises:

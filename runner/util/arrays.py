@@ -9,3 +9,4 @@ Records = NDArray[np.void]
 """Structured records, such as messages of one topic."""
 MaskedArray = np.ma.MaskedArray[tuple[int, ...], np.dtype[np.generic]]
 """The same with values missing."""
+Ints = NDArray[np.int64]
