@@ -22,6 +22,7 @@ from typing import Any, Final
 
 from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.analysis.step_reference import StepRef
+from runner.environments.gym_types import Value
 from runner.errors import CannotRedo, ConfigError, RunnerError
 from runner.loops.actions import Names, action_in_words, action_names, parsed_action
 from runner.loops.env import record
@@ -74,7 +75,7 @@ class _Task:
     """What to branch, and how."""
 
     at: StepRef
-    action: Any
+    action: Value
     policy: str
     seed: int
     name: str | None
@@ -205,9 +206,9 @@ class _Player:
         function: Any = policy_named(task.policy) if ":" in task.policy else None
         self._function: Policy | None = function
         self._is_game = False
-        self._actions: Iterator[Any] = iter(())
+        self._actions: Iterator[Value] = iter(())
 
-    def begin(self, stepper: RowStepper, actions: Iterator[Any]) -> None:
+    def begin(self, stepper: RowStepper, actions: Iterator[Value]) -> None:
         """Record the environment from now on."""
         env, task, recording = stepper.env, self._task, self._recording
         maker = recording.maker_of(self.phase)

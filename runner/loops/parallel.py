@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from numbers import Integral
 from typing import Any, Unpack
 
+from runner.environments.gym_types import ByAgent, GameStepResult
 from runner.environments.mdp import MAX_AGENTS
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, kind_of
@@ -46,7 +47,7 @@ class RecordedParallel(RecordedAlone[AgentRows]):
 
     def step(
         self, actions: Mapping[str, object], extras: Mapping[str, Mapping[str, object]] | None = None
-    ) -> tuple[Any, Any, Any, Any, Any]:
+    ) -> GameStepResult:
         """Take a step of all agents, and record it, with values of your own by agent and name."""
         result = self.env.step(actions)
         try:
@@ -79,7 +80,9 @@ class RecordedParallel(RecordedAlone[AgentRows]):
                 )
         return {f"{agent}/{name}": value for agent, own in values.items() for name, value in own.items()}
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[ByAgent, ByAgent]:
         """Reset the environment, and record it."""
         return self._recorded_reset(seed, options)
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.environments.gym_types import Value
 from runner.errors import shortened
-from runner.recording.spaces import decode
+from runner.recording.spaces import Description, decode
 from runner.util.arrays import Array
 from runner.util.jsonable import as_json
 
@@ -34,9 +35,9 @@ class Difference:
     """Which environment of a vector."""
     field: str
     """`observation[2]`, `reward`, `terminated`, ...; `first observation[2]` for that of a reset."""
-    recorded: Any
+    recorded: object
     """The value, as JSON can hold it."""
-    got: Any
+    got: object
 
     def __str__(self) -> str:
         """Describe the difference in a line."""
@@ -89,7 +90,7 @@ def _beyond(recorded: NDArray[Any], got: NDArray[Any], tolerance: float) -> NDAr
 
 
 def differing_value(
-    recorded: Any, got: Any, description: Mapping[str, Any], tolerance: float = 0.0
+    recorded: Value, got: Value, description: Description, tolerance: float = 0.0
 ) -> tuple[str, object, object]:
     """Return where in two observations the first difference is, such as `[2]`, and both values there.
 
@@ -112,7 +113,7 @@ def differing_value(
     return "", _plain(recorded), _plain(got)
 
 
-def _leaves(place: str, recorded: Any, got: Any) -> Iterator[tuple[str, NDArray[Any], NDArray[Any]]]:
+def _leaves(place: str, recorded: Value, got: Value) -> Iterator[tuple[str, Array, Array]]:
     """Yield the arrays in two values of a space, with their places."""
     names: Any = getattr(getattr(recorded, "dtype", None), "names", None)
     if names or isinstance(recorded, dict):
@@ -125,7 +126,7 @@ def _leaves(place: str, recorded: Any, got: Any) -> Iterator[tuple[str, NDArray[
         yield place, np.asarray(recorded), np.asarray(got)
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     """Return a value as JSON can hold it."""
     return as_json(value.item() if isinstance(value, np.ndarray | np.generic) and not value.shape else value)
 

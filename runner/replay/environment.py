@@ -137,10 +137,10 @@ def redo_in_child(
 def stream_from_child(
     function: Callable[..., None],
     path: Path,
-    *arguments: Any,
+    *arguments: object,
     seconds: float = SECONDS,
     memory_bytes: int = MEMORY_BYTES,
-    **keywords: Any,
+    **keywords: object,
 ) -> Iterator[Any]:
     """Yield what a function that runs foreign code passes to `report_progress` in a child process.
 

@@ -12,6 +12,9 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
+from gymnasium.envs.registration import EnvSpec
+
+from runner.environments.gym_types import Env
 from runner.errors import CannotRedo
 from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
@@ -183,7 +186,7 @@ def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
     )
     for wrapper in wrappers:
         _wrapper(wrapper.entry_point, gymnasium.Wrapper)
-    made: Any = gymnasium.make(
+    made: Env = gymnasium.make(
         dataclasses.replace(
             registered,
             kwargs=kwargs,
@@ -196,7 +199,7 @@ def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
     return made
 
 
-def _registered(maker: EnvironmentMaker, trust: bool) -> tuple[EnvironmentSpec, Any]:
+def _registered(maker: EnvironmentMaker, trust: bool) -> tuple[EnvironmentSpec, EnvSpec]:
     """Return the recorded specification, and Gymnasium's own `EnvSpec` of that environment.
 
     Raises:

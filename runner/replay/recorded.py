@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.environments.gym_types import Value
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.actions import kept_dtype
@@ -41,10 +42,10 @@ class RecordedReset(NamedTuple):
     """Steps of the phase before it."""
     time: int
     """Its `log_time` in nanoseconds."""
-    observation: Any
+    observation: Value
     """As recorded: a NumPy value, or bytes where values vary in size."""
     seed: int | None
-    options: dict[str, Any] | None
+    options: dict[str, object] | None
     state: ResetState | None
     """What it depends on, if it has no seed and this was recorded."""
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.environments.gym_types import Value
 from runner.replay.differences import Difference
+from runner.util.arrays import Array
 
 Frame = NDArray[np.uint8]
 """A picture, [height, width, 3]."""
@@ -19,7 +21,7 @@ Frame = NDArray[np.uint8]
 class Values:
     """Values of steps: arrays [rows]."""
 
-    observations: NDArray[Any]
+    observations: Array
     """After each step, as recorded: [rows, ...] in the dtype of the space, structured for `Dict` and `Tuple`.
 
     States from 0 if both spaces are `Discrete`; bytes, for `runner.recording.spaces.decode`, where values
@@ -49,9 +51,9 @@ class RedoneStart(NamedTuple):
     """The row of the block that comes after the reset."""
     episode: int
     seed: int | None
-    recorded: Any
+    recorded: Value
     """The first observation, as in `Values`, but a state as the environment returned it."""
-    got: Any
+    got: Value
     frame: Frame | None = None
     """The picture after the reset, if pictures are drawn."""
 
@@ -70,7 +72,7 @@ class RedoneSteps:
     episodes are done again."""
     t: NDArray[np.int64]
     """The number of each step in its episode."""
-    actions: NDArray[Any]
+    actions: Array
     """As recorded."""
     recorded: Values
     got: Values

@@ -37,7 +37,7 @@ ONLY_PICTURES: Final = frozenset({"HumanRendering", "RecordVideo", "RenderCollec
 """Wrappers of Gymnasium that show or write pictures and change no step: they are left out."""
 _ONLY_INFOS: Final = frozenset({"DictInfoToList", "RecordEpisodeStatistics"})
 """Wrappers of vectors that change nothing but infos: left out too."""
-Wrapper = tuple[str, str, dict[str, Any]]
+Wrapper = tuple[str, str, dict[str, object]]
 """Name, entry point and keyword arguments of a wrapper."""
 TRUST: Final = "It is imported only if you trust the recording (--trust)."
 
@@ -138,7 +138,7 @@ def check_arguments(spec: EnvironmentSpec, registered: Mapping[str, object]) -> 
             check_plain(f"argument of the wrapper {name}", kwargs, {})
 
 
-def check_plain(what: str, kwargs: Mapping[str, Any], registered: Mapping[str, Any]) -> None:
+def check_plain(what: str, kwargs: Mapping[str, object], registered: Mapping[str, object]) -> None:
     """Refuse arguments that name a file, unless they are the registered ones.
 
     Raises:

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from runner.environments.gym_types import Space
+from runner.environments.gym_types import Space, Value
 from runner.errors import CannotRedo, shortened
 from runner.recording.gym_json import value_of
 from runner.recording.gym_spaces import describe_space
@@ -35,9 +35,9 @@ _ENDING_DTYPE: Final = np.dtype([("reward", "<f8"), ("terminated", "?"), ("trunc
 class Dtypes:
     """The dtypes of recorded observations; `object` where values vary in size."""
 
-    step: np.dtype[Any]
+    step: np.dtype[np.generic]
     """Of the observation after a step."""
-    reset: np.dtype[Any]
+    reset: np.dtype[np.generic]
     """Of the first observation of an episode."""
 
 
@@ -46,7 +46,7 @@ class Results:
 
     def __init__(self, rows: int, resets: int, dtypes: Dtypes, learners: int, drawn: int = 0) -> None:
         self._drawn = drawn
-        self.observations: NDArray[Any] = np.empty(rows, dtypes.step)
+        self.observations: Array = np.empty(rows, dtypes.step)
         self.rewards: NDArray[np.float64] = np.zeros((rows, learners))
         self.terminated: NDArray[np.bool_] = np.zeros(rows, np.bool_)
         self.truncated: NDArray[np.bool_] = np.zeros(rows, np.bool_)
@@ -196,11 +196,11 @@ class RowStepper(Stepper):
         """Return a function that puts an observation into a row of a column; `is_first`: that of a reset."""
 
     @abstractmethod
-    def actions(self, rows: NDArray[np.void]) -> Sequence[Any]:
+    def actions(self, rows: NDArray[np.void]) -> Sequence[Value]:
         """Return the actions of recorded steps as the environment takes them."""
 
     @abstractmethod
-    def take(self, actions: Sequence[Any], first: int, stop: int, results: Results, put: Put) -> None:
+    def take(self, actions: Sequence[Value], first: int, stop: int, results: Results, put: Put) -> None:
         """Take the steps of these rows, and fill them in; `results.done` counts them also if one fails."""
 
     def run(self, rows: NDArray[np.void], resets: Sequence[tuple[int, RecordedReset]]) -> Results:
@@ -224,7 +224,7 @@ class RowStepper(Stepper):
             results.error = error
         return results
 
-    def _reset(self, reset: RecordedReset) -> Any:
+    def _reset(self, reset: RecordedReset) -> Value:
         """Reset the environment as it was; return its observation."""
         seed = reset.seed
         if seed is None and reset.state is not None:
@@ -275,7 +275,7 @@ class EnvironmentStepper(RowStepper):
 
         return put_bytes
 
-    def actions(self, rows: NDArray[np.void]) -> Sequence[Any]:
+    def actions(self, rows: NDArray[np.void]) -> Sequence[Value]:
         """Return the actions of recorded steps as the environment takes them."""
         if self._recording.kind == "step":
             start = int(self.action_space.start)  # type: ignore[attr-defined]
@@ -286,7 +286,7 @@ class EnvironmentStepper(RowStepper):
         where = f"{self._recording.path}: an action"
         return [keyed(self.action_space, decode(description, data, where)) for data in rows["action"]]
 
-    def take(self, actions: Sequence[Any], first: int, stop: int, results: Results, put: Put) -> None:
+    def take(self, actions: Sequence[Value], first: int, stop: int, results: Results, put: Put) -> None:
         """Take the steps of these rows, and fill them in."""
         step, pack, frames = self.env.step, _ENDING.pack_into, results.frames
         data, size, draws = self._endings.view(np.uint8).data, _ENDING.size, self.draws
@@ -322,7 +322,7 @@ class GameStepper(RowStepper):
     def _filler(self, column: Array, is_first: bool = False) -> Put:  # noqa: ARG002
         return filler_by_agent(leaves_by_agent(self.observation_space, "observation"), column)
 
-    def actions(self, rows: NDArray[np.void]) -> Sequence[Any]:
+    def actions(self, rows: NDArray[np.void]) -> Sequence[Value]:
         """Return the actions of recorded steps as the environment takes them."""
         agents = self.env.possible_agents
         own: Any = self.action_space
@@ -332,7 +332,7 @@ class GameStepper(RowStepper):
             for row, acted in enumerate(rows["acted"].tolist())
         ]
 
-    def take(self, actions: Sequence[Any], first: int, stop: int, results: Results, put: Put) -> None:
+    def take(self, actions: Sequence[Value], first: int, stop: int, results: Results, put: Put) -> None:
         """Take the steps of these rows, and fill them in."""
         agents = self.env.possible_agents
 
@@ -365,7 +365,7 @@ def game_spaces(env: Any) -> tuple[spaces.Dict, spaces.Dict]:
     return observations, spaces.Dict({agent: env.action_space(agent) for agent in agents})
 
 
-def values_in(space: Space, column: NDArray[Any]) -> Sequence[Any]:
+def values_in(space: Space, column: NDArray[Any]) -> Sequence[Value]:
     """Return the values of a column, one by one, as an environment with this action space takes them."""
     if isinstance(space, spaces.Dict):
         parts = {key: values_in(part, np.array(column[str(key)])) for key, part in space.spaces.items()}
@@ -376,7 +376,7 @@ def values_in(space: Space, column: NDArray[Any]) -> Sequence[Any]:
     return list(column)  # whole numbers as NumPy's, for which `Discrete.contains` takes a third of the time
 
 
-def keyed(space: Space, value: Any) -> Any:
+def keyed(space: Space, value: Value) -> Value:
     """Return a decoded value with the keys and types that its space has.
 
     Raises:

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from runner.environments.gym_types import Space
+from runner.environments.gym_types import AnyVectorEnv, Space, Value
 from runner.errors import CannotRedo
 from runner.recording import schema
 from runner.recording.gym_values import filler, leaves_of, put_chosen
@@ -125,7 +125,7 @@ class VectorStepper(Stepper):
             which[[reset.environment for _, reset in call]] = True
             options = dict(call[0][1].options or {}) | ({} if which.all() else {"reset_mask": which})
             seeds = [self._seed(reset) for _, reset in call]
-            arguments: dict[str, Any] = {"options": options} if options else {}
+            arguments: dict[str, object] = {"options": options} if options else {}
             if seeds == list(range(seeds[0] or 0, (seeds[0] or 0) + self._n)):
                 arguments["seed"] = seeds[0]  # not every vector takes a list
             elif any(seed is not None for seed in seeds):
@@ -137,7 +137,7 @@ class VectorStepper(Stepper):
             for number, reset in call:
                 results.first_observations[number] = self._last[reset.environment]
 
-    def _step(self, time: int, action: Any, results: Results) -> None:
+    def _step(self, time: int, action: Value, results: Results) -> None:
         """Take a step of all environments, and fill in its row."""
         observations, rewards, terminated, truncated, infos = self.env.step(action)
         self._put(0, observations)
@@ -164,7 +164,7 @@ class VectorStepper(Stepper):
         return self._restore(reset.state, base)
 
 
-def spaces_of_one(envs: Any) -> tuple[Space, Space]:
+def spaces_of_one(envs: AnyVectorEnv) -> tuple[Space, Space]:
     """Return the spaces of observation and action of one environment of a vector.
 
     Older vectors, such as SuperSuit's, have no `single_` spaces: their spaces are those of one environment.
@@ -173,7 +173,7 @@ def spaces_of_one(envs: Any) -> tuple[Space, Space]:
     return observation, getattr(envs, "single_action_space", None) or envs.action_space
 
 
-def final_observations(infos: Any) -> Any:
+def final_observations(infos: Any) -> Value:
     """Return the last observations of the episodes that ended in a step, by environment; None if none did."""
     if isinstance(infos, Mapping):
         return infos.get("final_obs")
@@ -193,7 +193,7 @@ def _calls(resets: Sequence[_Numbered]) -> Iterator[list[_Numbered]]:
         yield call
 
 
-def _batches(space: Space, column: NDArray[Any], n: int) -> Sequence[Any]:
+def _batches(space: Space, column: NDArray[Any], n: int) -> Sequence[Value]:
     """Return a column of actions as batches of n, as a vector takes them."""
     if isinstance(space, spaces.Dict):
         parts = {key: _batches(part, column[str(key)], n) for key, part in space.spaces.items()}

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from runner.environments.gym_types import ByAgent, GameStepResult
+
 
 def is_in_turns(env: object) -> bool:
     """Return whether an environment has the interface of an `AECEnv`."""
@@ -29,25 +31,25 @@ class Turns:
         self.render_mode = getattr(env, "render_mode", None)
         self.unwrapped = env.unwrapped
 
-    def observation_space(self, agent: Any) -> Any:
+    def observation_space(self, agent: object) -> Any:
         """Return the space of an agent's observations."""
         return self.env.observation_space(agent)
 
-    def action_space(self, agent: Any) -> Any:
+    def action_space(self, agent: object) -> Any:
         """Return the space of an agent's actions."""
         return self.env.action_space(agent)
 
     @property
-    def agents(self) -> list[Any]:
+    def agents(self) -> list[object]:
         """The agent that acts next; none if the game is over."""
         return [] if all(map(self._is_over, self.env.agents)) else [self.env.agent_selection]
 
-    def reset(self, **arguments: Any) -> tuple[dict[Any, Any], dict[Any, Any]]:
+    def reset(self, **arguments: object) -> tuple[ByAgent, ByAgent]:
         """Begin a game; return the observations and infos of all agents."""
         self.env.reset(**arguments)
         return self._observations(), dict(self.env.infos)
 
-    def step(self, actions: Mapping[Any, Any]) -> tuple[Any, Any, Any, Any, Any]:
+    def step(self, actions: Mapping[Any, object]) -> GameStepResult:
         """Take the step of the selected agent; return what a parallel game returns, of all agents.
 
         Raises:
@@ -78,8 +80,8 @@ class Turns:
         """Close the game."""
         self.env.close()
 
-    def _observations(self) -> dict[Any, Any]:
+    def _observations(self) -> ByAgent:
         return {agent: self.env.observe(agent) for agent in self.env.agents}
 
-    def _is_over(self, agent: Any) -> bool:
+    def _is_over(self, agent: object) -> bool:
         return bool(self.env.terminations.get(agent) or self.env.truncations.get(agent))

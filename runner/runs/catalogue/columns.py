@@ -15,7 +15,7 @@ from runner.recording.metrics import METRICS
 from runner.runs.run import RECORDING_FILE
 from runner.util.humanize import UNKNOWN, age, duration, number, size
 
-RowValues = Mapping[str, Any]
+IndexRow = dict[str, Any]
 """A run as the index has it, by the names of the stored columns."""
 
 SETTING: Final = "config."
@@ -60,7 +60,7 @@ class Column:
     """The stored columns that it is read from; itself by default. Filters compare the first."""
     in_json: bool = True
     """Whether JSON has it by default."""
-    read: Callable[[RowValues], Any] | None = None
+    read: Callable[[IndexRow], object] | None = None
     show: Callable[[Any], str] = lambda value: f"{value:,}" if isinstance(value, int) else str(value)
     if_empty: str = UNKNOWN
 
@@ -70,7 +70,7 @@ class Column:
         return self.needs or (self.name,)
 
 
-def moment(row: RowValues) -> datetime:
+def moment(row: IndexRow) -> datetime:
     """Return when a run began, in UTC."""
     return datetime.fromtimestamp(row["created"] / 1000, UTC)
 
@@ -213,8 +213,8 @@ def needed_for(columns: Iterable[str]) -> list[str]:
 
 
 def with_same_as(
-    rows: Iterable[dict[str, Any]], originals: Mapping[str, tuple[str, str, str]]
-) -> Iterator[dict[str, Any]]:
+    rows: Iterable[IndexRow], originals: Mapping[str, tuple[str, str, str]]
+) -> Iterator[IndexRow]:
     """Yield rows with `same_as`: the id of another run that recorded the same content first, or None.
 
     Args:
@@ -227,7 +227,7 @@ def with_same_as(
         yield row
 
 
-def value(row: RowValues, name: str) -> Any:
+def value(row: IndexRow, name: str) -> object:
     """Return the value of a column, as JSON has it."""
     if name.startswith(SETTING):
         return json.loads(row["settings"]).get(name.removeprefix(SETTING))
@@ -235,12 +235,12 @@ def value(row: RowValues, name: str) -> Any:
     return column.read(row) if column.read else row[column.stored[0]]
 
 
-def as_json(row: RowValues, columns: Sequence[str] = DEFAULT_JSON) -> dict[str, Any]:
+def as_json(row: IndexRow, columns: Sequence[str] = DEFAULT_JSON) -> dict[str, object]:
     """Return the values of a run by column."""
     return {name: value(row, name) for name in columns}
 
 
-def as_text(row: RowValues, name: str) -> str:
+def as_text(row: IndexRow, name: str) -> str:
     """Return the value of a column as a table shows it."""
     found = value(row, name)
     if name == "episodes" and row["episodes_to_do"] not in (None, found):

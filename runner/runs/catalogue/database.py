@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 
 from peewee import SchemaManager, SqliteDatabase
 
-from runner.runs.catalogue.rows import Row
+from runner.runs.catalogue.rows import Expression, Row
 from runner.util.files import cache_folder, replacing
 
 Report = Callable[[str], None]
@@ -104,7 +104,7 @@ def create(path: str) -> SqliteDatabase:
     return database
 
 
-def tuples_of(database: SqliteDatabase, query: Any) -> Iterator[tuple[Any, ...]]:
+def tuples_of(database: SqliteDatabase, query: Expression) -> Iterator[tuple[Any, ...]]:
     """Return the rows of a query as tuples of SQLite's values, without peewee's conversions."""
     found: Iterator[tuple[Any, ...]] = database.execute(query)  # type: ignore[no-untyped-call]
     return found

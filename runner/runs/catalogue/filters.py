@@ -25,7 +25,7 @@ from peewee import Value, fn
 
 from runner.errors import RunnerError, nearest
 from runner.runs.catalogue.columns import FIELDS, SETTING, STATUSES, TEXT_KINDS, Column, Kind, field_of
-from runner.runs.catalogue.rows import SEEDS, Row
+from runner.runs.catalogue.rows import SEEDS, Expression, Row
 from runner.util.values import is_utf8
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ _PLACE: Final = re.compile(
 )
 _MISTAKEN: Final = {"and": "AND", "or": "OR", "not": "NOT", "&&": "AND", "||": "OR", "&": "AND", "|": "OR"}
 _COMPARISON: Final = re.compile(r"([A-Za-z_][\w.-]*)\s*([<>]=?|!=|==?)(.*)", re.DOTALL)
-_OPERATORS: Final[dict[str, Callable[[Any, Any], Any]]] = {
+_OPERATORS: Final[dict[str, Callable[[Expression, Any], Expression]]] = {
     **{"=": operator.eq, "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 }
 _OPPOSITE: Final = {"<": ">", "<=": ">=", ">": "<", ">=": "<="}
@@ -56,12 +56,12 @@ _BYTES: Final = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
 class Filter:
     """A parsed filter."""
 
-    condition: Any
+    condition: Expression
     """The condition on a row, for peewee; None if any row matches."""
     settings: frozenset[str] = frozenset()
     """The paths of configurations in it."""
 
-    def also(self, condition: Any) -> Filter:
+    def also(self, condition: Expression) -> Filter:
         """Return the filter for rows that match another condition as well."""
         return Filter(condition if self.condition is None else condition & self.condition, self.settings)
 
@@ -105,7 +105,7 @@ class _Translation:
         self._text, self._now = text, now
         self.settings: set[str] = set()
 
-    def condition(self, item: Item, field: Column | None = None, depth: int = 0) -> Any:
+    def condition(self, item: Item, field: Column | None = None, depth: int = 0) -> Expression:
         """Return the condition of a node on a field, or on the whole run."""
         from luqum import tree
 
@@ -148,7 +148,7 @@ class _Translation:
                 return _joined(operator.and_, parts) if parts else self._compare(field, "=", item, "*")
         raise self._unexpected(item)
 
-    def _field(self, item: Any, outer: Column | None) -> Column:
+    def _field(self, item: Item, outer: Column | None) -> Column:
         if outer is not None:
             raise self._error(
                 item,
@@ -254,7 +254,7 @@ def _pattern(value: str) -> str:
     return "".join(wild or glob.escape(escaped or plain or stray) for escaped, wild, plain, stray in pieces)
 
 
-def _condition(field: Column, column: Any, sign: str, value: str, now: datetime) -> Any:
+def _condition(field: Column, column: Expression, sign: str, value: str, now: datetime) -> Expression:
     """Return the condition that a column compares so with a value.
 
     Raises:
@@ -378,7 +378,7 @@ def _compiled(pattern: str) -> re.Pattern[str]:
     return re.compile(fnmatch.translate(pattern.casefold()))
 
 
-def matches(value: Any, pattern: str) -> bool:
+def matches(value: object, pattern: str) -> bool:
     """Return whether a line of a text matches a pattern of `fnmatch`, ignoring case."""
     if not isinstance(value, str):
         return False

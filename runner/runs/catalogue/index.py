@@ -17,15 +17,14 @@ from peewee import DatabaseError, OperationalError, SqliteDatabase, Tuple, Value
 
 from runner.errors import RunnerError, nearest
 from runner.runs.branches import ORIGIN, BranchOrigin, parse_origin
-from runner.runs.catalogue.columns import SETTING, Kind, field_of, with_same_as
+from runner.runs.catalogue.columns import SETTING, IndexRow, Kind, field_of, with_same_as
 from runner.runs.catalogue.database import Report, create, index_path, open_index, renew, tuples_of, version
 from runner.runs.catalogue.filters import ANY_RUN, Filter, matches, setting_path
 from runner.runs.catalogue.folders import Depth, Folders
-from runner.runs.catalogue.rows import Row, text
+from runner.runs.catalogue.rows import Expression, Row, text
 from runner.runs.run import check_folder_name
 
 Result = TypeVar("Result")
-Rows = list[dict[str, Any]]
 
 _MAX_VALUES: Final = 1000
 """Values in one query."""
@@ -44,13 +43,15 @@ class Index:
         damaged = Row.select(Row.problem).where(Row.root.in_(self.roots) & Row.problem.is_null(False))
         return [problem for (problem,) in self._tuples(damaged.order_by(Row.root, Row.entry))]
 
-    def select(self, chosen: Filter, *order: Any, columns: Sequence[str] | None = None) -> Rows:
+    def select(
+        self, chosen: Filter, *order: Expression, columns: Sequence[str] | None = None
+    ) -> list[IndexRow]:
         """Return the rows that match a filter; arguments as for `rows`."""
         return list(self.rows(chosen, *order, columns=columns))
 
     def rows(
-        self, chosen: Filter, *order: Any, columns: Sequence[str] | None = None
-    ) -> Iterator[dict[str, Any]]:
+        self, chosen: Filter, *order: Expression, columns: Sequence[str] | None = None
+    ) -> Iterator[IndexRow]:
         """Yield the rows that match a filter, the newest first.
 
         Args:
@@ -71,11 +72,11 @@ class Index:
     def page(
         self,
         chosen: Filter,
-        *order: Any,
+        *order: Expression,
         limit: int | None,
         offset: int = 0,
         columns: Sequence[str] | None = None,
-    ) -> tuple[Rows, int]:
+    ) -> tuple[list[IndexRow], int]:
         """Return some of the rows that match a filter, and how many match.
 
         Args:
@@ -98,7 +99,9 @@ class Index:
             places, total = places[offset : offset + limit], len(places)
         return self._at(places, columns), total
 
-    def largest(self, chosen: Filter, size: Any, limit: int | None, columns: Sequence[str]) -> Rows:
+    def largest(
+        self, chosen: Filter, size: Expression, limit: int | None, columns: Sequence[str]
+    ) -> list[IndexRow]:
         """Return the rows with the largest `size`, an expression, that match a filter.
 
         Args:
@@ -115,22 +118,24 @@ class Index:
         places = self._of(chosen, Row.root, Row.entry).order_by(size.desc(), Row.id).limit(limit)
         return self._at(list(self._tuples(places)), columns)
 
-    def _at(self, places: Sequence[tuple[Any, ...]], columns: Sequence[str] | None) -> Rows:
+    def _at(self, places: Sequence[tuple[Any, ...]], columns: Sequence[str] | None) -> list[IndexRow]:
         """Return the rows of folders, given by root and entry, in their order."""
-        found: dict[tuple[str, str], dict[str, Any]] = {}
+        found: dict[tuple[str, str], IndexRow] = {}
         for root in {root for root, _ in places}:
             for entries in chunked([entry for there, entry in places if there == root], _MAX_VALUES):
-                some: Any = Row.select(*_stored(columns)).where((Row.root == root) & Row.entry.in_(entries))
+                some: Expression = Row.select(*_stored(columns)).where(
+                    (Row.root == root) & Row.entry.in_(entries)
+                )
                 found |= {(root, row["entry"]): row for row in some.dicts().bind(self._database)}
         return [found[place] for place in places]
 
-    def sums(self, chosen: Filter, columns: Sequence[Any]) -> list[int]:
+    def sums(self, chosen: Filter, columns: Sequence[Expression]) -> list[int]:
         """Return aggregates over the rows that match a filter; 0 where there is nothing to add up."""
         self._check_settings(chosen)
         (sums,) = self._tuples(self._of(chosen, *columns))
         return [number or 0 for number in sums]
 
-    def _recorded_twice(self, digests: Sequence[str] | None = None) -> Any:
+    def _recorded_twice(self, digests: Sequence[str] | None = None) -> Expression:
         """Return the query for digests that several rows have; mostly few, found in an index of SQLite."""
         recorded = Row.select(Row.digest).where(Row.digest.is_null(False) & Row.root.in_(self.roots))
         if digests is not None and len(digests) <= _MAX_VALUES:
@@ -162,7 +167,7 @@ class Index:
         ordered = first.order_by(Row.created.desc(), Row.id.desc(), Row.root.desc(), Row.entry.desc())
         return {digest: (root, entry, run_id) for digest, root, entry, run_id in self._tuples(ordered)}
 
-    def with_same_as(self, rows: Rows) -> Rows:
+    def with_same_as(self, rows: list[IndexRow]) -> list[IndexRow]:
         """Return rows with `same_as`: the id of another run that recorded the same content first, or None."""
         return list(with_same_as(rows, self.originals([row["digest"] for row in rows if row["digest"]])))
 
@@ -196,16 +201,16 @@ class Index:
         """Return the newest runs, of a name if one is given, as `named` does."""
         return self._names(Row.name == text(name) if name else None, limit)
 
-    def _names(self, condition: Any, limit: int | None = None) -> list[tuple[Any, ...]]:
+    def _names(self, condition: Expression, limit: int | None = None) -> list[tuple[Any, ...]]:
         columns = (Row.root, Row.entry, Row.id, Row.name, Row.seed, Row.created)
         query = self._of(Filter(condition), *columns).order_by(Row.created.desc(), Row.id.desc())
         return list(query.limit(limit).tuples().bind(self._database))
 
-    def _of(self, chosen: Filter, *columns: Any) -> Any:
+    def _of(self, chosen: Filter, *columns: Expression) -> Expression:
         known = Row.root.in_(self.roots) & Row.id.is_null(False)
         return Row.select(*columns).where(known if chosen.condition is None else known & chosen.condition)
 
-    def _tuples(self, query: Any) -> Iterator[tuple[Any, ...]]:
+    def _tuples(self, query: Expression) -> Iterator[tuple[Any, ...]]:
         return tuples_of(self._database, query)
 
     def _check_settings(self, chosen: Filter) -> None:
@@ -268,7 +273,7 @@ def look(
         return _look(database, places, work, depth, rebuild)
 
 
-def order_of(text: str) -> list[Any]:
+def order_of(text: str) -> list[Expression]:
     """Return the order by a list of fields, `-FIELD` for descending, to sort rows by.
 
     Missing values come last. A value of the configuration is a field too: `config.discount`.
@@ -311,11 +316,11 @@ def _look(
         return work(index)
 
 
-def _stored(columns: Sequence[str] | None) -> list[Any]:
+def _stored(columns: Sequence[str] | None) -> list[Expression]:
     return [getattr(Row, name) for name in columns or ()]
 
 
-def _begins(column: Any, beginning: str) -> Any:
+def _begins(column: Expression, beginning: str) -> Expression:
     """Return the condition that a text begins so, for which SQLite uses an index."""
     first = text(beginning) or ""
     return (column >= first) & (column < first + chr(0x10FFFF))

@@ -16,13 +16,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from runner.errors import RunnerError, StorageError
 from runner.recording.labels import KEEP, LABELS_FILE, are_readable
-from runner.runs.catalogue.columns import moment
+from runner.runs.catalogue.columns import IndexRow, moment
 from runner.runs.catalogue.filters import ANY_RUN, Filter
-from runner.runs.catalogue.index import Index, Rows
+from runner.runs.catalogue.index import Index
 from runner.runs.catalogue.rows import Row, row_of
 from runner.runs.catalogue.usage import REMOVED, Contents, belongs, contents_of, strays
 from runner.runs.locking import locked
@@ -82,7 +82,7 @@ def plan(run: Run, root: Path, foreign: bool = False) -> Removal:
     return _removal(row, run.folder, _why_not_in(run, root) or _protected(run), foreign)
 
 
-def plan_row(row: dict[str, Any], foreign: bool = False) -> Removal:
+def plan_row(row: IndexRow, foreign: bool = False) -> Removal:
     """Return the removal of a run by its row in the index, which is quicker for very many runs.
 
     This is for showing only: before runs are removed, `plan` reads their own files.
@@ -95,7 +95,7 @@ def plan_row(row: dict[str, Any], foreign: bool = False) -> Removal:
     return _removal(row, folder, _linked(folder) or _unreadable(folder), foreign)
 
 
-def _removal(row: dict[str, Any], folder: Path, refusal: str, foreign: bool) -> Removal:
+def _removal(row: IndexRow, folder: Path, refusal: str, foreign: bool) -> Removal:
     contents = Contents()
     if not refusal:
         try:
@@ -185,7 +185,7 @@ class Criteria:
     """Their status; any if empty, but `archived` only if named."""
 
 
-def unwanted(index: Index, criteria: Criteria, now: float) -> tuple[Rows, Counter[str]]:
+def unwanted(index: Index, criteria: Criteria, now: float) -> tuple[list[IndexRow], Counter[str]]:
     """Return the rows that meet the criteria, and how many more do but are protected, by reason.
 
     Args:

@@ -33,6 +33,9 @@ _SUMMED: Final = (
 )
 """The columns for sums of disk usage: an SQLite index over them saves reading all rows."""
 
+Expression = Any
+"""A column, a condition or a query of peewee, which has no types."""
+
 
 class SeedField(Field):
     """A seed, from 0 to 2^64 - 1, shifted to SQLite's signed integers so that their order stays."""
@@ -169,7 +172,7 @@ def _recorded(run: Run) -> Mapping[str, object]:
     return {}
 
 
-def text(value: Any, max_length: int = _TEXT) -> str | None:
+def text(value: object, max_length: int = _TEXT) -> str | None:
     """Return a text for SQLite, truncated; None if the value is not a text."""
     if not isinstance(value, str):
         return None

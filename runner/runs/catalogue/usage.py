@@ -7,19 +7,20 @@ import os
 import re
 import stat
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from peewee import Case, DatabaseError, Value, chunked, fn
 
 from runner.recording.labels import KEEP, LABELS_FILE, LOCK_FILE
+from runner.runs.catalogue.columns import IndexRow
 from runner.runs.catalogue.database import open_index
 from runner.runs.catalogue.filters import Filter
-from runner.runs.catalogue.index import Index, Rows
-from runner.runs.catalogue.rows import Row
+from runner.runs.catalogue.index import Index
+from runner.runs.catalogue.rows import Expression, Row
 from runner.runs.locking import RUN_LOCK
 from runner.runs.run import RECORDING_FILE, RUN_FILE
 from runner.runs.store import Store
@@ -112,7 +113,7 @@ def sizes(usages: Sequence[Usage | Sums]) -> dict[str, int]:
 class Usage:
     """The disk usage of a run, in bytes."""
 
-    row: dict[str, Any]
+    row: IndexRow
     """The run's row in the index."""
     contents: Contents
     checkpoints: int
@@ -214,7 +215,7 @@ def usage_of(
 
     stored = read(read_index)
 
-    def usage(row: dict[str, Any], contents: Contents) -> Usage:
+    def usage(row: IndexRow, contents: Contents) -> Usage:
         kept = contents_in(row["root"]).get(row["entry"], 0)
         return Usage(row, contents, kept, exports[row["id"]], restored[row["id"]])
 
@@ -246,9 +247,9 @@ class _Stored(NamedTuple):
 
     sums: Sums
     """Over the measured runs; without cached files."""
-    measured: Rows
+    measured: list[IndexRow]
     """Of the measured runs: the largest, and all that have cached files."""
-    unmeasured: Rows
+    unmeasured: list[IndexRow]
     """The runs whose folders have to be measured."""
 
 
@@ -271,7 +272,7 @@ def _summed(index: Index) -> list[object]:
     protected = fn.INSTR(Value(line).concat(Row.tags).concat(line), f"{line}{KEEP}{line}") > 0
     free = ~protected & (Row.status != "running")
 
-    def total(condition: Any, column: Any) -> Any:
+    def total(condition: Expression, column: Expression) -> Expression:
         return fn.SUM(Case(None, [(condition, column)], 0))
 
     return [
@@ -284,7 +285,7 @@ def _summed(index: Index) -> list[object]:
     ]
 
 
-def _store(measured: Sequence[tuple[Mapping[str, Any], Contents]]) -> None:
+def _store(measured: Sequence[tuple[IndexRow, Contents]]) -> None:
     """Store what was measured in the index, if it can be written; not of folders that changed since."""
     statement = (
         f"UPDATE {Row._meta.table_name} SET used_recording=?, used_other=?, used_left_over=?, used_freed=? "
