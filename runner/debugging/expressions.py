@@ -132,7 +132,8 @@ class Parser:
                 tree = ast.parse(self.text, mode="eval").body
         except SyntaxError as error:
             at = min(max((error.offset or 1) - 1, 0), len(self.text) - 1)
-            raise self._error(at, at + 1, error.msg) from None
+            hint = " (equality is ==)" if self.text[at] == "=" else ""
+            raise self._error(at, at + 1, f"{error.msg}{hint}") from None
         except (MemoryError, RecursionError, ValueError):
             raise RunnerError("expression: is nested too deeply.") from None
         nodes = sum(1 for _ in ast.walk(tree))

@@ -30,6 +30,7 @@ from runner.analysis.groups import grouped, groups_of, metrics_of, require_two
 from runner.analysis.histograms import histograms
 from runner.analysis.qtable import describe_tables, one_array, replay_at
 from runner.analysis.series import RunSeries, parse_target, read_series
+from runner.debugging.when import section_of, when_in
 from runner.errors import RunnerError
 from runner.export.plots.curves import curves_sheet
 from runner.export.plots.image import check_suffix, save
@@ -203,6 +204,36 @@ def q_table(path: Path, step: int | None, episode: int | None, state: int | None
         stream = io.BytesIO()
         np.save(stream, one_array(replay.tables))
         return stream.getvalue()
+
+
+def when(path: Path, expression: str, every: bool, first: str | None, last: str | None) -> bytes:
+    """Return when an expression held in training, as `dualtaxi when --json` prints it.
+
+    Raises:
+        RecordingError: there is no such step, or steps are not recorded.
+        RunnerError: the expression is invalid, or the recording is of a loop.
+    """
+    with open_recording(path) as recording:
+        return as_json(when_in(recording, expression, every, first, last).as_json())
+
+
+def when_section(
+    path: Path, expression: str, every: bool, first: str | None, last: str | None, intervals: int
+) -> bytes:
+    """Return the same as sentences and tables for a page, as JSON with the addresses of replays.
+
+    Args:
+        path: the recording.
+        expression: as for `when`.
+        every: as for `when`.
+        first: as for `when`.
+        last: as for `when`.
+        intervals: the most that are listed.
+    """
+    with open_recording(path) as recording:
+        found = when_in(recording, expression, every, first, last)
+        moments = [each.start.at.replay_address(found.run_id) for each in found.intervals[:intervals]]
+        return as_json({"section": dataclasses.asdict(section_of(found, intervals)), "replays": moments})
 
 
 def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:

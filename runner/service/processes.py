@@ -31,6 +31,7 @@ PRELOADED: Final = (
     "runner.analysis.diff",
     "runner.analysis.qtable",
     "runner.analysis.series",
+    "runner.debugging.when",
     "runner.environments.loading",
     "runner.execution.estimate",
     "runner.execution.initial_tables",

@@ -11,6 +11,7 @@ from pydantic import BaseModel
 
 from runner.analysis.axes import AXES, EPISODES
 from runner.analysis.frames import Phase, episode_columns, step_columns
+from runner.debugging.expressions import MAX_CHARACTERS
 from runner.recording.reader import Recording
 from runner.service import computed
 from runner.service.computed import too_many
@@ -42,6 +43,12 @@ Episode = Annotated[int | None, Query(ge=0, lt=2**62, description="After this nu
 PhasePath = Annotated[Phase, Path(description="`train`, or `eval`: the trials of evaluations.")]
 
 
+Expression = Annotated[
+    str, Query(max_length=MAX_CHARACTERS, description="A condition.", examples=["max(q[300]) > 20"])
+]
+StepText = Annotated[
+    str | None, Query(max_length=40, description="A training step: its number, or EPISODE:T.")
+]
 AxisName = Annotated[str, Query(max_length=20, description=f"The horizontal axis: one of {', '.join(AXES)}.")]
 Metrics = Annotated[list[str] | None, Query(max_length=100, description="Default: all.")]
 FirstPosition = Annotated[float, Query(ge=0, allow_inf_nan=False, description="The first position.")]
@@ -276,6 +283,18 @@ async def q_table(
     """Return size, fill and range of each learner's exact table, as `dualtaxi qtable --json` prints it."""
     _refuse_both(step, episode)
     return _json(await compute(computed.q_table, step, episode, state, "json"))  # type: ignore[return-value]
+
+
+@router.get("/when", responses=BUSY, summary="The training steps after which an expression holds.")
+async def when(
+    compute: ComputationOf,
+    expression: Expression,
+    every: Annotated[bool, Query(alias="all", description="Find every interval.")] = False,
+    first: Annotated[StepText, Query(alias="from")] = None,
+    last: Annotated[StepText, Query(alias="to")] = None,
+) -> dict[str, Any]:
+    """Return what `dualtaxi when --json` prints; of a run that was trained here."""
+    return _json(await compute(computed.when, expression, every, first, last))  # type: ignore[return-value]
 
 
 @router.get(

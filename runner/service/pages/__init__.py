@@ -18,6 +18,7 @@ from runner.service.pages import (
     static,
     submit,
     sweeps,
+    when,
 )
 from runner.service.pages.rendering import add_error_handlers, refused
 
@@ -25,7 +26,7 @@ __all__ = ["add_error_handlers", "refused", "router"]
 
 router = APIRouter(include_in_schema=False)
 for _module in (
-    *(runs, rerun, run, setup, replay, environments, episodes, compare),
+    *(runs, rerun, run, setup, replay, when, environments, episodes, compare),
     *(machine, submit, jobs, sweeps, static),
 ):
     router.include_router(_module.router)

@@ -19,6 +19,7 @@ TABS: Final = (
     ("episodes", "Episodes"),
     ("evaluations", "Evaluations"),
     ("learned", "What was learned"),
+    ("when", "When?"),
     ("config", "Configuration"),
     ("code", "Code"),
     ("pictures", "Pictures"),
@@ -55,6 +56,7 @@ def head_of(run: Run) -> RunHead:
     """Return the facts of a run that all of its pages show."""
     has_tab = {
         "learned": has_tables(run),
+        "when": has_tables(run),
         "pictures": bool(run.summary.messages.get(schema.IMAGE_TOPIC.name))
         or (run.status == "running" and not has_tables(run)),
     }

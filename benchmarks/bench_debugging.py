@@ -1,0 +1,62 @@
+"""Questions about how the tutorial's cooperative run learned: time of whole commands, and memory."""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import tempfile
+from collections.abc import Sequence
+
+from benchmarks.figures import Figure, figure
+from benchmarks.processes import Process, run, run_command
+
+CONFIG = "tutorial_cooperative"
+STATE = 'q[300, "north + east"] > q[300, "west + east"]'
+NEVER = "max(q[300]) > 1e6"
+PATH = "greedy_success[300]"
+
+
+def measure(quick: bool) -> list[Figure]:
+    """Return times of commands, with compiled code in its cache, and their peak memory."""
+    repetitions, times = (3, 2) if quick else (7, 10)
+    with tempfile.TemporaryDirectory() as folder:
+        run(run_command(CONFIG, folder))
+        figures = when(folder, repetitions)
+    with tempfile.TemporaryDirectory() as folder:
+        run(run_command(CONFIG, folder, f"episodes={50_000 * times}"))
+        longer = [command(folder, "when", "@latest", text, "--all") for text in (STATE, PATH, "reward > 0")]
+    return [*figures, _peak(f"  when, for a run {times} times as long", longer)]
+
+
+def when(folder: str, repetitions: int) -> list[Figure]:
+    """Return the figures of `dualtaxi when` for one state."""
+    command(folder, "when", "@latest", PATH)  # compiles
+    questions = {
+        "when, first time": ((1, 0.3), [STATE]),
+        "when, first time, never found": ((1, 0.3), [NEVER]),
+        "when, every time": ((2, 0.5), [STATE, "--all"]),
+        "when, every time, of a greedy path": ((2, 0.5), [PATH, "--all"]),
+    }
+    figures, processes = [], []
+    for what, (targets, words) in questions.items():
+        done = [command(folder, "when", "@latest", *words) for _ in range(repetitions)]
+        figures.append(_seconds(what, done, targets))
+        processes += done
+    return [*figures, _peak("  peak memory", processes)]
+
+
+def command(folder: str, *words: str) -> Process:
+    """Return the process of a command of the program over a folder of runs."""
+    return run([sys.executable, "-m", "runner", *words, "--recordings", folder])
+
+
+def _seconds(what: str, processes: Sequence[Process], targets: tuple[float, float]) -> Figure:
+    cpu = statistics.median(process.cpu_seconds for process in processes)
+    seconds = [process.seconds for process in processes]
+    detail = f"{cpu:.2f} s of processor time in all threads"
+    return figure(what, seconds, "s", targets, higher_is_better=False, detail=detail)
+
+
+def _peak(what: str, processes: Sequence[Process]) -> Figure:
+    peak = max(process.peak_megabytes for process in processes)
+    return figure(what, [peak], "MB", (400, 300), higher_is_better=False)
