@@ -26,6 +26,9 @@ from runner.loops.options import Options
 from runner.loops.outcomes import Outcomes
 from runner.recording import schema
 from runner.recording.action_recorder import ActionRecorder
+from runner.recording.actions import ACTION_TOPICS
+from runner.recording.blocks import record_dtype
+from runner.recording.compaction import compacted
 from runner.recording.gym_spaces import can_widen, widened
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.metadata import run_metadata, sizes_of, write_description, write_maker, write_result
@@ -193,7 +196,12 @@ class LoopRun:
         Raises:
             StorageError: the disk is full or failing.
         """
-        result = self.recorder.totals(self.recorder.drain()) | self.outcomes.summary()
+        topic_digests = self.recorder.drain()
+        self._code.write(self._file, wait=True)
+        self._write_makers()
+        if self._actions is not None and self._follower is None:  # which has sent the file as it is
+            self._compact()
+        result = self.recorder.totals(topic_digests) | self.outcomes.summary()
         result |= {
             "episodes": self.recorder.counts["/train/episode"],
             "steps_recorded": self._options.steps == "all",
@@ -202,11 +210,23 @@ class LoopRun:
             result["rewards_off_table"] = rewards_off_table
         if error:
             result["error"] = truncated_message(error)
-        self._code.write(self._file, wait=True)
-        self._write_makers()
         write_result(self._file, status, result, synced=False)
         seconds = round(time.monotonic() - self.started, 3)
         return result | {"seconds": seconds, "bytes": self._file.size}
+
+    def _compact(self) -> None:
+        """Write a recording of actions alone again, in fewer chunks, if there are several."""
+        counts = self.recorder.counts
+        steps = {
+            ACTION_TOPICS[topic.name]: record_dtype(topic.message, sizes)
+            for topic, sizes in sizes_of(self._facts, str(self._file.path)).items()
+            if topic.name in ACTION_TOPICS
+        }
+        if sum(counts[topic.name] for topic in steps) > len(steps):
+            environments, packing = self.described.environments, self._options.packing.packing
+            with contextlib.suppress(OSError):  # without the space for both, the recording stays as it is
+                self._file, messages = compacted(self._file, packing, steps, environments)
+                counts |= messages
 
     def close_file(self) -> None:
         """Close the file, finished or not."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.recording import schema
-from runner.recording.actions import ACTION_TOPICS, COLUMNS, MARK, NUMBERS, EpisodeDigests, Rows, kept_dtype
+from runner.recording.actions import ACTION_TOPICS, EpisodeDigests, Rows, kept_dtype, packed
 from runner.recording.messages import encode
 from runner.recording.recorder import BLOCK_BYTES, Recorder
 from runner.recording.schema import RESET_ONLY, Topic
@@ -64,7 +64,7 @@ class ActionRecorder:
             rows, self._rows = np.concatenate(self._rows), []
             position = int(rows["log_time"][-1]) // schema.STEP_NANOSECONDS
             topic = ACTION_TOPICS[f"/{self._phase}/step"]
-            self._recorder.append(topic, encode(schema.ACTIONS, _packed(rows, self._n)), position)
+            self._recorder.append(topic, encode(schema.ACTIONS, packed(rows, self._n)), position)
 
 
 def _outcomes(rows: Rows) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
@@ -72,31 +72,3 @@ def _outcomes(rows: Rows) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDA
     names = rows.dtype.names or ()
     observations = rows["next_state" if "next_state" in names else "next_observation"]
     return rows["t"], observations, rows["rewards"], rows["terminated"], rows["truncated"]
-
-
-def _packed(rows: Rows, n: int) -> dict[str, object]:
-    """Return the fields of a message for a block of steps."""
-    columns = []
-    for name in rows.dtype.names or ():
-        if name in COLUMNS:
-            values = np.ascontiguousarray(rows[name])
-            if name in NUMBERS:
-                values[n:] -= values[:-n].copy()
-            columns.append(values.view(np.uint8).reshape(len(rows), -1).T.tobytes())
-    last = np.zeros(len(rows), np.bool_)  # of an episode, in the block
-    digests = rows["digest"].copy().view(np.uint8).reshape(len(rows), -1)
-    marked = np.asarray(digests.any(axis=1))
-    for first in range(min(n, len(rows))):  # an environment
-        own = np.arange(first, len(rows), n)
-        own = own[marked[own]]
-        if len(own):
-            episode = rows["episode"][own]
-            last[own] = np.append(episode[1:] != episode[:-1], True)
-    marks = np.zeros(int(last.sum()), MARK)
-    marks["row"], marks["digest"] = np.flatnonzero(last), rows["digest"][last]
-    return {
-        "step": int(rows["step"][0]),
-        "count": len(rows),
-        "data": b"".join(columns),
-        "digests": marks.tobytes(),
-    }

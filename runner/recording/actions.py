@@ -84,6 +84,37 @@ class EpisodeDigests:
                 yield stop - 1, running.digest(DIGEST_BYTES)
 
 
+def packed(rows: Rows, n: int) -> dict[str, object]:
+    """Return the fields of a message with a block of steps, as `unpacked` returns them.
+
+    Of each episode only the last digest in the block is kept.
+    """
+    columns = []
+    for name in rows.dtype.names or ():
+        if name in COLUMNS:
+            values = np.ascontiguousarray(rows[name])
+            if name in NUMBERS:
+                values[n:] -= values[:-n].copy()
+            columns.append(values.view(np.uint8).reshape(len(rows), -1).T.tobytes())
+    last = np.zeros(len(rows), np.bool_)  # of an episode, in the block
+    digests = rows["digest"].copy().view(np.uint8).reshape(len(rows), -1)
+    marked = np.asarray(digests.any(axis=1))
+    for first in range(min(n, len(rows))):  # an environment
+        own = np.arange(first, len(rows), n)
+        own = own[marked[own]]
+        if len(own):
+            episode = rows["episode"][own]
+            last[own] = np.append(episode[1:] != episode[:-1], True)
+    marks = np.zeros(int(last.sum()), MARK)
+    marks["row"], marks["digest"] = np.flatnonzero(last), rows["digest"][last]
+    return {
+        "step": int(rows["step"][0]),
+        "count": len(rows),
+        "data": b"".join(columns),
+        "digests": marks.tobytes(),
+    }
+
+
 def unpacked(fields: Mapping[str, Any], dtype: np.dtype[np.void], n: int, where: str) -> Rows:
     """Return the steps in a message.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Final
 
@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
-from runner.recording.schema import EXTRA, TOPIC_OF, TRANSITION, UNIFORM_TOPICS, Topic
-from runner.util.packing import MAX_CHUNK_STEPS, Packing
+from runner.recording.schema import ACTIONS, EXTRA, TOPIC_OF, TRANSITION, UNIFORM_TOPICS, Topic
+from runner.util.packing import MAX_CHUNK_STEPS, MAX_LEVEL, Packing
 
 MAX_CHUNK_BYTES: Final = 64 << 20
 """The largest chunk that is read, packed or unpacked; the recorder's are below 16 MiB."""
@@ -66,6 +66,8 @@ def encode_chunk(
         offsets: where each begins in `records`.
         packing: how to pack it.
     """
+    if topic.message is ACTIONS:  # hardly anything but zeros and small numbers: quick at any level
+        packing = replace(packing, level=MAX_LEVEL)
     name = "" if packing.compression == "none" else packing.compression
     width = len(records) // len(log_times) if topic.message is TRANSITION else 0
     data = _compress(records, packing, width)

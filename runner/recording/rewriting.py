@@ -60,7 +60,7 @@ def rewrite(
     with open_recording(path) as recording:
         topics = recording.topics
     with RecordingFile(fresh, topics) as file:
-        for opcode, offset, body in _whole_records(path):
+        for opcode, offset, body in whole_records(path):
             if opcode == Opcode.METADATA:
                 name, entries = metadata_of(body)
                 if name == "config":
@@ -138,13 +138,13 @@ def _is_stated(result: Summary, seen: dict[str, str]) -> bool:
 
 
 def _chunks(path: Path) -> Iterator[tuple[Topic, ReadChunk]]:
-    for opcode, offset, body in _whole_records(path):
+    for opcode, offset, body in whole_records(path):
         if opcode == Opcode.CHUNK:
             chunk = read_chunk(body, offset)
             yield TOPIC_OF[chunk.summary.channel], chunk
 
 
-def _whole_records(path: Path) -> Iterator[tuple[int, int, bytes]]:
+def whole_records(path: Path) -> Iterator[tuple[int, int, bytes]]:
     """Yield (opcode, offset, body) of the data section's records, up to where the file may be cut off.
 
     Raises:

@@ -1,0 +1,159 @@
+"""A recording of actions alone, written again in few chunks when it is complete.
+
+While a loop runs, each topic gets a chunk twice a second, so that a kill loses less than a second. Of actions
+alone these hold a few hundred bytes, and their heads and index entries take as much again.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from runner.recording import schema
+from runner.recording.actions import Rows, kept_dtype, packed, unpacked
+from runner.recording.blocks import HEADER_BYTES, message_record
+from runner.recording.chunks import encode_chunk
+from runner.recording.messages import decode, encode
+from runner.recording.records import ReadChunk, attachment_of, metadata_of, read_chunk
+from runner.recording.rewriting import whole_records
+from runner.recording.schema import TOPIC_OF, Topic
+from runner.recording.writer import RecordingFile
+from runner.util.files import replacing
+from runner.util.packing import Packing
+
+_SMALL: Final = 1 << 16
+"""Chunks of more bytes, unpacked, are not put together with others."""
+_MAX_BYTES: Final = 1 << 20
+_MAX_MESSAGES: Final = 2048
+
+
+@dataclass
+class _Gathered:
+    """Messages of a topic that wait for a chunk."""
+
+    records: list[bytes] = field(default_factory=list)
+    times: list[NDArray[np.uint64]] = field(default_factory=list)
+    offsets: list[NDArray[np.uint64]] = field(default_factory=list)
+    size: int = 0
+    """Bytes of the records."""
+    count: int = 0
+
+
+class _Compaction:
+    """Writes the chunks of one recording into another.
+
+    Args:
+        file: the new recording.
+        packing: how chunks are packed, and the most steps whose actions share a message.
+        steps: the dtype of whole steps, by the topic of their actions.
+        environments: how many take turns.
+    """
+
+    def __init__(
+        self,
+        file: RecordingFile,
+        packing: Packing,
+        steps: Mapping[Topic, np.dtype[np.void]],
+        environments: int,
+    ) -> None:
+        self._file, self._packing, self._n = file, packing, environments
+        self._kept = {topic: kept_dtype(dtype) for topic, dtype in steps.items()}
+        self._rows: dict[Topic, list[Rows]] = defaultdict(list)
+        self._gathered: dict[Topic, _Gathered] = defaultdict(_Gathered)
+        self.messages: dict[str, int] = {topic.name: 0 for topic in steps}
+        """Messages with actions written so far, by topic."""
+
+    def take(self, chunk: ReadChunk) -> None:
+        """Take a chunk of the old recording."""
+        topic = TOPIC_OF[chunk.summary.channel]
+        if topic not in self._kept:
+            self._gather(topic, chunk)
+            return
+        for start, stop in pairwise([*chunk.offsets.tolist(), len(chunk.records)]):
+            fields = decode(topic.message, chunk.records[start + HEADER_BYTES : stop])
+            self._rows[topic].append(unpacked(fields, self._kept[topic], self._n, topic.name))
+        while sum(map(len, self._rows[topic])) >= self._packing.chunk_steps:
+            rows = np.concatenate(self._rows[topic])
+            self._rows[topic] = [rows[self._packing.chunk_steps :]]
+            self._write_actions(topic, rows[: self._packing.chunk_steps])
+
+    def finish(self) -> None:
+        """Write what is still waiting."""
+        for topic, rows in self._rows.items():
+            if sum(map(len, rows)):
+                self._write_actions(topic, np.concatenate(rows))
+        for topic in list(self._gathered):
+            self._write(topic)
+
+    def _write_actions(self, topic: Topic, rows: Rows) -> None:
+        log_time = rows["log_time"][-1:].astype(np.uint64)
+        record = message_record(topic, int(log_time[0]), encode(schema.ACTIONS, packed(rows, self._n)))
+        chunk = encode_chunk(topic, record, log_time, np.zeros(1, np.uint64), self._packing)
+        self._file.add_chunk(topic, chunk)
+        self.messages[topic.name] += 1
+
+    def _gather(self, topic: Topic, chunk: ReadChunk) -> None:
+        size, waiting = len(chunk.records), self._gathered[topic]
+        is_small = size <= _SMALL
+        if not is_small or waiting.size + size > _MAX_BYTES or waiting.count >= _MAX_MESSAGES:
+            self._write(topic)
+        waiting = self._gathered[topic]
+        waiting.records.append(chunk.records)
+        waiting.times.append(chunk.times)
+        waiting.offsets.append(chunk.offsets + np.uint64(waiting.size))
+        waiting.size += size
+        waiting.count += len(chunk.times)
+        if not is_small:
+            self._write(topic)
+
+    def _write(self, topic: Topic) -> None:
+        if (waiting := self._gathered.pop(topic, None)) is not None:
+            times, offsets = np.concatenate(waiting.times), np.concatenate(waiting.offsets)
+            chunk = encode_chunk(topic, b"".join(waiting.records), times, offsets, self._packing)
+            self._file.add_chunk(topic, chunk)
+
+
+def compacted(
+    file: RecordingFile,
+    packing: Packing,
+    steps: Mapping[Topic, np.dtype[np.void]],
+    environments: int,
+) -> tuple[RecordingFile, dict[str, int]]:
+    """Return a recording in place of one that is complete but for its result, and its messages with actions.
+
+    Metadata, attachments and all messages are the same, but that more actions share a message.
+
+    Args:
+        file: the recording; it is closed.
+        packing: how its chunks are packed.
+        steps: the dtype of whole steps, by the topic of their actions.
+        environments: how many take turns.
+
+    Raises:
+        OSError: the new recording cannot be written; the old one is as before.
+    """
+    with replacing(file.path) as path:
+        fresh = RecordingFile(path, file.topics)
+        try:
+            writing = _Compaction(fresh, packing, steps, environments)
+            for opcode, offset, body in whole_records(file.path):
+                if opcode == Opcode.METADATA:
+                    fresh.add_metadata(*metadata_of(body))
+                elif opcode == Opcode.ATTACHMENT:
+                    fresh.add_attachment(*attachment_of(body, offset))
+                elif opcode == Opcode.CHUNK:
+                    writing.take(read_chunk(body, offset))
+            writing.finish()
+        except BaseException:
+            fresh.close()
+            raise
+    fresh.path = file.path
+    file.close()
+    return fresh, writing.messages
