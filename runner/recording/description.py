@@ -25,6 +25,7 @@ from runner.recording.metadata import (
     lost_ranges,
     parse_shards,
     spaces_of,
+    unpacked_provenance,
 )
 from runner.recording.run_file import Summary, parse_result
 from runner.recording.schema import Topic
@@ -104,7 +105,7 @@ class RunDescription(ABC):
     @cached_property
     def provenance(self) -> dict[str, str]:
         """Where and by what it was made, with the commit of the user's code where it is recorded."""
-        first = self.metadata("provenance")
+        first = unpacked_provenance(self.metadata("provenance"), str(self.path))
         code = self.metadata(CODE_RECORD) if CODE_RECORD in self.metadata_names else {}
         return first | code | first  # no entry of the first is replaced
 

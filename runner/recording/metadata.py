@@ -5,10 +5,13 @@ Anyone may have written a file that is read.
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
+
+import zstandard
 
 from runner.environments.mdp import MAX_AGENTS, MAX_ARRAYS_BYTES, MAX_EVENTS, Mdp, from_parts
 from runner.errors import RecordingError
@@ -28,6 +31,10 @@ REQUIRED_RECORDS: Final = frozenset({"run", "config", "provenance"})
 """The metadata records without which a recording's messages cannot be interpreted."""
 RECORDING_STOPPED: Final = "recording stopped at step "
 """The beginning of the error of a loop that went on when recording failed."""
+_PACKAGE: Final = "package."
+_PACKAGES: Final = "packages"
+"""The entry of the provenance with the versions of all packages: JSON, in zstd, in Base64."""
+_MAX_PACKAGES_BYTES: Final = 1 << 20
 _RUN_TEXTS: Final = ("run_id", "name", "job", "created", "agents")
 _RUN_COUNTS: Final = {"seed": 2**64 - 1, "learners": MAX_AGENTS, "events": MAX_EVENTS}
 """The numbers that every metadata record `run` has, and the largest possible value of each."""
@@ -257,6 +264,42 @@ def environment_of(description: Mapping[str, Any], attachment: Callable[[str], b
     return from_parts(description, arrays)
 
 
+# --- the provenance -----------------------------------------------------------------------------------
+
+
+def packed_provenance(provenance: Mapping[str, str]) -> dict[str, str]:
+    """Return the entries of the metadata record: the versions of packages, one each in it, in one of them."""
+    packages = {key: text for key, text in provenance.items() if key.startswith(_PACKAGE)}
+    others = {key: text for key, text in provenance.items() if key not in packages}
+    return others | ({_PACKAGES: _packed_packages(tuple(packages.items()))} if packages else {})
+
+
+@lru_cache(4)
+def _packed_packages(packages: tuple[tuple[str, str], ...]) -> str:
+    text = json.dumps({key.removeprefix(_PACKAGE): version for key, version in packages})
+    return base64.b64encode(zstandard.ZstdCompressor(level=19).compress(text.encode())).decode()
+
+
+def unpacked_provenance(entries: Mapping[str, str], path: str) -> dict[str, str]:
+    """Return the provenance in the entries of its record, of earlier recordings too.
+
+    Raises:
+        RecordingError: the versions of packages are damaged.
+    """
+    others = dict(entries)
+    what = f"{path}: the packages of its provenance"
+    try:
+        data = base64.b64decode(others.pop(_PACKAGES, ""), validate=True)
+        with zstandard.ZstdDecompressor(max_window_size=_MAX_PACKAGES_BYTES).stream_reader(data) as stream:
+            text = stream.read(_MAX_PACKAGES_BYTES)
+    except (ValueError, zstandard.ZstdError) as error:
+        raise RecordingError(f"{what} are damaged ({error}).") from error
+    packages = json_object(text, what) if data else {}
+    if not all(isinstance(version, str) for version in packages.values()):
+        raise RecordingError(f"{what} are damaged: found a version that is no text.")
+    return others | {f"{_PACKAGE}{name}": version for name, version in packages.items()}
+
+
 # --- the file -----------------------------------------------------------------------------------------
 
 
@@ -276,7 +319,7 @@ def write_description(
     try:
         file.add_metadata("run", run)
         file.add_metadata("config", _json_entry(config))
-        file.add_metadata("provenance", provenance)
+        file.add_metadata("provenance", packed_provenance(provenance))
         if maker is not None:
             file.add_metadata(MAKER_RECORD, maker.to_metadata())
         for name, (media_type, data) in environment.items():
