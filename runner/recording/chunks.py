@@ -31,6 +31,8 @@ CHUNK_HEAD: Final = struct.Struct("<QQQII")
 """Start time, end time, size unpacked, its CRC, and the length of the name of the compression."""
 _PICTURE_BYTES: Final = 1 << 13
 """Steps of more bytes have pictures in their observations, or are as rare."""
+_MOSTLY_ZEROS: Final = 16
+"""Blocks of actions that become this many times smaller are discrete: nearly all of their columns are 0."""
 _DATA_LENGTH: Final = struct.Struct("<Q")
 _MAX_NAME_BYTES: Final = 4
 """The length of the longest name of a compression, `zstd`."""
@@ -66,11 +68,11 @@ def encode_chunk(
         offsets: where each begins in `records`.
         packing: how to pack it.
     """
-    if topic.message is ACTIONS:  # hardly anything but zeros and small numbers: quick at any level
-        packing = replace(packing, level=MAX_LEVEL)
     name = "" if packing.compression == "none" else packing.compression
     width = len(records) // len(log_times) if topic.message is TRANSITION else 0
     data = _compress(records, packing, width)
+    if topic.message is ACTIONS and len(data) * _MOSTLY_ZEROS < len(records):  # quick at any level
+        data = _compress(records, replace(packing, level=MAX_LEVEL), width)
     start, end, size = int(log_times[0]), int(log_times[-1]), len(records)
     head = CHUNK_HEAD.pack(start, end, size, zlib.crc32(records), len(name)) + name.encode()
     head += _DATA_LENGTH.pack(len(data))

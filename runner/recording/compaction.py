@@ -21,6 +21,7 @@ from runner.recording.actions import Rows, kept_dtype, packed, unpacked
 from runner.recording.blocks import HEADER_BYTES, message_record
 from runner.recording.chunks import encode_chunk
 from runner.recording.messages import decode, encode
+from runner.recording.recorder import BLOCK_BYTES
 from runner.recording.records import ReadChunk, attachment_of, metadata_of, read_chunk
 from runner.recording.rewriting import whole_records
 from runner.recording.schema import TOPIC_OF, Topic
@@ -79,10 +80,13 @@ class _Compaction:
         for start, stop in pairwise([*chunk.offsets.tolist(), len(chunk.records)]):
             fields = decode(topic.message, chunk.records[start + HEADER_BYTES : stop])
             self._rows[topic].append(unpacked(fields, self._kept[topic], self._n, topic.name))
-        while sum(map(len, self._rows[topic])) >= self._packing.chunk_steps:
+        limit = min(self._packing.chunk_steps, max(1, BLOCK_BYTES // self._kept[topic].itemsize))
+        if sum(map(len, self._rows[topic])) >= limit:
             rows = np.concatenate(self._rows[topic])
-            self._rows[topic] = [rows[self._packing.chunk_steps :]]
-            self._write_actions(topic, rows[: self._packing.chunk_steps])
+            whole = len(rows) // limit * limit
+            for start in range(0, whole, limit):
+                self._write_actions(topic, rows[start : start + limit])
+            self._rows[topic] = [rows[whole:]]
 
     def finish(self) -> None:
         """Write what is still waiting."""
