@@ -294,10 +294,11 @@ def unpacked_provenance(entries: Mapping[str, str], path: str) -> dict[str, str]
             text = stream.read(_MAX_PACKAGES_BYTES)
     except (ValueError, zstandard.ZstdError) as error:
         raise RecordingError(f"{what} are damaged ({error}).") from error
-    packages = json_object(text, what) if data else {}
-    if not all(isinstance(version, str) for version in packages.values()):
-        raise RecordingError(f"{what} are damaged: found a version that is no text.")
-    return others | {f"{_PACKAGE}{name}": version for name, version in packages.items()}
+    for name, version in (json_object(text, what) if data else {}).items():
+        if not isinstance(version, str):
+            raise RecordingError(f"{what} are damaged: found {version!r}, expected the version of {name}.")
+        others[f"{_PACKAGE}{name}"] = version
+    return others
 
 
 # --- the file -----------------------------------------------------------------------------------------
