@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from html import escape
 from typing import Final
 
@@ -20,19 +19,20 @@ KEY: Final = (
 )
 
 
-def why_body(found: Why, address: Callable[[StepRef], str] | None = None) -> str:
+def why_body(found: Why, linked: bool) -> str:
     """Return the part of a page that shows a Q-value as a sum.
 
     Args:
         found: the sum.
-        address: returns the address of the replay of a step; None for no links.
+        linked: link each step to its replay on a server.
 
     Raises:
         MissingExtra: Jinja2 is not installed.
     """
     parts = partials()
     *sections, steps = sections_of(found)
-    links = [address(StepRef.parse(step.at)) for step in found.steps] if address else []
+    steps_at = [StepRef.parse(step.at) for step in found.steps]
+    links = [at.replay_address(found.run_id) for at in steps_at] if linked else []
     picture = ""
     if found.picture:
         picture = f'<figure class="moves">{found.picture}<figcaption>{escape(KEY)}</figcaption></figure>'
@@ -49,7 +49,7 @@ def why_body(found: Why, address: Callable[[StepRef], str] | None = None) -> str
 def why_frame(found: Why) -> str:
     """Return a Q-value as a sum in a frame of its own; the value alone if packages are missing."""
     try:
-        page = f"<style>{page_style()}</style><main>{why_body(found)}</main>"
+        page = f"<style>{page_style()}</style><main>{why_body(found, linked=False)}</main>"
     except MissingExtra as error:
         facts = "; ".join(f"{name} {text}" for name, text in facts_of(found).items())
         return f"<p>{escape(facts)}</p><p>{escape(str(error))}</p>"

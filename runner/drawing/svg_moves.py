@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from runner.drawing.svg import CELL, Drawing, corner, picture
 from runner.environments.scene import SceneDescription
 
-WIDEST: Final = 24.0
+WIDEST: Final = 20.0
 """Width of the heaviest arrow, in hundredths of a cell."""
 _FAINTEST: Final = 0.5
 """Narrower arrows are not drawn."""
@@ -48,8 +48,8 @@ def moves_map(
         for move, width in sorted(widths, key=lambda each: -each[1])
         if width >= _FAINTEST
     ]
-    things = "" if place is None else f'<g opacity=".6">{drawing.things(place)}</g>'
-    content = f'{drawing.still()}{things}<g fill-opacity=".85">{"".join(shapes)}</g>'
+    things = "" if place is None else drawing.things(place)
+    content = f'{drawing.still()}<g fill-opacity=".85">{"".join(shapes)}</g>{things}'
     return picture(drawing.width, drawing.height, title, content)
 
 

@@ -30,7 +30,9 @@ from runner.analysis.groups import grouped, groups_of, metrics_of, require_two
 from runner.analysis.histograms import histograms
 from runner.analysis.qtable import describe_tables, one_array, replay_at
 from runner.analysis.series import RunSeries, parse_target, read_series
+from runner.analysis.step_reference import StepRef
 from runner.debugging.when import section_of, when_in
+from runner.debugging.why import why_in
 from runner.errors import RunnerError
 from runner.export.plots.curves import curves_sheet
 from runner.export.plots.image import check_suffix, save
@@ -234,6 +236,20 @@ def when_section(
         found = when_in(recording, expression, every, first, last)
         moments = [each.start.at.replay_address(found.run_id) for each in found.intervals[:intervals]]
         return as_json({"section": dataclasses.asdict(section_of(found, intervals)), "replays": moments})
+
+
+def why(
+    path: Path, state: str | None, action: str | None, agent: str | None, at: str | None, limit: int
+) -> bytes:
+    """Return where a Q-value comes from, as `dualtaxi why --json` prints it.
+
+    Raises:
+        RecordingError: there is no such step, or steps are not recorded.
+        RunnerError: there is no such state, action or agent, or the recording is of a loop.
+    """
+    step = StepRef.parse(at) if at else None
+    with open_recording(path) as recording:
+        return as_json(why_in(recording, state, action, agent, step, limit).as_json())
 
 
 def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:

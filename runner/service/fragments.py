@@ -31,6 +31,8 @@ from runner.analysis.sections import Grid, Section
 from runner.analysis.series import read_series
 from runner.analysis.step_reference import StepRef
 from runner.analysis.summary import random_policy_sentence
+from runner.debugging.why import why_in
+from runner.debugging.why_page import why_body
 from runner.drawing import svg
 from runner.errors import RecordingError, RunnerError
 from runner.export.encoded import picture_note
@@ -121,6 +123,15 @@ def maps(path: Path) -> bytes:
         if recording.has_tables:
             rows = maps_of(recording.mdp, recording.agents, stages_of(recording), _typical_start(recording))
         return str(partials().maps(rows, drawing is not None and drawing.width > svg.BROAD)).encode()
+
+
+def why(
+    path: Path, state: str | None, action: str | None, agent: str | None, at: str | None, limit: int
+) -> bytes:
+    """Return where a Q-value comes from as HTML; arguments and errors as for `computed.why`."""
+    step = StepRef.parse(at) if at else None
+    with open_recording(path) as recording:
+        return why_body(why_in(recording, state, action, agent, step, limit), linked=True).encode()
 
 
 def distributions(path: Path, axis: str) -> bytes:

@@ -32,6 +32,7 @@ PRELOADED: Final = (
     "runner.analysis.qtable",
     "runner.analysis.series",
     "runner.debugging.when",
+    "runner.debugging.why_page",
     "runner.environments.loading",
     "runner.execution.estimate",
     "runner.execution.initial_tables",

@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from runner.analysis.axes import AXES, EPISODES
 from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.debugging.expressions import MAX_CHARACTERS
+from runner.debugging.why import LIMIT, MAX_LIMIT
 from runner.recording.reader import Recording
 from runner.service import computed
 from runner.service.computed import too_many
@@ -48,6 +49,19 @@ Expression = Annotated[
 ]
 StepText = Annotated[
     str | None, Query(max_length=40, description="A training step: its number, or EPISODE:T.")
+]
+StateName = Annotated[
+    str | None, Query(max_length=1000, description="A state, by number or name; default: that of `at`.")
+]
+ActionName = Annotated[
+    str | None, Query(max_length=1000, description="An action, by number or name; default: that of `at`.")
+]
+AgentName = Annotated[
+    str | None, Query(max_length=200, description="Whose Q-table, where each agent has its own.")
+]
+StepName = Annotated[
+    str | None,
+    Query(max_length=60, description="The value before this step, EPISODE:T or eval:N:TRIAL:T."),
 ]
 AxisName = Annotated[str, Query(max_length=20, description=f"The horizontal axis: one of {', '.join(AXES)}.")]
 Metrics = Annotated[list[str] | None, Query(max_length=100, description="Default: all.")]
@@ -295,6 +309,19 @@ async def when(
 ) -> dict[str, Any]:
     """Return what `dualtaxi when --json` prints; of a run that was trained here."""
     return _json(await compute(computed.when, expression, every, first, last))  # type: ignore[return-value]
+
+
+@router.get("/why", responses=BUSY, summary="The rewards that a Q-value is the sum of.")
+async def why(
+    compute: ComputationOf,
+    state: StateName = None,
+    action: ActionName = None,
+    agent: AgentName = None,
+    at: StepName = None,
+    limit: Annotated[int, Query(ge=1, le=MAX_LIMIT, description="Number of steps.")] = LIMIT,
+) -> dict[str, Any]:
+    """Return where a Q-value comes from, as `dualtaxi why --json` prints it; of a run trained here."""
+    return _json(await compute(computed.why, state, action, agent, at, limit))  # type: ignore[return-value]
 
 
 @router.get(

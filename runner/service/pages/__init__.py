@@ -19,6 +19,7 @@ from runner.service.pages import (
     submit,
     sweeps,
     when,
+    why,
 )
 from runner.service.pages.rendering import add_error_handlers, refused
 
@@ -26,7 +27,7 @@ __all__ = ["add_error_handlers", "refused", "router"]
 
 router = APIRouter(include_in_schema=False)
 for _module in (
-    *(runs, rerun, run, setup, replay, when, environments, episodes, compare),
+    *(runs, rerun, run, setup, replay, when, why, environments, episodes, compare),
     *(machine, submit, jobs, sweeps, static),
 ):
     router.include_router(_module.router)

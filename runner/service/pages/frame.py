@@ -20,6 +20,7 @@ TABS: Final = (
     ("evaluations", "Evaluations"),
     ("learned", "What was learned"),
     ("when", "When?"),
+    ("why", "Why?"),
     ("config", "Configuration"),
     ("code", "Code"),
     ("pictures", "Pictures"),
@@ -57,6 +58,7 @@ def head_of(run: Run) -> RunHead:
     has_tab = {
         "learned": has_tables(run),
         "when": has_tables(run),
+        "why": has_tables(run),
         "pictures": bool(run.summary.messages.get(schema.IMAGE_TOPIC.name))
         or (run.status == "running" and not has_tables(run)),
     }
