@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import runner.integrations as integrations  # noqa: PLR0402
     from runner.api import run, run_all
     from runner.config import ExperimentConfig
+    from runner.debugging.explain import explain
     from runner.debugging.what_if import what_if
     from runner.debugging.when import when
     from runner.debugging.why import why
@@ -49,6 +50,7 @@ __all__ = [
     "__version__",
     "branch",
     "evaluate",
+    "explain",
     "find_run",
     "frames",
     "integrations",
@@ -78,6 +80,7 @@ _HOME = {
     "RunnerError": "runner.errors",
     "branch": "runner.loops.branch",
     "evaluate": "runner.execution.rerecord",
+    "explain": "runner.debugging.explain",
     "find_run": "runner.runs.resolve",
     "label": "runner.runs.run",
     "list_runs": "runner.runs.listing",

@@ -50,6 +50,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "branch": ("branch", "Take another action at a recorded step, and play on."),
         "when": ("when", "Find the training steps after which something holds, such as a Q-value."),
         "why": ("why", "Show the rewards and initial values that a Q-value is the sum of."),
+        "explain": ("explain", "Find which settings make the difference between two runs."),
     },
     "Manage": {
         "label": ("catalogue", "Change the name, note and tags of a run."),

@@ -69,6 +69,13 @@ def count_line(what: str, total: int) -> Iterator[Callable[[int], None]]:
 
 
 @contextlib.contextmanager
+def total_line(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Yield a function that is called with the number done and their total, which may grow."""
+    with _line("", [_BAR, f"{{task.completed:,}}/{{task.total:,}} {what}", "left"], total=0) as update:
+        yield lambda done, total: update(completed=done, total=total)
+
+
+@contextlib.contextmanager
 def _line(
     label: str, names: list[str], total: float | None = None, **fields: Any
 ) -> Iterator[Callable[..., None]]:

@@ -83,13 +83,14 @@ class Mixing:
         return [factor for i, factor in enumerate(self.factors) if mixture >> i & 1]
 
 
-def mix(a: ExperimentConfig, b: ExperimentConfig, at: int | None = None) -> Mixing:
+def mix(a: ExperimentConfig, b: ExperimentConfig, at: int | None = None, exact: bool = False) -> Mixing:
     """Return the settings in which two experiments differ, grouped so that they can be mixed.
 
     Args:
         a: one experiment.
         b: another.
         at: the number of training episodes after which they are compared; by default each at its own end.
+        exact: whether evaluations need exact measures.
 
     Raises:
         RunnerError: they differ in no setting, in too many, or in settings that cannot be mixed; or one of
@@ -109,6 +110,7 @@ def mix(a: ExperimentConfig, b: ExperimentConfig, at: int | None = None) -> Mixi
     if ours["evaluation"] is None:
         ours["evaluation"] = theirs["evaluation"] or {"every": 1000, "trials": 200}
         notes.append("A has no evaluation: that of B is used, or else one of 200 trials")
+    ours["evaluation"] |= {"exact": True} if exact else {}
     shared = {key: ours[key] for key in (*_MEASURING, "name", "seeds")}
     shared |= {"episodes": at} if at is not None else {}
     a, b = (from_mapping(values | shared) for values in (ours, theirs))

@@ -183,9 +183,24 @@ class Mixtures:
         self.seconds = 0.0
         """The time that one run takes of a processor; 0 if none was trained."""
 
+    @property
+    def ends(self) -> tuple[int, int]:
+        """The numbers of A and of B."""
+        return 0, self._mixing.everything
+
+    def complete(self) -> list[int]:
+        """Return the mixtures of which all seeds were measured."""
+        numbers = {number for number, _ in self._found}
+        return [n for n in numbers if all((n, seed) in self._found for seed in self._seeds)]
+
+    def known(self, mixtures: Sequence[int]) -> int:
+        """Return the number of runs of mixtures that need not be trained."""
+        missing = sum(len(task.seeds) for task in self._tasks(mixtures, self._seeds))
+        return len(mixtures) * len(self._seeds) - missing
+
     def readings(self, mixture: int) -> list[Readings]:
-        """Return the readings of a mixture, by the order of the seeds; they must have been measured."""
-        return [self._found[mixture, seed] for seed in self._seeds]
+        """Return the readings of a mixture that were measured, by the order of the seeds."""
+        return [self._found[mixture, seed] for seed in self._seeds if (mixture, seed) in self._found]
 
     def values(self, mixtures: Sequence[int], metric: str) -> NDArray[np.float64]:
         """Return the values of a metric in mixtures, [mixtures, seeds].
@@ -216,12 +231,12 @@ class Mixtures:
         """
         waiting = deque(self._tasks(mixtures, self._seeds[:seeds]))
         left = sum(len(task.seeds) for task in waiting)
-        total, busy, died = left, 0, set[int]()
+        busy, died = 0, set[int]()
         while waiting or busy:
             while waiting and workers.idle:
                 workers.submit(waiting.popleft())
                 busy += 1
-            self._report(total - left, total)
+            self._report(self.trained, self.trained + left)
             for task, result in workers.collect(_WAIT_SECONDS):
                 busy -= 1
                 if result is None and id(task) not in died:
@@ -234,7 +249,7 @@ class Mixtures:
                 self.trained += len(result.readings)
                 self.seconds = result.seconds or self.seconds
                 self._keep(task, result.readings)
-        self._report(total, total)
+        self._report(self.trained, self.trained)
 
     def _tasks(self, mixtures: Sequence[int], seeds: Sequence[int]) -> Iterator[Measurement]:
         """Yield tasks for what is not known."""

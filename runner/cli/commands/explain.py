@@ -1,0 +1,147 @@
+"""`dualtaxi explain`: which settings make the difference between two runs or configurations."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from runner.cli import Command
+from runner.cli.options import (
+    COUNT,
+    json_option,
+    markdown_option,
+    ray_option,
+    recordings_option,
+    workers_option,
+)
+from runner.cli.output import draw, facts, print_json, print_sections, require_one_form, say
+from runner.cli.progress import total_line
+from runner.util.humanize import duration
+
+if TYPE_CHECKING:
+    from runner.debugging.explain import Plan
+
+
+class _Planned(Exception):
+    """The plan, when nothing more than it was wanted."""
+
+    def __init__(self, plan: Plan) -> None:
+        super().__init__()
+        self.plan = plan
+
+
+@click.command("explain", cls=Command)
+@click.argument("a", metavar="A")
+@click.argument("b", metavar="B")
+@click.option(
+    "--metric",
+    metavar="METRIC",
+    help="A metric of evaluations.  [default: success_percent, or mean_return]",
+)
+@click.option(
+    "--at",
+    type=COUNT,
+    metavar="EPISODE",
+    help="Compare after this number of training episodes.  [default: the end of each]",
+)
+@click.option(
+    "--seeds",
+    type=click.IntRange(1, 10_000),
+    default=20,
+    show_default=True,
+    metavar="N",
+    help="Number of seeds of each mixture.",
+)
+@workers_option("one per processor")
+@ray_option
+@click.option("--dry-run", is_flag=True, help="Show what would be trained and how long it takes, and stop.")
+@markdown_option
+@json_option
+@recordings_option
+def explain_command(
+    a: str,
+    b: str,
+    metric: str | None,
+    at: int | None,
+    seeds: int,
+    workers: int | None,
+    ray: str | None,
+    dry_run: bool,
+    as_markdown: bool,
+    as_json: bool,
+    recordings: Path | None,
+) -> None:
+    """Find which settings make the difference between A and B: mixtures of them are trained.
+
+    A and B are runs, or configurations: files, or names of shipped ones. The same seeds and draws are
+    trained with the settings of A and of B mixed: all mixtures of up to 8 settings; of up to 12, those that
+    delta debugging needs. Shown are the share of each setting, which settings need each other, the smallest
+    set that makes the difference, and the first step that the strongest setting changed.
+
+    Nothing is recorded but two short runs, to show that step. What was trained is kept: interrupted, the
+    same command continues, and more --seeds train only those that are new.
+
+    Examples:
+      dualtaxi explain tutorial_cooperative tutorial_text_cooperative --at 5000 --dry-run
+      dualtaxi explain tutorial_cooperative tutorial_text_cooperative --at 5000
+      dualtaxi explain k3v9m2xq x7b2c4da --metric mean_length --seeds 40
+    """
+    from runner.debugging.explain import explain
+    from runner.debugging.explanation import sections
+
+    require_one_form(as_json, as_markdown)
+
+    def planned(plan: Plan) -> None:
+        if dry_run:
+            raise _Planned(plan)
+        say(_in_words(plan))
+
+    try:
+        with (
+            contextlib.redirect_stdout(sys.stderr),  # Ray prints messages about workers that died
+            total_line("runs trained") as report,
+        ):
+            explanation = explain(
+                a,
+                b,
+                metric=metric,
+                at=at,
+                seeds=seeds,
+                workers=workers,
+                ray=ray,
+                recordings=recordings,
+                report=report,
+                planned=planned,
+            )
+    except _Planned as stopped:
+        plan = stopped.plan
+        if as_json:
+            times = {"seconds": plan.seconds, "most_seconds": plan.most_seconds}
+            print_json(dataclasses.asdict(plan) | times)
+        else:
+            draw(facts({"settings": str(plan.settings), "runs": _in_words(plan)}))
+        return
+    except KeyboardInterrupt:
+        say("Interrupted. What was trained is kept: the same command continues.")
+        raise
+    if as_json:
+        print_json(explanation.as_json())
+    else:
+        print_sections(sections(explanation), as_markdown)
+
+
+def _in_words(plan: Plan) -> str:
+    """Return what will be trained, and how long it takes."""
+    runs, most = plan.mixtures * plan.seeds, plan.most_mixtures * plan.seeds
+    known = f", {plan.known:,} of them known" if plan.known else ""
+    text = f"{runs:,} runs: {plan.mixtures:,} mixtures of {plan.settings} settings, {plan.seeds} seeds each"
+    if most != runs:
+        text = f"from {runs:,} to {most:,} runs: delta debugging of {plan.settings} settings, each mixture "
+        text += f"with {plan.seeds} seeds"
+        return f"{text}{known}; from about {duration(plan.seconds)} to {duration(plan.most_seconds)}"
+    return f"{text}{known}; about {duration(plan.seconds)}"

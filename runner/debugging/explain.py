@@ -1,0 +1,360 @@
+"""Which settings make the difference between two runs or configurations: mixtures of them are trained.
+
+explanation = runner.explain("tutorial_cooperative", "tutorial_text_cooperative", at=5000)
+for setting in explanation.settings:
+print(setting.name, setting.share)
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from blake3 import blake3
+from numpy.typing import NDArray
+
+from runner.analysis.compare.statistics import Estimate, bootstrap_means
+from runner.config import ExperimentConfig, from_mapping, load
+from runner.config.shipped import shipped
+from runner.debugging.explanation import (
+    ENOUGH,
+    FOLDER,
+    Explanation,
+    Interaction,
+    Mixture,
+    Setting,
+    Side,
+    excludes_zero,
+    write_explanation,
+)
+from runner.debugging.factors import MAX_ALL, Mixing, mix
+from runner.debugging.first_step import first_step
+from runner.debugging.mixtures import Measured, Measurement, Mixtures
+from runner.debugging.shapley import minimal_set, shapley_interactions, shapley_values
+from runner.errors import RunnerError, RunNotFound, nearest
+from runner.execution.initial_tables import resolve_initial_q
+from runner.runs.locking import acquired
+from runner.runs.resolve import find_run
+from runner.runs.run import Run, recordings_folder
+from runner.sweep.local import Workers
+from runner.sweep.pool import worker_pool
+
+Source = str | os.PathLike[str] | Mapping[str, Any] | ExperimentConfig | Run
+DEFAULT_SEEDS: Final = 20
+_PROBES: Final = 2
+"""Seeds of A and of B that are trained first, to see how long a run takes; the first one loads kernels."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What an explanation will train."""
+
+    settings: int
+    mixtures: int
+    """The mixtures that will be run, at least."""
+    most_mixtures: int
+    """The same, at most; delta debugging depends on what it finds."""
+    seeds: int
+    known: int
+    """Runs that need not be trained: they were trained before."""
+    run_seconds: float
+    """The time that one run takes of a worker; 0 if all are known."""
+    workers: int
+
+    @property
+    def seconds(self) -> float:
+        """The estimated time of the runs that are not known, at least."""
+        return (self.mixtures * self.seeds - self.known) * self.run_seconds / self.workers
+
+    @property
+    def most_seconds(self) -> float:
+        """The same, at most."""
+        return (self.most_mixtures * self.seeds - self.known) * self.run_seconds / self.workers
+
+
+def explain(
+    a: Source,
+    b: Source,
+    *,
+    metric: str | None = None,
+    at: int | None = None,
+    seeds: int = DEFAULT_SEEDS,
+    workers: int | None = None,
+    ray: str | None = None,
+    recordings: str | os.PathLike[str] | None = None,
+    report: Callable[[int, int], None] = lambda *_: None,
+    planned: Callable[[Plan], None] = lambda _: None,
+) -> Explanation:
+    """Train mixtures of two configurations, and return which settings make the difference between them.
+
+    Interrupted, it keeps what was trained: called again, it continues. The result is kept in the recordings
+    folder, too.
+
+    Args:
+        a: a run, a configuration, a file of one, or the name of a shipped one or of a run.
+        b: another.
+        metric: the metric of an evaluation; the success rate, or the mean return if nothing is a success.
+        at: training episodes after which it is read; by default at the end of each.
+        seeds: number of seeds of each mixture, from that of A on.
+        workers: maximum number of processes; one per processor by default.
+        ray: the address of a cluster of Ray, or empty for this machine; None for no Ray.
+        recordings: the recordings folder: $DUALTAXI_RECORDINGS, or ./recordings, by default.
+        report: called several times a second with the number of runs trained, and of those to train.
+        planned: called with what will be trained, before it is.
+
+    Raises:
+        RunnerError: nothing differs, or too much; they cannot be mixed; a mixture does not have the metric.
+        KeyboardInterrupt: it was interrupted.
+    """
+    began, folder = time.monotonic(), recordings_folder(recordings)
+    question = _question(a, b, metric, at, seeds, folder)
+    mixing, own = question.mixing, folder / FOLDER / question.name
+    busy = RunnerError("another process computes the same explanation; try again when it has finished.")
+    lock = acquired(own / "owner.lock", busy)
+    pool: Workers[Measurement, Measured]
+    try:
+        mixtures = Mixtures(mixing, question.seeds, folder, own, report)
+        with worker_pool(workers, ray, 2**MAX_ALL) as pool:
+            mixtures.measure((0, mixing.everything), pool, _PROBES)
+            game = _Game(question, mixtures, pool, _metric_of(mixtures, metric))
+            planned(game.plan())
+            players = game.players()
+        strongest = None
+        settings = _settings(game, players)
+        if settings[0].share is not None:
+            strongest = next(i for i, each in enumerate(mixing.factors) if each.name == settings[0].name)
+        step = (
+            None if strongest is None else first_step(mixing, strongest, question.seeds[0], folder, own.name)
+        )
+        explanation = Explanation(
+            name=question.name,
+            a=question.a,
+            b=question.b,
+            metric=game.metric,
+            at=at,
+            episodes=mixing.a.episodes,
+            seeds=question.seeds,
+            method="all mixtures" if len(mixing.factors) <= MAX_ALL else "delta debugging",
+            value_a=game.mean(0),
+            value_b=game.mean(mixing.everything),
+            difference=game.difference,
+            settings=settings,
+            interactions=_interactions(game, players),
+            smallest=game.smallest(players),
+            mixtures=tuple(game.mixture(number) for number in game.ordered()),
+            first_step=step,
+            notes=question.notes,
+            trained=mixtures.trained,
+            seconds=time.monotonic() - began,
+        )
+        write_explanation(explanation, folder)
+        return explanation
+    finally:
+        lock.release()
+
+
+@dataclass(frozen=True)
+class _Question:
+    """What is to be explained."""
+
+    name: str
+    a: Side
+    b: Side
+    mixing: Mixing
+    seeds: tuple[int, ...]
+    notes: tuple[str, ...]
+
+
+def _question(
+    a: Source, b: Source, metric: str | None, at: int | None, seeds: int, folder: Path
+) -> _Question:
+    if seeds < 1:
+        raise RunnerError(f"--seeds: found {seeds}, expected 1 or more.")
+    (side_a, config_a, first), (side_b, config_b, other) = (_resolved(source, folder) for source in (a, b))
+    mixing = mix(config_a, config_b, at, exact=(metric or "").startswith("exact."))
+    notes = list(mixing.notes)
+    if first != other:
+        notes.append(f"all mixtures have the same seeds, though A has seed {first} and B seed {other}")
+    values = [mixing.a.to_mapping(), mixing.b.to_mapping(), metric]
+    digest = blake3(json.dumps(values, sort_keys=True).encode()).hexdigest()[:8]
+    names = [re.sub(r"[^A-Za-z0-9_.-]", "_", side.name).lstrip(".-")[:40] for side in (side_a, side_b)]
+    chosen = range(first, first + seeds) if first + seeds <= 2**64 else range(seeds)
+    return _Question(f"{'-'.join(names)}-{digest}", side_a, side_b, mixing, tuple(chosen), tuple(notes))
+
+
+def _resolved(source: Source, recordings: Path) -> tuple[Side, ExperimentConfig, int]:
+    """Return a name, the configuration and the seed of a run or a configuration.
+
+    Raises:
+        RunnerError: there is none, or it is a loop, whose learning is the user's own.
+    """
+    if isinstance(source, Mapping):
+        source = from_mapping(source)
+    if isinstance(source, str | os.PathLike):
+        path, known = Path(source), [name for name, each in shipped().items() if each.kind == "experiment"]
+        if path.suffix in (".yaml", ".yml") or os.fspath(source) in known:
+            source = load(path)
+        else:
+            try:
+                source = find_run(os.fspath(source), recordings)
+            except RunNotFound as error:
+                hint = nearest(path.name, known) or " `dualtaxi config ls` lists those that are shipped."
+                raise RunnerError(f"{error} There is no configuration of this name either.{hint}") from error
+    if isinstance(source, ExperimentConfig):
+        return Side(source.name), resolve_initial_q(source, recordings), source.seeds[0]
+    if "made_by" in source.file.config:
+        raise RunnerError(
+            f"run {source.run_id} was recorded from a training loop of your own, which cannot be trained "
+            f"here with other settings. `dualtaxi diff {source.run_id} OTHER` shows in what two loops differ "
+            "and where they diverge, and `dualtaxi compare` compares many."
+        )
+    config = from_mapping(source.file.config)
+    return Side(source.name, source.run_id), resolve_initial_q(config, recordings), source.seed
+
+
+def _metric_of(mixtures: Mixtures, metric: str | None) -> str:
+    """Return the metric: the one that was chosen, the success rate, or the mean return.
+
+    Raises:
+        RunnerError: there is no such metric in evaluations of A and of B.
+    """
+    sides = [mixtures.readings(side)[0] for side in mixtures.ends]
+    shared = {name for name in sides[0] if all(side.get(name) is not None for side in sides)}
+    candidates = [metric] if metric is not None else ["success_percent", "mean_return"]
+    found = next((name for name in candidates if name in shared), None)
+    if found is None:
+        names = ", ".join(sorted(name for name in shared if not name.startswith("training.reward.")))
+        raise RunnerError(
+            f"--metric: found {metric or 'none'!r}, expected one that evaluations of both have: {names}."
+            f"{nearest(metric or '', shared)}"
+        )
+    return found
+
+
+class _Game:
+    """The values of mixtures, measured when they are needed: settings are players, mixtures coalitions."""
+
+    def __init__(
+        self,
+        question: _Question,
+        mixtures: Mixtures,
+        pool: Workers[Measurement, Measured],
+        metric: str,
+    ) -> None:
+        self.mixing, self.metric = question.mixing, metric
+        self._mixtures, self._pool, self._seeds = mixtures, pool, len(question.seeds)
+        self._count = len(self.mixing.factors)
+
+    def plan(self) -> Plan:
+        """Return what will be trained."""
+        count = self._count
+        least = most = 2**count
+        if count > MAX_ALL:
+            least, most = 2 + math.ceil(math.log2(count)), 2 + 3 * count + count**2 + 2**MAX_ALL
+        known = self._mixtures.known(range(2**count))
+        return Plan(count, least, most, self._seeds, known, self._mixtures.seconds, max(1, self._pool.idle))
+
+    def players(self) -> list[int]:
+        """Return the numbers of the settings among which the difference is shared; measure their mixtures.
+
+        These are all of them, or those of a minimal set; none if there is no difference to look for, or if
+        too many are needed.
+        """
+        players = list(range(self._count))
+        if self._count > MAX_ALL:
+            self._mixtures.measure((0, self.mixing.everything), self._pool)
+            players = minimal_set(players, self._makes_enough) if excludes_zero(self.difference) else []
+        if len(players) <= MAX_ALL:
+            self._mixtures.measure(_coalitions(players), self._pool)
+        return players
+
+    def _makes_enough(self, players: Sequence[int]) -> bool:
+        number = sum(1 << i for i in players)
+        self._mixtures.measure([number], self._pool)
+        return self._part(number) >= ENOUGH
+
+    def _part(self, number: int) -> float:
+        """Return the part of the difference that a mixture makes."""
+        low, own, high = self.values((0, number, self.mixing.everything)).mean(axis=1).tolist()
+        return float((own - low) / (high - low)) if high != low else math.nan
+
+    def values(self, numbers: Sequence[int]) -> NDArray[np.float64]:
+        """Return the values of mixtures that were measured, [mixtures, seeds]."""
+        return self._mixtures.values(numbers, self.metric)
+
+    def mean(self, number: int) -> Estimate:
+        """Return the mean of a mixture over the seeds."""
+        return bootstrap_means(self.values([number]))[0]
+
+    @property
+    def difference(self) -> Estimate:
+        """B less A."""
+        low, high = self.values((0, self.mixing.everything))
+        return bootstrap_means((high - low)[np.newaxis])[0]
+
+    def ordered(self) -> list[int]:
+        """Return the numbers of the mixtures that were measured, by the number of settings of B."""
+        return sorted(self._mixtures.complete(), key=lambda number: (number.bit_count(), number))
+
+    def mixture(self, number: int) -> Mixture:
+        """Return a mixture that was measured."""
+        names = tuple(factor.name for factor in self.mixing.chosen(number))
+        return Mixture(names, self.mean(number), tuple(self.values([number])[0].tolist()))
+
+    def smallest(self, players: Sequence[int]) -> Mixture | None:
+        """Return the fewest settings that make `ENOUGH` of the difference, of several the most of it."""
+        if not players or not excludes_zero(self.difference):
+            return None
+        if self._count > MAX_ALL:
+            return self.mixture(sum(1 << i for i in players))
+        enough = [number for number in self.ordered() if self._part(number) >= ENOUGH]
+        return self.mixture(min(enough, key=lambda number: (number.bit_count(), -self._part(number))))
+
+
+def _coalitions(players: Sequence[int]) -> list[int]:
+    """Return the mixtures of some settings: bit j of a position stands for the j-th of them."""
+    return [
+        sum(1 << i for j, i in enumerate(players) if position >> j & 1)
+        for position in range(2 ** len(players))
+    ]
+
+
+def _settings(game: _Game, players: Sequence[int]) -> tuple[Setting, ...]:
+    """Return the settings, those with a share first, the largest first."""
+    factors = game.mixing.factors
+    shares: dict[int, tuple[Estimate, Estimate, Estimate]] = {}
+    if players and len(players) <= MAX_ALL:
+        values = game.values(_coalitions(players))
+        bits = [1 << j for j in range(len(players))]
+        own = shapley_values(values)
+        alone, last = values[bits] - values[0], values[-1] - values[[len(values) - 1 - bit for bit in bits]]
+        rows = zip(*map(bootstrap_means, (own, alone, last)), strict=True)
+        shares = dict(zip(players, rows, strict=True))
+    order = sorted(shares, key=lambda i: -abs(shares[i][0].value))
+    order += [i for i in range(len(factors)) if i not in shares]
+    return tuple(
+        Setting(factors[i].name, factors[i].a, factors[i].b, *shares.get(i, (None, None, None)))
+        for i in order
+    )
+
+
+def _interactions(game: _Game, players: Sequence[int]) -> tuple[Interaction, ...]:
+    """Return the interactions of settings in pairs, the largest first."""
+    if not 2 <= len(players) <= MAX_ALL:
+        return ()
+    names = [game.mixing.factors[i].name for i in players]
+    beyond = shapley_interactions(game.values(_coalitions(players)))
+    estimates = bootstrap_means(np.array(list(beyond.values())))
+    found = [
+        Interaction((names[i], names[j]), estimate)
+        for (i, j), estimate in zip(beyond, estimates, strict=True)
+    ]
+    return tuple(sorted(found, key=lambda pair: -abs(pair.beyond.value)))

@@ -1,0 +1,131 @@
+"""The first step at which one setting changed what was learned, in two short runs recorded for it."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import Final
+
+from runner.analysis.diff import can_compare_steps
+from runner.analysis.diff.causes import find_cause
+from runner.analysis.diff.divergence import training_divergence
+from runner.analysis.diff.sections import where_in_words
+from runner.analysis.diff.updates import Update, replay_to
+from runner.archive.places import at_hand
+from runner.config import from_mapping
+from runner.config.job import Job, identity_of
+from runner.debugging.explanation import FirstStep
+from runner.debugging.factors import Mixing
+from runner.environments.naming import spoken
+from runner.execution.session import run_job
+from runner.recording import schema
+from runner.recording.labels import Labels
+from runner.recording.reader import Recording, open_recording
+from runner.runs.listing import list_runs
+from runner.runs.run import Run, new_run, unless_empty
+
+_EPISODES: Final = (100, 1000, 10_000)
+"""Training episodes in which the step is looked for, one after the other."""
+
+
+def first_step(mixing: Mixing, number: int, seed: int, recordings: Path, name: str) -> FirstStep:
+    """Record A with and without one setting of B, until they differ; return where they do.
+
+    If they do not, all settings of B with and without this one are recorded.
+
+    Args:
+        mixing: the two configurations.
+        number: of the setting.
+        seed: the seed of the runs.
+        recordings: the recordings folder.
+        name: the name of the explanation, which the runs have as a tag.
+
+    Raises:
+        StorageError: the recordings folder cannot be written.
+    """
+    bit, setting = 1 << number, mixing.factors[number].name
+    tag = f"explain={name}"
+    made = {identity_of(run.file.config, run.seed): run for run in list_runs(recordings) if tag in run.tags}
+    pairs = [(0, bit, f"Changing {setting} alone in A")]
+    if mixing.everything != bit:
+        others = f"Changing {setting} when all other settings are as in B"
+        pairs.append((mixing.everything - bit, mixing.everything, others))
+    limit = min(mixing.a.episodes, mixing.b.episodes)
+    for before, after, what in pairs:
+        for episodes in (*(count for count in _EPISODES if count < limit), min(limit, _EPISODES[-1])):
+            runs = []
+            for mixture, word in ((before, "without"), (after, "with")):
+                plain = {"episodes": episodes, "evaluation": None, "recording": {"console": False}}
+                job = Job(from_mapping(mixing.config(mixture).to_mapping() | plain), seed)
+                run = made.get(job.identity)
+                if run is None or run.status != "finished":
+                    title = re.sub(r"[^A-Za-z0-9_.]+", "-", f"{word}-{setting}")[:100]
+                    run = _record(job, recordings, title, tag)
+                runs.append(run)
+            found = _found(runs[0], runs[1], setting, what)
+            if found.sentences:
+                return found
+            for run in runs:
+                made.pop(identity_of(run.file.config, run.seed), None)
+                shutil.rmtree(run.folder)
+    sentence = (
+        f"Neither alone nor last did {setting} change a step in {min(limit, _EPISODES[-1]):,} episodes."
+    )
+    return FirstStep(setting, "", "", None, None, None, (sentence,))
+
+
+def _record(job: Job, recordings: Path, title: str, tag: str) -> Run:
+    """Record a job with every step, as a run with a tag."""
+    run = new_run(recordings, job.config.to_mapping(), job.seed, title, labels=Labels(tags=(tag,)))
+    with unless_empty(run):
+        return run_job(job, run)
+
+
+def _found(before: Run, after: Run, setting: str, what: str) -> FirstStep:
+    """Return where two runs differ first; without a step and sentences if they do not."""
+    with (
+        open_recording(at_hand(before).recording) as a,
+        open_recording(at_hand(after).recording) as b,
+    ):
+        if not can_compare_steps(a, b):
+            text = f"{what} changes the states or actions, so that no steps can be compared."
+            return FirstStep(setting, before.run_id, after.run_id, None, None, None, (text,))
+        divergence, sentences, update = training_divergence(a, b), [], None
+        if divergence is not None and divergence.a_step is not None and divergence.b_step is not None:
+            cause = find_cause(divergence, a, b)
+            sentences = [f"Training diverges {where_in_words(divergence)}: {cause.text}."]
+            update = cause.update
+            if update is None:
+                place = divergence.step, divergence.episode, divergence.t
+                return _at(place, setting, before, after, what, sentences)
+        else:
+            update = _other_update(a, b)
+        if update is None:
+            return FirstStep(setting, before.run_id, after.run_id, None, None, None, ())
+        record = next(a.blocks(schema.TRAIN_STEP, update.step, update.step + 1))[0]
+        place = update.step, update.episode, int(record["t"])
+        own = [
+            f"{spoken(update.agent)}'s value of {update.action} in the state ({update.state}) became "
+            f"{update.b:.6g} instead of {update.a:.6g}: {'; '.join(update.reasons)}."
+        ]
+        return _at(place, setting, before, after, what, [*own, *sentences])
+
+
+def _at(
+    place: tuple[int, int, int], setting: str, before: Run, after: Run, what: str, sentences: list[str]
+) -> FirstStep:
+    step, episode, t = place
+    first = (
+        f"{what} first changed an update at training step {step:,}, in episode {episode:,} at t = {t} "
+        f"(runs {before.run_id} without it and {after.run_id} with it, which are recorded)."
+    )
+    return FirstStep(setting, before.run_id, after.run_id, step, episode, t, (first, *sentences))
+
+
+def _other_update(a: Recording, b: Recording) -> Update | None:
+    """Return the first update that differs though all steps are the same; None if there is none."""
+    steps = min(recording.count(schema.TRAIN_STEP) for recording in (a, b))
+    if a.agents != b.agents:
+        return None
+    return replay_to(a, b, steps)[1]

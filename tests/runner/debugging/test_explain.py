@@ -1,0 +1,192 @@
+"""Planted causes are found in real jobs, what was trained is kept, and bad input is named."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+import runner
+from runner.config import from_mapping
+from runner.debugging.explanation import explanations_in, read_explanation, sections
+from runner.debugging.factors import mix
+from runner.errors import RunnerError
+from runner.runs.listing import list_runs
+
+LAKE = {
+    "env": {"id": "FrozenLake-v1", "kwargs": {"is_slippery": False}},
+    "episodes": 400,
+    "evaluation": {"every": 100, "trials": 10},
+    "epsilon": 0.0,
+    "discount": 0.0,
+}
+"""Nothing is learned: without exploring the goal is never reached, and without a discount no path to it."""
+PLANTED = {"epsilon": 0.9, "discount": 0.9}
+"""Together they solve the lake; neither does alone."""
+
+
+def explained(a, b, folder, **options):
+    return runner.explain(a, b, recordings=folder, **({"seeds": 4, "workers": 1} | options))
+
+
+def test_a_planted_interaction_is_found(tmp_path):
+    b = LAKE | PLANTED | {"quirks": {"bootstrap_after_termination": True}}
+    found = explained(LAKE, b, tmp_path)
+    assert (found.metric, found.value_a.value, found.value_b.value) == ("success_percent", 0.0, 100.0)
+    shares = {setting.name: setting.share.value for setting in found.settings}
+    expected = {"epsilon": 50.0, "discount": 50.0, "quirks.bootstrap_after_termination": 0.0}
+    assert shares == pytest.approx(expected)
+    assert all(setting.alone.value == 0.0 for setting in found.settings)
+    (clear,) = [pair for pair in found.interactions if pair.is_clear]
+    assert (set(clear.settings), clear.beyond.value) == ({"epsilon", "discount"}, 100.0)
+    assert set(found.smallest.settings) == {"epsilon", "discount"}
+    assert len(found.mixtures) == 8
+    text = "\n".join(line for each in sections(found) for line in each.sentences)
+    assert "epsilon and discount together make 100% of it" in text or "discount and epsilon" in text
+
+
+def test_a_planted_cause_is_found_with_the_step_that_it_changed_first(tmp_path):
+    a, b = LAKE | {"discount": 0.9}, LAKE | PLANTED | {"step_size": 0.5}
+    found = explained(a, b, tmp_path)
+    assert found.smallest.settings == ("epsilon",)
+    strongest = found.settings[0]
+    assert (strongest.name, strongest.a, strongest.b) == ("epsilon", "0", "0.9")
+    assert strongest.share.value > 90.0
+    first = found.first_step
+    run_a, run_b = (runner.find_run(run, tmp_path) for run in (first.run_a, first.run_b))
+    assert [run.file.config["epsilon"] for run in (run_a, run_b)] == [0.0, 0.9]
+    records = []
+    for run in (run_a, run_b):
+        with runner.open_recording(run.recording) as recording:
+            records.append(
+                [step for block in recording.blocks(recording.topic("/train/step")) for step in block]
+            )
+    fields = ("state", "action", "explored", "next_state")
+    equal = [all(x[name] == y[name] for name in fields) for x, y in zip(*records, strict=False)]
+    assert equal.index(False) == first.step
+
+
+def test_the_values_are_those_of_recorded_runs(tmp_path):
+    config = LAKE | PLANTED | {"env": {"id": "FrozenLake-v1", "kwargs": {"is_slippery": True}}}
+    found = explained(config, config | {"epsilon": 0.5}, tmp_path, at=300, seeds=3, metric="mean_length")
+    for seed, value in zip(found.seeds, found.mixtures[0].values, strict=True):
+        run = runner.run(config, seed=seed, recordings=tmp_path)
+        evaluations = runner.frames.evaluations(run)
+        assert evaluations.set_index("episode")["mean_length"][300] == value
+
+
+def test_what_was_trained_is_kept(tmp_path):
+    b = LAKE | PLANTED | {"step_size": 0.5}
+
+    def interrupt(done, total):
+        if done >= 12:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        explained(LAKE, b, tmp_path, report=interrupt)
+    found = explained(LAKE, b, tmp_path)
+    assert 0 < found.trained < found.runs == 32
+    (name,) = explanations_in(tmp_path)
+    assert read_explanation(name, tmp_path) == found
+    again = explained(LAKE, b, tmp_path, seeds=5)
+    assert (again.trained, again.runs) == (8, 40)
+    runs = len(list_runs(tmp_path))
+    values = tmp_path / ".explain" / name / "values.jsonl"
+    values.write_text("{\n" + values.read_text()[:-30])  # a damaged line, and one that was cut off
+    assert explained(LAKE, b, tmp_path, seeds=5).trained == 1
+    assert len(list_runs(tmp_path)) == runs
+
+
+def test_above_eight_settings_a_minimal_set_is_found(tmp_path):
+    b = (
+        LAKE
+        | PLANTED
+        | {
+            "step_size": 0.2,
+            "initial_q": 1e-9,
+            "episodes": 410,
+            "exploration": "independent",
+            "algorithm": "expected_sarsa",
+            "env": {"id": "FrozenLake-v1", "kwargs": {"is_slippery": False, "max_episode_steps": 101}},
+            "quirks": {"bootstrap_after_termination": True},
+        }
+    )
+    found = explained(LAKE, b, tmp_path, seeds=2)
+    assert found.method == "delta debugging"
+    assert len(found.settings) == 9
+    assert set(found.smallest.settings) == {"epsilon", "discount"}
+    assert {setting.name for setting in found.settings if setting.share} == {"epsilon", "discount"}
+    assert len(found.mixtures) < 60
+
+
+def test_settings_that_only_go_together_are_one(tmp_path):
+    a = {"episodes": 10, "mode": "cooperative"}
+    b = {"episodes": 10, "mode": "competitive", "algorithm": "hysteretic_q_learning", "discount": 0.5}
+    mixing = mix(from_mapping(a), from_mapping(b))
+    names = {factor.name for factor in mixing.factors}
+    assert names >= {"discount", "exploration"}
+    (together,) = [factor for factor in mixing.factors if len(factor.changes) > 1]
+    assert {change.path for change in together.changes} >= {"tables", "rewards", "algorithm", "hysteretic"}
+    assert any("only go together" in note for note in mixing.notes)
+    for mixture in range(2 ** len(mixing.factors)):
+        mixing.config(mixture)
+    shared = {"episodes": 10, "mode": "competitive", "exploration": "shared"}
+    (mode,) = mix(from_mapping(a), from_mapping(shared)).factors
+    assert (mode.name, mode.a, mode.b) == ("mode", "cooperative", "competitive")
+
+
+MANY = {
+    "episodes": 401,
+    "step_size": 0.2,
+    "discount": 0.3,
+    "epsilon": 0.4,
+    "initial_q": 0.5,
+    "exploration": "independent",
+    "algorithm": "expected_sarsa",
+    "quirks": {"bootstrap_after_termination": True, "epsilon_exploits": True},
+    "env": {
+        "id": "FrozenLake-v1",
+        "kwargs": {"is_slippery": True, "map_name": "8x8", "max_episode_steps": 7, "success_rate": 0.5}
+        | {"reward_schedule": [2, 0, 0]},
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("b", "options", "message"),
+    [
+        (LAKE, {}, "differ in no setting"),
+        (LAKE | {"evaluation": {"every": 50, "trials": 10}}, {}, "evaluation only measure and record"),
+        (LAKE | MANY, {}, "expected at most 12"),
+        (LAKE | PLANTED, {"at": 500}, "A trains 400 episodes"),
+        (LAKE | PLANTED, {"seeds": 0}, "found 0, expected 1 or more"),
+        (LAKE | PLANTED, {"metric": "succes_percent"}, "success_percent"),
+        ("tutorial_cooperativ", {}, "tutorial_cooperative"),
+        (LAKE | {"env": {"id": "Nowhere-v0"}}, {}, "Nowhere"),
+    ],
+)
+def test_bad_input_is_named(b, options, message, tmp_path):
+    with pytest.raises(RunnerError, match=message):
+        explained(LAKE, b, tmp_path, **options)
+
+
+def test_a_loop_is_refused(tmp_path):
+    import gymnasium
+
+    env = runner.record(gymnasium.make("FrozenLake-v1"), recordings=tmp_path, name="mine")
+    env.reset(seed=1)
+    env.step(0)
+    env.close()
+    with pytest.raises(RunnerError, match="training loop of your own"):
+        explained("mine", LAKE, tmp_path)
+
+
+def test_a_damaged_result_is_named(tmp_path):
+    found = explained(LAKE, LAKE | PLANTED, tmp_path, seeds=1)
+    assert found.difference.value == 100.0
+    path = tmp_path / ".explain" / found.name / "explanation.json"
+    path.write_text(json.dumps({"name": 3}))
+    with pytest.raises(RunnerError, match="no longer describes an explanation"):
+        read_explanation(found.name, tmp_path)
+    with pytest.raises(RunnerError, match="no explanation 'other'"):
+        read_explanation("other", tmp_path)
