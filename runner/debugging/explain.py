@@ -26,15 +26,13 @@ from runner.config import ExperimentConfig, from_mapping, load
 from runner.config.shipped import shipped
 from runner.debugging.explanation import (
     ENOUGH,
-    FOLDER,
     Explanation,
     Interaction,
     Mixture,
     Setting,
     Side,
-    excludes_zero,
-    write_explanation,
 )
+from runner.debugging.explanation_files import FOLDER, write_explanation
 from runner.debugging.factors import MAX_ALL, Mixing, mix
 from runner.debugging.first_step import first_step
 from runner.debugging.mixtures import Measured, Measurement, Mixtures
@@ -135,7 +133,7 @@ def explain(
             None if strongest is None else first_step(mixing, strongest, question.seeds[0], folder, own.name)
         )
         explanation = Explanation(
-            name=question.name,
+            name=f"{question.name}/{re.sub(r'[^A-Za-z0-9_.-]+', '_', game.metric)}",
             a=question.a,
             b=question.b,
             metric=game.metric,
@@ -166,6 +164,7 @@ class _Question:
     """What is to be explained."""
 
     name: str
+    """The folder of what is known of the two."""
     a: Side
     b: Side
     mixing: Mixing
@@ -183,7 +182,7 @@ def _question(
     notes = list(mixing.notes)
     if first != other:
         notes.append(f"all mixtures have the same seeds, though A has seed {first} and B seed {other}")
-    values = [mixing.a.to_mapping(), mixing.b.to_mapping(), metric]
+    values = [mixing.a.to_mapping(), mixing.b.to_mapping()]
     digest = blake3(json.dumps(values, sort_keys=True).encode()).hexdigest()[:8]
     names = [re.sub(r"[^A-Za-z0-9_.-]", "_", side.name).lstrip(".-")[:40] for side in (side_a, side_b)]
     chosen = range(first, first + seeds) if first + seeds <= 2**64 else range(seeds)
@@ -271,7 +270,7 @@ class _Game:
         players = list(range(self._count))
         if self._count > MAX_ALL:
             self._mixtures.measure((0, self.mixing.everything), self._pool)
-            players = minimal_set(players, self._makes_enough) if excludes_zero(self.difference) else []
+            players = minimal_set(players, self._makes_enough) if self.difference.excludes_zero else []
         if len(players) <= MAX_ALL:
             self._mixtures.measure(_coalitions(players), self._pool)
         return players
@@ -311,7 +310,7 @@ class _Game:
 
     def smallest(self, players: Sequence[int]) -> Mixture | None:
         """Return the fewest settings that make `ENOUGH` of the difference, of several the most of it."""
-        if not players or not excludes_zero(self.difference):
+        if not players or not self.difference.excludes_zero:
             return None
         if self._count > MAX_ALL:
             return self.mixture(sum(1 << i for i in players))

@@ -1,28 +1,21 @@
-"""Which settings make the difference between two configurations: the result, as text and on disk.
-
-recordings/.explain/NAME/values.jsonl       the readings of every run, a line each
-recordings/.explain/NAME/explanation.json   the result
-"""
+"""Which settings make the difference between two configurations: the result, as text and pictures."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from html import escape
 from typing import Any, Final, Literal
 
 from runner.analysis.compare.statistics import FEW_SEEDS, Estimate
-from runner.analysis.sections import Grid, Section
-from runner.errors import RunnerError, nearest
-from runner.util.files import open_regular, replacing, storage_errors
+from runner.analysis.sections import Grid, Section, markdown
+from runner.errors import MissingExtra
+from runner.export.plots.curves import Plot
+from runner.export.plots.mixtures import Column, bars_chart, mixtures_chart
+from runner.export.reports.rendering import partials
 from runner.util.humanize import counted, duration
 
-FOLDER: Final = ".explain"
-FILE: Final = "explanation.json"
-MAX_BYTES: Final = 32 << 20
-"""The largest file of a result that is read."""
 ENOUGH: Final = 0.9
 """The part of the difference from which some settings count as making it."""
 _MAX_MIXTURES: Final = 16
@@ -61,11 +54,6 @@ class Interaction:
     beyond: Estimate
     """The Shapley interaction index."""
 
-    @property
-    def is_clear(self) -> bool:
-        """Whether the interval excludes 0."""
-        return excludes_zero(self.beyond)
-
 
 @dataclass(frozen=True)
 class Mixture:
@@ -98,6 +86,7 @@ class Explanation:
     """Which settings make the difference between A and B in a metric."""
 
     name: str
+    """The folder of the pair, and the metric: `first-second-1f2e3d4c/success_percent`."""
     a: Side
     b: Side
     metric: str
@@ -134,69 +123,20 @@ class Explanation:
         """Return a value as a part of the difference."""
         return value / self.difference.value if self.difference.value else float("nan")
 
-    @property
-    def has_difference(self) -> bool:
-        """Whether the interval of the difference excludes 0."""
-        return excludes_zero(self.difference)
-
     def as_json(self) -> dict[str, Any]:
         """Return the result as plain values; NaN where there is no interval."""
         return asdict(self)
 
     def _repr_html_(self) -> str:
-        """Return the result for a notebook."""
-        from runner.debugging.explain_page import explanation_html
-
-        return explanation_html(self)
-
-
-def excludes_zero(estimate: Estimate) -> bool:
-    """Return whether the interval excludes 0; without an interval, whether the value is not 0."""
-    if math.isnan(estimate.low):
-        return estimate.value != 0
-    return estimate.low > 0 or estimate.high < 0
-
-
-# --- on disk ----------------------------------------------------------------------------------------------
-
-
-def write_explanation(explanation: Explanation, recordings: Path) -> None:
-    """Write a result next to what it was computed from.
-
-    Raises:
-        StorageError: the folder cannot be written.
-    """
-    path = recordings / FOLDER / explanation.name / FILE
-    with storage_errors(path), replacing(path) as fresh:
-        fresh.write_text(json.dumps(explanation.as_json()), encoding="utf-8")
-
-
-def explanations_in(recordings: Path) -> list[str]:
-    """Return the names of the results in a recordings folder."""
-    return sorted(file.parent.name for file in (recordings / FOLDER).glob(f"*/{FILE}"))
-
-
-def read_explanation(name: str, recordings: Path) -> Explanation:
-    """Return a result from its file.
-
-    Raises:
-        RunnerError: there is none of this name, or its file is damaged.
-    """
-    from pydantic import TypeAdapter, ValidationError
-
-    known = explanations_in(recordings)
-    if name not in known:
-        raise RunnerError(f"no explanation {name!r} in {recordings}.{nearest(name, known)}")
-    path = recordings / FOLDER / name / FILE
-    try:
-        with open_regular(path) as file:
-            content = file.read(MAX_BYTES + 1)
-        if len(content) > MAX_BYTES:
-            raise RunnerError(f"{path}: larger than {MAX_BYTES >> 20} MiB, expected an explanation.")
-        return TypeAdapter(Explanation).validate_json(content)
-    except (OSError, ValidationError) as error:
-        reason = str(error).splitlines()[0]
-        raise RunnerError(f"{path}: no longer describes an explanation ({reason}).") from error
+        """Return pictures and text for a notebook; text alone if Jinja2 is not installed."""
+        first, *others = sections(self)
+        try:
+            parts = [partials().section("explain", first.title, first)]
+            parts += [f'<figure style="max-width: 46em">{plot.svg}</figure>' for plot in plots(self)]
+            parts += [partials().section(f"explain-{i}", one.title, one) for i, one in enumerate(others)]
+        except MissingExtra:
+            return f"<pre>{escape(chr(10).join(markdown([first, *others])))}</pre>"
+        return "".join(map(str, parts))
 
 
 # --- as text ----------------------------------------------------------------------------------------------
@@ -211,15 +151,16 @@ def summary(explanation: Explanation) -> list[str]:
         f"{number(explanation.value_a.value)} in A, {number(explanation.value_b.value)} in B, "
         f"a difference of {signed(explanation.difference)}."
     ]
-    if not explanation.has_difference:
+    if not explanation.difference.excludes_zero:
         sentences.append("The interval includes 0: there is no clear difference to explain with these seeds.")
     elif explanation.smallest is not None:
         own = explanation.smallest
         names = " and ".join(own.settings) if len(own.settings) < 3 else ", ".join(own.settings)
         part = explanation.part(own.mean.value - explanation.value_a.value)
         of = f" of the {len(settings)} settings" if len(settings) > 1 else ""
-        rest = " alone makes" if len(own.settings) == 1 else " together make"
-        sentences.append(f"{names}{rest} {part:.0%} of it: the smallest set{of} that makes {ENOUGH:.0%}.")
+        make = "alone makes" if len(own.settings) == 1 else "together make"
+        least = f"the smallest set{of} that makes {_percent(ENOUGH)}"
+        sentences.append(f"{names} {make} {_percent(part)} of it: {least}.")
     if len(explanation.seeds) < FEW_SEEDS:
         sentences.append(f"With fewer than {FEW_SEEDS} seeds the intervals are too narrow.")
     return sentences
@@ -230,7 +171,7 @@ def sections(explanation: Explanation) -> list[Section]:
     title = f"{explanation.a.name} (A) and {explanation.b.name} (B)"
     notes = [f"Note: {note}." for note in explanation.notes]
     lines = [Section(title, [*summary(explanation), *notes]), _settings_section(explanation)]
-    clear = [pair for pair in explanation.interactions if pair.is_clear]
+    clear = [pair for pair in explanation.interactions if pair.beyond.excludes_zero]
     if explanation.interactions:
         lines.append(_interactions_section(explanation, clear))
     if explanation.first_step is not None:
@@ -241,11 +182,11 @@ def sections(explanation: Explanation) -> list[Section]:
 
 def _settings_section(explanation: Explanation) -> Section:
     has_shares = any(setting.share is not None for setting in explanation.settings)
-    rows = []
+    is_clear, rows = explanation.difference.excludes_zero, []
     for setting in explanation.settings:
         cells = [setting.name, setting.a, setting.b]
         if has_shares and setting.share is not None:
-            part = f"{explanation.part(setting.share.value):.0%}" if explanation.has_difference else ""
+            part = _percent(explanation.part(setting.share.value)) if is_clear else ""
             own = (setting.share, setting.alone, setting.last)
             cells += [signed(own[0]), part, *(number(one.value, True) if one else "" for one in own[1:])]
         elif has_shares:
@@ -285,36 +226,36 @@ def _meaning(explanation: Explanation, pair: Interaction) -> str:
     """Return what an interaction means for the two settings."""
     shares = {setting.name: setting.share for setting in explanation.settings}
     own = [shares[name] for name in pair.settings]
-    signs = {share.value > 0 for share in own if share is not None and excludes_zero(share)}
+    signs = {share.value > 0 for share in own if share is not None and share.excludes_zero}
     if len(signs) != 1:
-        return "each changes what the other does"
-    return "they need each other" if signs == {pair.beyond.value > 0} else "they replace each other in part"
+        return "the effect of one depends on the other"
+    return "stronger together" if signs == {pair.beyond.value > 0} else "weaker together"
+
+
+def shown_mixtures(explanation: Explanation) -> list[Mixture]:
+    """Return the mixtures, of many only A, each setting alone, all but one, B and the smallest set."""
+    if len(explanation.mixtures) <= _MAX_MIXTURES:
+        return list(explanation.mixtures)
+    count = len(explanation.settings)
+    counts = (0, 1, count - 1, count)
+    return [one for one in explanation.mixtures if len(one.settings) in counts or one == explanation.smallest]
 
 
 def _mixtures_section(explanation: Explanation) -> Section:
-    names = [setting.name for setting in explanation.settings]
-    mixtures = explanation.mixtures
-    left_out = len(mixtures) > _MAX_MIXTURES
-    if left_out:  # A, each setting alone, all but one, B, and the smallest set
-        chosen = (0, 1, len(names) - 1, len(names))
-        mixtures = tuple(
-            one for one in mixtures if len(one.settings) in chosen or one == explanation.smallest
-        )
-    rows = [
-        (
-            *("B" if name in one.settings else "A" for name in names),
-            number(one.mean.value),
-            _interval(one.mean),
-        )
-        for one in mixtures
-    ]
+    names, mixtures = [setting.name for setting in explanation.settings], shown_mixtures(explanation)
+    rows = []
+    for one in mixtures:
+        sides = ("B" if name in one.settings else "A" for name in names)
+        rows.append((*sides, number(one.mean.value), _interval(one.mean)))
     text = f"{counted(explanation.runs, 'run')}, {len(explanation.mixtures)} mixtures of the settings"
-    text += f"; {len(mixtures)} of them are listed." if left_out else "."
+    text += f"; {len(mixtures)} of them are listed." if len(mixtures) < len(explanation.mixtures) else "."
     if explanation.trained:
-        text += (
-            f" {counted(explanation.trained, 'run')} were trained now, in {duration(explanation.seconds)}."
-        )
+        text += f" {counted(explanation.trained, 'run')} trained now, in {duration(explanation.seconds)}."
     return Section("Mixtures", [text], [Grid((*names, explanation.metric, "95 %"), rows)])
+
+
+def _percent(part: float) -> str:
+    return f"{round(100 * part) or 0} %"
 
 
 def number(value: float, sign: bool = False) -> str:
@@ -331,3 +272,30 @@ def signed(estimate: Estimate) -> str:
     """Return a difference with its interval: `+21.3 (19.8 to 22.7)`."""
     interval = _interval(estimate)
     return number(estimate.value, True) + (f" ({interval})" if interval else "")
+
+
+# --- as pictures ------------------------------------------------------------------------------------------
+
+
+def plots(explanation: Explanation) -> list[Plot]:
+    """Return the pictures of an explanation: shares, clear interactions, and mixtures by their value."""
+    names, found = [setting.name for setting in explanation.settings], []
+    shares = [(each.name, each.share) for each in explanation.settings if each.share is not None]
+    if shares:
+        title = f"Share of each setting in the difference of {explanation.metric}"
+        found.append(Plot("Shares", bars_chart(title, shares).svg(), True))
+    pairs = [
+        (" x ".join(pair.settings), pair.beyond)
+        for pair in explanation.interactions
+        if pair.beyond.excludes_zero
+    ]
+    if pairs:
+        title = f"{explanation.metric}: what two settings do together beyond what each does"
+        found.append(Plot("Which need each other", bars_chart(title, pairs).svg(), True))
+    columns = [
+        Column(one.settings, one.values, one == explanation.smallest)
+        for one in sorted(shown_mixtures(explanation), key=lambda one: one.mean.value)
+    ]
+    title = f"{explanation.metric} of mixtures: a filled dot is the value of B, a hollow one that of A"
+    found.append(Plot("Mixtures", mixtures_chart(title, names, columns).svg(), True))
+    return found

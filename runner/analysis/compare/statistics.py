@@ -46,6 +46,13 @@ class Estimate:
     low: float
     high: float
 
+    @property
+    def excludes_zero(self) -> bool:
+        """Whether the interval excludes 0; without an interval, whether the value is not 0."""
+        if np.isnan(self.low):
+            return self.value != 0
+        return self.low > 0 or self.high < 0
+
 
 def require_scipy() -> Any:
     """Return the module `scipy.stats`.

@@ -8,7 +8,8 @@ import pytest
 
 import runner
 from runner.config import from_mapping
-from runner.debugging.explanation import explanations_in, read_explanation, sections
+from runner.debugging.explanation import sections
+from runner.debugging.explanation_files import explanations_in, read_explanation
 from runner.debugging.factors import mix
 from runner.errors import RunnerError
 from runner.runs.listing import list_runs
@@ -37,12 +38,12 @@ def test_a_planted_interaction_is_found(tmp_path):
     expected = {"epsilon": 50.0, "discount": 50.0, "quirks.bootstrap_after_termination": 0.0}
     assert shares == pytest.approx(expected)
     assert all(setting.alone.value == 0.0 for setting in found.settings)
-    (clear,) = [pair for pair in found.interactions if pair.is_clear]
+    (clear,) = [pair for pair in found.interactions if pair.beyond.excludes_zero]
     assert (set(clear.settings), clear.beyond.value) == ({"epsilon", "discount"}, 100.0)
     assert set(found.smallest.settings) == {"epsilon", "discount"}
     assert len(found.mixtures) == 8
     text = "\n".join(line for each in sections(found) for line in each.sentences)
-    assert "epsilon and discount together make 100% of it" in text or "discount and epsilon" in text
+    assert "epsilon and discount together make 100 % of it" in text or "discount and epsilon" in text
 
 
 def test_a_planted_cause_is_found_with_the_step_that_it_changed_first(tmp_path):
@@ -90,8 +91,10 @@ def test_what_was_trained_is_kept(tmp_path):
     assert read_explanation(name, tmp_path) == found
     again = explained(LAKE, b, tmp_path, seeds=5)
     assert (again.trained, again.runs) == (8, 40)
+    assert explained(LAKE, b, tmp_path, seeds=5, metric="mean_length").trained == 0
     runs = len(list_runs(tmp_path))
-    values = tmp_path / ".explain" / name / "values.jsonl"
+    assert runs == 2
+    values = tmp_path / ".explain" / name.split("/")[0] / "values.jsonl"
     values.write_text("{\n" + values.read_text()[:-30])  # a damaged line, and one that was cut off
     assert explained(LAKE, b, tmp_path, seeds=5).trained == 1
     assert len(list_runs(tmp_path)) == runs
@@ -184,7 +187,7 @@ def test_a_loop_is_refused(tmp_path):
 def test_a_damaged_result_is_named(tmp_path):
     found = explained(LAKE, LAKE | PLANTED, tmp_path, seeds=1)
     assert found.difference.value == 100.0
-    path = tmp_path / ".explain" / found.name / "explanation.json"
+    path = tmp_path / ".explain" / f"{found.name}.json"
     path.write_text(json.dumps({"name": 3}))
     with pytest.raises(RunnerError, match="no longer describes an explanation"):
         read_explanation(found.name, tmp_path)
