@@ -180,8 +180,12 @@ class Mixtures:
         self._batch = 1
         self.trained = 0
         """Runs that were trained now, not read from the file."""
-        self.seconds = 0.0
-        """The time that one run takes of a processor; 0 if none was trained."""
+        self._seconds: dict[int, float] = {}
+
+    @property
+    def seconds(self) -> float:
+        """The time that a run takes of a processor, the mean over mixtures; 0 if none was trained."""
+        return sum(self._seconds.values()) / max(1, len(self._seconds))
 
     @property
     def ends(self) -> tuple[int, int]:
@@ -247,7 +251,7 @@ class Mixtures:
                     raise self._failed(task, "its worker died twice" if result is None else result.error)
                 left -= len(result.readings)
                 self.trained += len(result.readings)
-                self.seconds = result.seconds or self.seconds
+                self._seconds[task.mixture] = result.seconds
                 self._keep(task, result.readings)
         self._report(self.trained, self.trained)
 
