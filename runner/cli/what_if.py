@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from runner.cli.output import draw, facts, print_json, say, table
 from runner.cli.runs import compilation_notice
-from runner.util.humanize import number
 
 if TYPE_CHECKING:
     from runner.analysis.step_reference import StepRef
@@ -16,32 +15,17 @@ if TYPE_CHECKING:
 
 def print_what_if(run: Run, at: StepRef, actions: Sequence[str], as_json: bool) -> None:
     """Print where joint actions at a step lead: each of those that are named, or all."""
-    from runner.debugging.what_if import ENDS, grid_of, what_if
+    from runner.debugging.what_if import what_if
 
     with compilation_notice():
         found = what_if(run, at=at, actions=actions)
     if as_json:
         print_json(found.as_json())
         return
-    grid = grid_of(found)
+    grid = found.grid
     drawn = table(*grid.headings, left=("action", "end"))
     for row in grid.rows:
         drawn.add_row(*row)
-    recorded = found.recorded
-    returns = " and ".join(number(value, 2).removesuffix(".00") for value in recorded.returns)
-    draw(
-        facts(
-            {
-                "run": f"{run.run_id}  {run.title}",
-                "step": f"{found.at}, {found.title}",
-                "state": f"{found.state}: {found.state_in_words}",
-                "policy": f"{found.policy}, after {found.tables_step:,} training steps",
-                "recorded": f"return {returns}, {recorded.length:,} steps, {ENDS[recorded.end]}",
-                "discount": f"{found.discount:g}, of the exact values",
-            }
-        ),
-        "",
-        drawn,
-    )
+    draw(facts({"run": f"{run.run_id}  {run.title}"} | found.facts), "", drawn)
     for note in found.notes:
         say(f"Note: {note}.")

@@ -12,116 +12,50 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.sections import Grid
 from runner.analysis.step_reference import StepRef
+from runner.debugging.action_outcomes import ActionOutcome, Outcome, WhatIf
 from runner.debugging.continuation import Continuation, Moment
-from runner.environments.mdp import Mdp, events_of
-from runner.environments.naming import actions_in_words, spoken, states_in_words
-from runner.errors import ConfigError, RecordingError, nearest
+from runner.environments.mdp import events_of
+from runner.environments.naming import actions_in_words, joint_action, states_in_words
+from runner.errors import RecordingError
 from runner.export.contents import ending_of, require_steps
 from runner.export.episodes import EpisodePlace, place_of
+from runner.export.reports.episode import episode_of
+from runner.export.reports.playback import tabular_playback
+from runner.export.reports.player_data import Playback
 from runner.planning.evaluation import action_values, policy_values
 from runner.planning.optimum import optimal_values
 from runner.recording import schema
 from runner.recording.blocks import blank_records
 from runner.recording.metadata import sizes_of
 from runner.recording.reader import Recording, open_recording
-from runner.replay.steps import check_steps, episode_blocks
+from runner.replay.steps import check_steps, episode_blocks, steps_of
 from runner.replay.tables import TableReplay
 from runner.runs.run import Run
-from runner.util.humanize import number
 from runner.util.values import finite
 
 ALL: Final = "all"
 """Stands for every joint action."""
 MAX_STEPS: Final = 100_000
 """Steps that an action is played on for where the environment has no step limit."""
-ENDS: Final = {
-    "success": "success",
-    "terminated": "terminated",
-    "truncated": "step limit",
-    "reset": "reset",
-    "cut off": "not over",
-}
-"""How an episode ends, by the keys of `ENDINGS`, in the words of a table."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Where an episode led, from its beginning to its end."""
-
-    returns: tuple[float, ...]
-    """The sum of each learner's rewards."""
-    length: int
-    end: str
-    """A key of `ENDS`."""
-
-
-@dataclass(frozen=True)
-class ActionOutcome(Outcome):
-    """Where an action leads, and what it is worth."""
-
-    action: int
-    """The number of the joint action."""
-    name: str
-    is_recorded: bool
-    probability: float
-    """With which the policy takes it in this state."""
-    learned: tuple[float, ...]
-    """Its Q-value in each learner's table; empty if nothing is learned."""
-    values: tuple[float | None, ...]
-    """Its exact value for each learner if the policy acts from there on; None with a discount of 1."""
-    optimal_value: float | None
-    """Its exact value for all together if they act optimally from there on; None with a discount of 1."""
-    regret: float | None
-    """By how much `optimal_value` is below that of the best action."""
-
-
-@dataclass(frozen=True)
-class WhatIf:
-    """The actions at a step of an episode, and where each leads."""
-
-    run_id: str
-    at: str
-    """The step, as a reference."""
-    title: str
-    """The name of the episode."""
-    state: int
-    state_in_words: str
-    tables_step: int
-    """Training steps that the tables have learned from."""
-    learners: tuple[str, ...]
-    policy: str
-    """What acts from the step on, in words."""
-    epsilon: float
-    discount: float
-    recorded: Outcome
-    """Where the episode led."""
-    actions: tuple[ActionOutcome, ...]
-    """Those of the highest value first, summed over learners."""
-    notes: tuple[str, ...]
-
-    def as_json(self) -> dict[str, Any]:
-        """Return all fields as JSON can hold them."""
-        plain = {name: value for name, value in vars(self).items() if name not in ("recorded", "actions")}
-        fields: dict[str, Any] = finite(
-            plain | {"recorded": vars(self.recorded), "actions": [vars(action) for action in self.actions]}
-        )
-        return fields
 
 
 @dataclass(frozen=True)
 class Branched:
-    """An action's episode from the step on."""
+    """The episode to which an action leads."""
 
     place: EpisodePlace
+    """Of the recorded episode."""
     steps: NDArray[np.void]
+    """Those up to the branch as they were recorded, then those played."""
     outcome: Outcome
+    tables: list[NDArray[np.float64]]
+    """The Q-tables of each learner that the branch was played with, [S, actions]; empty if there are none."""
 
 
 def what_if(run: Run, *, at: str | StepRef, actions: Sequence[str | int] = ()) -> WhatIf:
@@ -147,63 +81,38 @@ def what_if_in(recording: Recording, at: StepRef, actions: Sequence[str | int] =
     chosen = (
         range(mdp.joint_actions)
         if not actions or ALL in actions
-        else [parse_action(mdp, each) for each in actions]
+        else [joint_action(mdp, str(each)) for each in actions]
     )
     return branches.compare(dict.fromkeys(chosen))
 
 
 def branched(recording: Recording, at: StepRef, action: str | int) -> Branched:
-    """Return the episode of one action, from the step on; errors as for `what_if`."""
-    branches = _Branches(recording, at)
-    return branches.play(parse_action(recording.mdp, action))
+    """Return the whole episode to which an action leads; errors as for `what_if`."""
+    return _Branches(recording, at).episode(joint_action(recording.mdp, str(action)))
 
 
-def parse_action(mdp: Mdp, given: str | int) -> int:
-    """Return a joint action from its number or name, `north + east` or `north+east`.
+def branch_playback(
+    recording: Recording, at: StepRef, action: str | int, limit: int, first: int = 0
+) -> Playback:
+    """Return what a page plays of the episode to which an action leads; errors as for `what_if`.
 
-    Raises:
-        ConfigError: there is none.
+    Args:
+        recording: the run.
+        at: the step of the branch.
+        action: the joint action there.
+        limit: the largest number of steps.
+        first: the first step.
     """
-    names = [str(name) for name in actions_in_words(mdp)]
-    compact = {_compact(name): action for action, name in enumerate(names)}
-    if (found := compact.get(_compact(str(given)))) is not None:
-        return found
-    if str(given).strip().isdecimal() and int(given) < len(names):
-        return int(given)
-    raise ConfigError(
-        f"action: found {str(given)[:60]!r}, expected a joint action, 0 to {len(names) - 1} or a name "
-        f"such as {names[0]!r}, or `all`.{nearest(str(given), names)}"
-    )
-
-
-def grid_of(found: WhatIf) -> Grid:
-    """Return the actions as a table of text."""
-    several = len(found.learners) > 1
-    own = [f" {spoken(learner)}" if several else "" for learner in found.learners]
-    has_learned = bool(found.actions[0].learned)
-    headings = (
-        "action",
-        *(f"return{who}" for who in own),
-        "length",
-        "end",
-        "policy",
-        *(f"learned{who}" for who in own if has_learned),
-        *(f"value{who}" for who in own),
-        "optimal",
-        "regret",
-    )
-    rows = [
-        (
-            f"{row.name}{' (recorded)' if row.is_recorded else ''}",
-            *(number(value, 0 if value % 1 == 0 else 2) for value in row.returns),
-            f"{row.length:,}",
-            ENDS[row.end],
-            f"{100 * row.probability:.3g} %",
-            *(number(value, 3) for value in (*row.learned, *row.values, row.optimal_value, row.regret)),
+    found = branched(recording, at, action)
+    shown = found.steps[first : first + limit]
+    if not len(shown):
+        raise RecordingError(
+            f"{recording.path}: this branch of {found.place.title} has {len(found.steps):,} steps, from 0; "
+            f"found no step {first:,}."
         )
-        for row in found.actions
-    ]
-    return Grid(headings, rows)
+    values = tuple(table[shown["state"]] for table in found.tables)
+    episode = episode_of(found.place, recording.mdp, found.steps, found.outcome.end, values, first, limit)
+    return tabular_playback(recording, episode)
 
 
 class _Branches:
@@ -260,11 +169,22 @@ class _Branches:
             done += len(block)
         self._recorded = Outcome(tuple(returns.tolist()), len(span), ending_of(recording, phase, episode))
 
+    @property
+    def _learns(self) -> bool:
+        return self._tables.learner.rules.learns
+
     def _has_success(self, steps: NDArray[np.void]) -> bool:
         return len(steps) > 0 and bool((events_of(self._mdp, steps) & self._mdp.success_mask).any())
 
-    def play(self, action: int) -> Branched:
-        """Return the episode of an action, from the step on."""
+    def episode(self, action: int) -> Branched:
+        """Return the whole episode to which an action leads."""
+        before = steps_of(self._recording, self._place.phase, self._place.number)[: self._at.t]
+        steps, outcome = self._play(action)
+        tables = self._tables.tables if self._learns else []
+        return Branched(self._place, np.concatenate([before, steps]), outcome, tables)
+
+    def _play(self, action: int) -> tuple[NDArray[np.void], Outcome]:
+        """Return the steps from an action on, and where the whole episode leads."""
         recording, place, t = self._recording, self._place, self._at.t
         limit = self._mdp.step_limit - t if self._mdp.step_limit else MAX_STEPS
         sizes = sizes_of(recording.run, str(recording.path))
@@ -280,11 +200,11 @@ class _Branches:
         steps["log_time"] = steps["publish_time"] = times
         if action == int(self._step["action"]):
             steps[0]["explored"] = self._step["explored"]
-        end = next((end for end in ("terminated", "truncated") if steps[-1][end]), "cut off")
+        end = next((end for end in ("terminated", "truncated") if steps[-1][end]), "stopped")
         if self._succeeded or self._has_success(steps):
             end = "success"
         returns = tuple(_summed(self._returns, steps).tolist())
-        return Branched(place, steps, Outcome(returns, t + len(steps), end))
+        return steps, Outcome(returns, t + len(steps), end)
 
     def compare(self, actions: Iterable[int]) -> WhatIf:
         """Return where each of some joint actions leads."""
@@ -295,7 +215,7 @@ class _Branches:
         values, optimal = self._exact_values(state, probabilities)
         rows = [
             ActionOutcome(
-                **vars(self.play(action).outcome),
+                **vars(self._play(action)[1]),
                 action=action,
                 name=str(names[action]),
                 is_recorded=action == recorded,
@@ -321,11 +241,12 @@ class _Branches:
             recorded=self._recorded,
             actions=tuple(sorted(rows, key=_rank)),
             notes=tuple(self._notes(rows)),
+            mdp=mdp,
         )
 
     def _learned(self, state: int) -> list[tuple[float, ...]]:
         """Return the Q-values of each joint action in a state; empty tuples where nothing is learned."""
-        if not self._tables.learner.rules.learns:
+        if not self._learns:
             return [()] * self._mdp.joint_actions
         rows = [table[state] for table in self._tables.tables]
         own = self._tables.own_actions
@@ -357,7 +278,7 @@ class _Branches:
             )
         if self._playing.discount >= 1:
             yield "there are no exact values: with a discount of 1 a process without end has none"
-        if any(row.end == "cut off" for row in rows):
+        if any(row.end == "stopped" for row in rows):
             yield f"episodes that were not over after {MAX_STEPS:,} more steps were not played to their end"
 
 
@@ -370,7 +291,3 @@ def _rank(row: ActionOutcome) -> tuple[float, float, float, int]:
     """Return the key that sorts actions: by value, return and probability, the highest first."""
     value = sum(value for value in row.values if value is not None)
     return -round(value, 9), -sum(row.returns), -row.probability, row.action
-
-
-def _compact(name: str) -> str:
-    return spoken(name).replace(" ", "").casefold()

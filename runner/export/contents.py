@@ -18,6 +18,7 @@ ENDINGS: Final = {
     "truncated": "ended by the step limit",
     "reset": "reset before its end",
     "cut off": "cut off with the recording",
+    "stopped": "stopped before its end",
 }
 """How an episode may end, and its description."""
 

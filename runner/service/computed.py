@@ -31,6 +31,7 @@ from runner.analysis.histograms import histograms
 from runner.analysis.qtable import describe_tables, one_array, replay_at
 from runner.analysis.series import RunSeries, parse_target, read_series
 from runner.analysis.step_reference import StepRef
+from runner.debugging.what_if import what_if_in
 from runner.debugging.when import section_of, when_in
 from runner.debugging.why import why_in
 from runner.errors import RunnerError
@@ -339,6 +340,17 @@ def comparison(
         return as_json(dataclasses.asdict(tasks))
     require_two(groups, by)
     return as_json(dataclasses.asdict(compare(groups, metrics_of(groups, names), chosen, notes)))
+
+
+def where_actions_lead(path: Path, at: StepRef, actions: tuple[str, ...]) -> bytes:
+    """Return where joint actions at a step lead as JSON, as `dualtaxi branch --json` prints it.
+
+    Raises:
+        RecordingError: there is no such step.
+        RunnerError: there is no such action, or the run was not trained here.
+    """
+    with open_recording(path) as recording:
+        return as_json(what_if_in(recording, at, actions).as_json())
 
 
 def replay(runs: Sequence[Run], request: Request) -> bytes:

@@ -31,9 +31,11 @@ from runner.analysis.sections import Grid, Section
 from runner.analysis.series import read_series
 from runner.analysis.step_reference import StepRef
 from runner.analysis.summary import random_policy_sentence
+from runner.debugging.what_if import branch_playback, what_if_in
 from runner.debugging.why import why_in
 from runner.debugging.why_page import why_body
 from runner.drawing import svg
+from runner.environments.naming import joint_action
 from runner.errors import RecordingError, RunnerError
 from runner.export.encoded import picture_note
 from runner.export.episodes import last_episode, last_whole_evaluation, typical_trial
@@ -91,6 +93,63 @@ def episode_part(path: Path, which: tuple[int, ...], start: int, steps: int) -> 
         data = {"episode": asdict(episode), "scene": scene}
         data |= {"has_pictures": has_pictures, "picture_note": note}
         return json.dumps(data, separators=(",", ":"), ensure_ascii=False).encode(errors="replace")
+
+
+def branch_part(path: Path, at: StepRef, action: str, start: int, steps: int) -> bytes:
+    """Return a part of the episode to which a joint action leads, as `episode_part` does.
+
+    Raises:
+        RecordingError: there is no such step.
+        RunnerError: there is no such action, or the run was not trained here.
+    """
+    with open_recording(path) as recording:
+        return _branch_part(recording, at, action, start, steps)
+
+
+def what_if_page(run: Run, at: StepRef, action: str | None, start: int, steps: int) -> bytes:
+    """Return where each joint action at a step leads, as JSON for its page, and a part of one branch.
+
+    Args:
+        run: the run.
+        at: the step.
+        action: the joint action whose branch is shown; None for the recorded one.
+        start: the first step of the part.
+        steps: the largest number of steps of the part.
+
+    Raises:
+        RecordingError: there is no such step.
+        RunnerError: there is no such action, or the run was not trained here.
+    """
+
+    def address(number: int) -> str:
+        return f"/runs/{run.run_id}/what-if/{at}/{number}"
+
+    with open_recording(run.recording) as recording:
+        found = what_if_in(recording, at)
+        number = next(row.action for row in found.actions if row.is_recorded)
+        if action is not None:
+            number = joint_action(recording.mdp, action)
+        part = _branch_part(recording, at, str(number), start, steps)
+        shown = {
+            "facts": found.facts,
+            "notes": found.notes,
+            "action": number,
+            "name": next(row.name for row in found.actions if row.action == number),
+            "picture": found.picture(style=""),
+            "matrix": found.matrix(address),
+            "grid": asdict(found.grid),
+            "addresses": [address(row.action) for row in found.actions],
+            "part": json.loads(part),
+        }
+        return json.dumps(shown, ensure_ascii=False).encode(errors="replace")
+
+
+def _branch_part(recording: Recording, at: StepRef, action: str, start: int, steps: int) -> bytes:
+    episode = branch_playback(recording, at, action, steps, max(0, start - _STEPS_BEFORE))
+    scene = recording.environment["scene"] if episode.grid else None
+    note = "" if scene else "The environment has no scene to draw."
+    data = {"episode": asdict(episode), "scene": scene, "has_pictures": False, "picture_note": note}
+    return json.dumps(data, separators=(",", ":"), ensure_ascii=False).encode(errors="replace")
 
 
 def random_policy(path: Path) -> bytes:

@@ -31,6 +31,7 @@ PRELOADED: Final = (
     "runner.analysis.diff",
     "runner.analysis.qtable",
     "runner.analysis.series",
+    "runner.debugging.what_if",
     "runner.debugging.when",
     "runner.debugging.why_page",
     "runner.environments.loading",

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.environments.mdp import events_of
+from runner.environments.mdp import Mdp, events_of
 from runner.errors import RecordingError
 from runner.export.contents import ENDINGS, ending_of, require_steps
 from runner.export.episodes import EpisodePlace, place_of
@@ -83,29 +83,56 @@ def episode_at(recording: Recording, place: EpisodePlace, limit: int = MAX_STEPS
         RecordingError: there is no such episode or step, or no steps.
     """
     require_steps(recording, "show", may_redo=True)
-    phase, number, title = place.phase, place.number, place.title
-    steps = steps_of(recording, phase, number)
+    steps, ended = (
+        steps_of(recording, place.phase, place.number),
+        ending_of(recording, place.phase, place.number),
+    )
     shown = steps[first : first + limit]
     if not len(shown):
         raise RecordingError(
-            f"{recording.path}: {title} has {len(steps):,} steps, from 0; found no step {first:,}."
+            f"{recording.path}: {place.title} has {len(steps):,} steps, from 0; found no step {first:,}."
         )
-    mdp = recording.mdp
-    check_steps(shown, mdp, str(recording.path))
+    check_steps(shown, recording.mdp, str(recording.path))
+    return episode_of(
+        place, recording.mdp, steps, ended, _values(recording, shown, place.table_step), first, limit
+    )
+
+
+def episode_of(
+    place: EpisodePlace,
+    mdp: Mdp,
+    steps: NDArray[np.void],
+    ended: str,
+    values: tuple[NDArray[np.float64], ...],
+    first: int = 0,
+    limit: int = MAX_STEPS,
+) -> Episode:
+    """Return a part of an episode from its steps, which the environment can have.
+
+    Args:
+        place: where the episode stands.
+        mdp: the environment.
+        steps: all of its steps.
+        ended: a key of `ENDINGS`.
+        values: for each learner the Q-values in the states of the part, [T, actions].
+        first: the first step of the part.
+        limit: the largest number of steps of the part.
+    """
+    shown = steps[first : first + limit]
     return Episode(
-        title=title,
-        phase=phase,
-        number=number,
+        title=place.title,
+        phase=place.phase,
+        number=place.number,
         length=len(steps),
         total=float(steps["rewards"].sum()),
-        ended=ending_of(recording, phase, number),
+        ended=ended,
         states=np.append(shown["state"], shown["next_state"][-1]).astype(np.int64),
         actions=shown["action"].astype(np.int64),
         rewards=shown["rewards"].astype(np.float64),
         events=events_of(mdp, shown).astype(np.int64),
         explored=shown["explored"].astype(np.int64),
         times=(shown["log_time"] // schema.STEP_NANOSECONDS).astype(np.int64),
-        values=_values(recording, shown, place.table_step),
+        values=values,
         first=first,
         before=tuple(steps["rewards"][:first].sum(axis=0).tolist()) if first else (),
     )

@@ -18,6 +18,7 @@ from runner.service.pages import (
     static,
     submit,
     sweeps,
+    what_if,
     when,
     why,
 )
@@ -27,7 +28,7 @@ __all__ = ["add_error_handlers", "refused", "router"]
 
 router = APIRouter(include_in_schema=False)
 for _module in (
-    *(runs, rerun, run, setup, replay, when, why, environments, episodes, compare),
-    *(machine, submit, jobs, sweeps, static),
+    *(runs, rerun, run, setup, replay, when, why, what_if, environments, episodes),
+    *(compare, machine, submit, jobs, sweeps, static),
 ):
     router.include_router(_module.router)

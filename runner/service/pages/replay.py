@@ -101,6 +101,8 @@ class _ReplayView(RunView):
     """Path of the episode below the replays."""
     environments: int
     """How many environments take turns."""
+    what_if: str
+    """Address of the actions at a step, without its `:T`; empty for loops."""
     branches: list[Link]
     """This run next to its parent, and to its branches."""
 
@@ -215,7 +217,7 @@ async def _replay(
         if isinstance(part, RunnerError):
             view = _view(run, which, branches, None, message_of(part, request))
             return page(request, view, HTTPStatus.NOT_FOUND)
-        return page(request, _view(run, which, branches, _step(json.loads(part), t)))
+        return page(request, _view(run, which, branches, shown_step(json.loads(part), t)))
 
     return await run_in_threadpool(show)
 
@@ -242,7 +244,7 @@ def _view(
 ) -> _ReplayView:
     with open_recording(run.recording) as recording:
         episodes = recording.count(recording.topic("/train/episode"))
-        environments = recording.environments
+        environments, is_job = recording.environments, recording.is_job
         evaluations = [Evaluation(one.after, one.stop - one.start) for one in evaluations_of(recording)]
     if len(which) == 1:
         count = episodes
@@ -269,11 +271,12 @@ def _view(
         reference=at.episode_text,
         episode_path=at.episode_path,
         environments=environments,
+        what_if=f"/runs/{run.run_id}/what-if/{at.episode_text}" if is_job else "",
         branches=branches,
     )
 
 
-def _step(part: Mapping[str, Any], t: int) -> ShownStep:
+def shown_step(part: Mapping[str, Any], t: int) -> ShownStep:
     """Return a step of a part of an episode, see `fragments.episode_part`."""
     episode = part["episode"]
     at = min(t, episode["length"])

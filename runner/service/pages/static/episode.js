@@ -3,12 +3,13 @@ import { onKeys, partAt } from "./parts.js";
 import { picturesOf } from "./pictures.js";
 
 const root = document.querySelector("[data-part]"), source = root.dataset.part;
-const onward = root.querySelector("[data-to-rerun]");
+const [toRerun, toWhatIf] = ["rerun", "what-if"].map((name) => root.querySelector(`[data-to-${name}]`));
 let writing = null;
 
 // Browsers limit how often the address may change, so a playing replay does not write every step.
 function moved(k) {
-  onward.href = `${root.dataset.rerun}:${Math.max(0, k - 1)}`;
+  if (toRerun) toRerun.href = `${root.dataset.rerun}:${Math.max(0, k - 1)}`;
+  if (toWhatIf) toWhatIf.href = `${root.dataset.whatIf}:${Math.min(k, replay.length - 1)}`;
   clearTimeout(writing);
   writing = setTimeout(() => history.replaceState(null, "", `?t=${k}`), 150);
 }

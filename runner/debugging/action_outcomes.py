@@ -1,0 +1,230 @@
+"""Where the actions at a step lead, and what each is worth: as JSON, tables and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from html import escape
+from typing import Any, Final
+
+import numpy as np
+
+from runner.analysis.sections import Grid
+from runner.drawing import svg, svg_maps
+from runner.drawing.palette import ink_on, ramp_colour
+from runner.environments.mdp import Mdp
+from runner.environments.naming import numbered_actions, spoken
+from runner.util.humanize import number
+from runner.util.values import finite
+
+ENDS: Final = {
+    "success": "success",
+    "terminated": "terminated",
+    "truncated": "step limit",
+    "reset": "reset",
+    "cut off": "cut off",
+    "stopped": "not over",
+}
+"""How an episode ends, by the keys of `ENDINGS`, in the words of a table."""
+_CELL: Final = (96, 44)
+"""Width and height of a cell of the matrix."""
+_HEAD: Final = (96, 60)
+"""Width and height of its headings."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Where an episode led, from its beginning to its end."""
+
+    returns: tuple[float, ...]
+    """The sum of each learner's rewards."""
+    length: int
+    end: str
+    """A key of `ENDS`."""
+
+
+@dataclass(frozen=True)
+class ActionOutcome(Outcome):
+    """Where an action leads, and what it is worth."""
+
+    action: int
+    """The number of the joint action."""
+    name: str
+    is_recorded: bool
+    probability: float
+    """With which the policy takes it in this state."""
+    learned: tuple[float, ...]
+    """Its Q-value in each learner's table; empty if nothing is learned."""
+    values: tuple[float | None, ...]
+    """Its exact value for each learner if the policy acts from there on; None with a discount of 1."""
+    optimal_value: float | None
+    """Its exact value for all together if they act optimally from there on; None with a discount of 1."""
+    regret: float | None
+    """By how much `optimal_value` is below that of the best action."""
+
+
+@dataclass(frozen=True, eq=False)
+class WhatIf:
+    """The actions at a step of an episode, and where each leads."""
+
+    run_id: str
+    at: str
+    """The step, as a reference."""
+    title: str
+    """The name of the episode."""
+    state: int
+    state_in_words: str
+    tables_step: int
+    """Training steps that the tables have learned from."""
+    learners: tuple[str, ...]
+    policy: str
+    """What acts from the step on, in words."""
+    epsilon: float
+    discount: float
+    recorded: Outcome
+    """Where the episode led."""
+    actions: tuple[ActionOutcome, ...]
+    """Those of the highest value first, summed over learners."""
+    notes: tuple[str, ...]
+    """What a reader must know about these figures, a sentence each."""
+    mdp: Mdp = field(repr=False)
+    """The environment; not a part of the JSON."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all fields but the environment as JSON can hold them."""
+        plain = {
+            name: value for name, value in vars(self).items() if name not in ("recorded", "actions", "mdp")
+        }
+        fields: dict[str, Any] = finite(
+            plain | {"recorded": vars(self.recorded), "actions": [vars(action) for action in self.actions]}
+        )
+        return fields
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """The step, and what is known of it, as text by name."""
+        recorded = self.recorded
+        returns = " and ".join(map(_short, recorded.returns))
+        return {
+            "step": f"{self.at}, {self.title}",
+            "state": f"{self.state}: {self.state_in_words}",
+            "policy": f"{self.policy}, after {self.tables_step:,} training steps",
+            "recorded": f"return {returns}, {recorded.length:,} steps, {ENDS[recorded.end]}",
+            "discount": f"{self.discount:g}, of the exact values",
+        }
+
+    @property
+    def grid(self) -> Grid:
+        """The actions as a table of text."""
+        several = len(self.learners) > 1
+        own = [f" {spoken(learner)}" if several else "" for learner in self.learners]
+        headings = (
+            "action",
+            *(f"return{who}" for who in own),
+            "length",
+            "end",
+            "policy",
+            *(f"learned{who}" for who in own if self.actions[0].learned),
+            *(f"value{who}" for who in own),
+            "optimal",
+            "regret",
+        )
+        rows = [
+            (
+                f"{row.name}{' (recorded)' if row.is_recorded else ''}",
+                *map(_short, row.returns),
+                f"{row.length:,}",
+                ENDS[row.end],
+                f"{100 * row.probability:.3g} %",
+                *(number(value, 3) for value in (*row.learned, *row.values, row.optimal_value, row.regret)),
+            )
+            for row in self.actions
+        ]
+        return Grid(headings, rows)
+
+    def picture(self, style: str = svg.STYLE) -> str:
+        """Return the grid in the state of the step, as SVG; empty without a scene.
+
+        Args:
+            style: CSS of the picture; empty if the page has it.
+        """
+        drawing = svg.drawing_of(self.mdp)
+        if drawing is None:
+            return ""
+        places = drawing.places(self.mdp, np.array([self.state]))
+        return drawing.frame(places[0], f"The state of the step: {self.state_in_words}", style=style)
+
+    def matrix(self, address: Callable[[int], str] | None = None) -> str:
+        """Return the actions of two agents as a matrix, as SVG; empty for other environments.
+
+        The first agent's actions are the rows. A cell has the exact values of its joint action, or its
+        returns where there are none, and the colour of their sum.
+
+        Args:
+            address: called with a joint action, returns the address that its cell links to.
+        """
+        mdp = self.mdp
+        if len(mdp.agents) != 2 or len(self.actions) < mdp.joint_actions:
+            return ""
+        shown = {
+            row.action: row.returns if None in row.values else [value or 0.0 for value in row.values]
+            for row in self.actions
+        }
+        totals = np.array([sum(shown[action]) for action in range(mdp.joint_actions)])
+        levels = svg_maps.levels_of(totals, float(totals.min()), float(totals.max()))
+        rows, columns = numbered_actions(mdp)
+        first, second = map(spoken, mdp.agents)
+        parts = [_text(_HEAD[0] + _CELL[0] * len(columns) / 2, 20, second, "currentColor", bold=True)]
+        parts += [_text(6, _HEAD[1] - 10, first, "currentColor", anchor="start", bold=True)]
+        for i, name in enumerate(columns):
+            parts.append(_text(_HEAD[0] + _CELL[0] * (i + 0.5), _HEAD[1] - 10, name, "currentColor"))
+        for i, name in enumerate(rows):
+            middle = _HEAD[1] + _CELL[1] * (i + 0.5) + 5
+            parts.append(_text(6, middle, name, "currentColor", anchor="start"))
+        for row in self.actions:
+            i, j = divmod(row.action, len(columns))
+            x, y, colour = _HEAD[0] + j * _CELL[0], _HEAD[1] + i * _CELL[1], ramp_colour(levels[row.action])
+            edge = ' stroke="currentColor" stroke-width="4"' if row.is_recorded else ""
+            values = " / ".join(number(value, 1) for value in shown[row.action])
+            cell = (
+                f'<rect x="{x + 2}" y="{y + 2}" width="{_CELL[0] - 4}" height="{_CELL[1] - 4}" '
+                f'fill="{colour}"{edge}/>' + _text(x + _CELL[0] / 2, y + 27, values, ink_on(colour))
+            )
+            title = f"<title>{escape(row.name)}: {escape(ENDS[row.end])} after {row.length:,} steps</title>"
+            link = "" if address is None else f' href="{escape(address(row.action))}"'
+            parts.append(f"<a{link}>{title}{cell}</a>" if link else f"<g>{title}{cell}</g>")
+        width, height = _HEAD[0] + _CELL[0] * len(columns), _HEAD[1] + _CELL[1] * len(rows)
+        label = f"The value of each action of {first} (rows) and {second} (columns)"
+        drawn = svg.picture(width + 4, height + 4, label, "".join(parts))
+        return drawn if address is None else drawn.replace('role="img"', 'role="group"', 1)
+
+    def _repr_html_(self) -> str:
+        """Return the result as a notebook shows it."""
+        left = ' style="text-align:left"'
+        facts = "".join(
+            f"<tr><th{left}>{escape(name)}</th><td{left}>{escape(text)}</td></tr>"
+            for name, text in self.facts.items()
+        )
+        grid = self.grid
+        head = "".join(f"<th>{escape(heading)}</th>" for heading in grid.headings)
+        rows = "".join(
+            "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in grid.rows
+        )
+        notes = "".join(f"<p>{escape(note[0].upper() + note[1:])}.</p>" for note in self.notes)
+        return (
+            f'<table>{facts}</table><div style="display:flex;gap:1rem;max-width:60rem">'
+            f'<div style="flex:1">{self.picture()}</div><div style="flex:2">{self.matrix()}</div></div>'
+            f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>{notes}"
+        )
+
+
+def _short(value: float) -> str:
+    return number(value, 0 if value % 1 == 0 else 2)
+
+
+def _text(x: float, y: float, text: str, colour: str, anchor: str = "middle", bold: bool = False) -> str:
+    weight = ' font-weight="bold"' if bold else ""
+    return (
+        f'<text x="{x:g}" y="{y:g}" text-anchor="{anchor}" fill="{colour}" font-size="15" '
+        f'font-family="DejaVu Sans, sans-serif"{weight}>{escape(text)}</text>'
+    )

@@ -1,0 +1,96 @@
+"""Where other actions at a recorded step would have led."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query, Response
+from pydantic import BaseModel
+
+from runner.analysis.step_reference import EXPECTED, StepRef
+from runner.service import computed, fragments
+from runner.service.api.replay import STEPS, Part, Start, Steps
+from runner.service.dependencies import ComputationOf
+from runner.service.problems import error_docs
+
+router = APIRouter(
+    prefix="/runs/{run}/what-if",
+    tags=["reading"],
+    responses=error_docs(
+        HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT, HTTPStatus.SERVICE_UNAVAILABLE
+    ),
+)
+MAX_ACTIONS = 1000
+At = Annotated[str, Path(max_length=60, description=EXPECTED, examples=["eval:3000:17:5"])]
+ActionPath = Annotated[str, Path(max_length=200, description="A joint action: its number or its name.")]
+
+
+class Outcome(BaseModel):
+    """Where an episode led."""
+
+    returns: list[float]
+    """Of each learner."""
+    length: int
+    end: str
+
+
+class ActionOutcome(Outcome):
+    """Where an action leads, and what it is worth."""
+
+    action: int
+    name: str
+    is_recorded: bool
+    probability: float
+    """With which the policy takes it."""
+    learned: list[float]
+    """Its Q-value in each learner's table."""
+    values: list[float | None]
+    """Its exact value for each learner under the policy; null with a discount of 1."""
+    optimal_value: float | None
+    """Its exact value for all together if they act optimally from there on."""
+    regret: float | None
+    """By how much that is below the best action's."""
+
+
+class WhatIf(BaseModel):
+    """The actions at a step, and where each leads."""
+
+    run_id: str
+    at: str
+    title: str
+    state: int
+    state_in_words: str
+    tables_step: int
+    """Training steps that the tables have learned from."""
+    learners: list[str]
+    policy: str
+    epsilon: float
+    discount: float
+    recorded: Outcome
+    actions: list[ActionOutcome]
+    """Those of the highest value first."""
+    notes: list[str]
+
+
+@router.get("/{at}", response_model=WhatIf, summary="Where each joint action at a step leads.")
+async def what_if(
+    compute: ComputationOf,
+    at: At,
+    action: Annotated[
+        list[str] | None, Query(max_length=MAX_ACTIONS, description="Numbers or names; default: all.")
+    ] = None,
+) -> dict[str, Any]:
+    """Return what `dualtaxi branch --action all --json` prints; of a run that was trained here."""
+    step = StepRef.parse(at)
+    body = await compute(computed.where_actions_lead, step, tuple(action or ()))
+    return Response(body, media_type="application/json")  # type: ignore[return-value]
+
+
+@router.get("/{at}/{action}", response_model=Part, summary="A part of the episode to which an action leads.")
+async def branch(
+    compute: ComputationOf, at: At, action: ActionPath, start: Start = 0, steps: Steps = STEPS
+) -> Response:
+    """Return steps in the form of a replay: those recorded up to the step, then those played."""
+    body = await compute(fragments.branch_part, StepRef.parse(at), action, start, steps)
+    return Response(body, media_type="application/json")

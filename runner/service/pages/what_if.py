@@ -1,0 +1,108 @@
+"""The actions at a step of a recorded episode: where each leads, with the replay of one of them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import ClassVar
+
+from fastapi import APIRouter, Request, Response
+from starlette.concurrency import run_in_threadpool
+
+from runner.analysis.sections import Grid
+from runner.analysis.step_reference import StepRef
+from runner.service import fragments
+from runner.service.api.debugging import ActionPath, At
+from runner.service.api.replay import LONG, STEPS
+from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
+from runner.service.pages.frame import RunView, head_of
+from runner.service.pages.rendering import page
+from runner.service.pages.replay import BEFORE, ShownStep, T, shown_step
+
+router = APIRouter(prefix="/runs/{run}/what-if", include_in_schema=False)
+
+
+@dataclass(frozen=True)
+class _WhatIfView(RunView):
+    TEMPLATE: ClassVar = "run_what_if.html"
+    at: str
+    title: str
+    facts: dict[str, str]
+    notes: list[str]
+    name: str
+    """The action whose branch is shown."""
+    picture: str
+    """The grid in the state of the step, as SVG; empty without a scene."""
+    matrix: str
+    """The actions of two agents, as SVG; empty for other environments."""
+    grid: Grid
+    addresses: list[str]
+    """The page of each action's branch."""
+    step: ShownStep
+    source: str
+    """Address of the branch's data."""
+    recorded: str
+    """Address of the recorded episode at the step."""
+
+
+@router.get("/{at}")
+async def what_if(
+    request: Request, run: RecordedRun, cache: CacheOf, processes: ProcessesOf, at: At, t: T | None = None
+) -> Response:
+    """Show where each joint action leads, and the replay of the recorded one."""
+    return await _what_if(request, run, cache, processes, at, None, t)
+
+
+@router.get("/{at}/{action}")
+async def branch(
+    request: Request,
+    run: RecordedRun,
+    cache: CacheOf,
+    processes: ProcessesOf,
+    at: At,
+    action: ActionPath,
+    t: T | None = None,
+) -> Response:
+    """Show where each joint action leads, and the replay of one."""
+    return await _what_if(request, run, cache, processes, at, action, t)
+
+
+async def _what_if(
+    request: Request,
+    run: RecordedRun,
+    cache: CacheOf,
+    processes: ProcessesOf,
+    at: str,
+    action: str | None,
+    t: int | None,
+) -> Response:
+    step = StepRef.parse(at)
+    shown_t = step.t if t is None else t
+    start = max(0, shown_t - BEFORE)
+    key = ("what if", recording_state(run), step, action, start)
+    body = await cache.get_or_await(
+        key, lambda: processes(fragments.what_if_page, run, step, action, start, STEPS), LONG
+    )
+
+    def show() -> Response:
+        found = json.loads(body)
+        address = f"/runs/{run.run_id}/what-if/{step}"
+        view = _WhatIfView(
+            run=head_of(run),
+            here="replay",
+            at=str(step),
+            title=f"What if? {step.episode_name}, step {step.t:,}",
+            facts=found["facts"],
+            notes=found["notes"],
+            name=found["name"],
+            picture=found["picture"],
+            matrix=found["matrix"],
+            grid=Grid(**found["grid"]),
+            addresses=found["addresses"],
+            step=shown_step(found["part"], shown_t),
+            source=f"/api/v1{address}/{found['action']}",
+            recorded=f"/runs/{run.run_id}/replay/{step.episode_path}?t={step.t}",
+        )
+        return page(request, view)
+
+    return await run_in_threadpool(show)
