@@ -11,11 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from runner.util.arrays import Records
-
 if TYPE_CHECKING:
     import numpy as np
-from numpy.typing import NDArray
+    from numpy.typing import NDArray
+
+    from runner.util.arrays import Records
 
 Better = Literal["higher", "lower", "lower_to_goal", None]
 """Which values are better; `lower_to_goal` only where episodes have a goal, None where nobody can say."""
