@@ -80,7 +80,6 @@ STATES: Final = "states.parquet"
 ACTIONS: Final = "actions.parquet"
 METADATA: Final = "metadata.json"
 MANIFEST: Final = "manifest.json"
-ENVIRONMENT: Final = "environment.json"
 
 PHASES: Final = ("train", "eval")
 TEXT: Final = pa.dictionary(pa.int8(), pa.string())

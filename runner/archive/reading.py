@@ -28,7 +28,6 @@ from runner.util.files import open_regular
 
 MAX_DESCRIPTION_BYTES: Final = 64 << 20
 MAX_ROWS_A_GROUP: Final = 1 << 21
-_MAX_FOOTER_BYTES: Final = 32 << 20
 _UNPACKED_ANYWAY: Final = 1 << 30
 _ROW_BYTES: Final = 88
 """The size of a step in a recording."""

@@ -254,7 +254,8 @@ def _array_checks(mdp: Mdp) -> Iterator[tuple[str, bool, object]]:
     """Yield expectations of the arrays: their text, whether they hold, and the value found."""
     for name, kind in _DTYPES.items():
         array = getattr(mdp, name)
-        yield f"{name} must be an array of {np.dtype(kind)}", _is_array(array, kind), array
+        is_valid = isinstance(array, np.ndarray) and array.dtype == kind
+        yield f"{name} must be an array of {np.dtype(kind)}", is_valid, array
     shape, size = mdp.next_state.shape, sum(array.nbytes for array in mdp.arrays().values())
     limit = f"its arrays may take {MAX_ARRAYS_BYTES:,} bytes, to be recorded"
     yield limit, size <= MAX_ARRAYS_BYTES, f"{size:,}"
@@ -311,10 +312,6 @@ def _sums(probability: NDArray[np.float64]) -> str:
 
 def _distinct(names: tuple[object, ...]) -> bool:
     return all(map(is_text, names)) and len(set(names)) == len(names)
-
-
-def _is_array(array: object, kind: object) -> bool:
-    return isinstance(array, np.ndarray) and array.dtype == kind
 
 
 def _within(values: Array, low: int, high: int) -> bool:

@@ -122,7 +122,8 @@ def _resume(run: Run, accept_changes: bool, report: Report, stop: Stop) -> Run:
     path, contents = _place(run, described)
     changes = _changes(run)
     mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
-    changes |= _environment_changes(run, mdp)
+    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
+        changes |= differing_environment(recording, mdp)
     if not accept_changes:
         _refuse_changes(run, changes)
     learner = Learner(job.config, mdp, job.seed, _first_tables(job, run, mdp))
@@ -282,12 +283,6 @@ def _changes(run: Run) -> Differences:
     with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
         found = differing_provenance(recording.provenance)
         return {key: values for key, values in found.items() if key in DECISIVE}
-    return {}
-
-
-def _environment_changes(run: Run, mdp: Mdp) -> Differences:
-    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
-        return differing_environment(recording, mdp)
     return {}
 
 

@@ -189,7 +189,8 @@ class Session:
         for episode in self._boundaries():
             if not self._train(episode):
                 break
-            if self._snapshot_is_due(episode):
+            every = self._config.snapshots.every
+            if episode in (0, self._config.episodes) or (every and episode % every == 0):
                 self._snapshot()
             if not self._evaluate(episode):
                 break
@@ -288,10 +289,6 @@ class Session:
     @cached_property
     def _exact_evaluator(self) -> ExactEvaluator:
         return ExactEvaluator(self._learner.mdp, len(self._learner.agents))
-
-    def _snapshot_is_due(self, episode: int) -> bool:
-        every = self._config.snapshots.every
-        return episode in (0, self._config.episodes) or bool(every and episode % every == 0)
 
     def _snapshot(self) -> None:
         learner = self._learner

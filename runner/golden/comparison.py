@@ -63,14 +63,14 @@ def _in_words(difference: RunDiff) -> str:
     for section in sections(difference):
         if section.title in ("Runs", "Environment", "Training", "Evaluation"):
             lines += section.sentences
-    versions = [change for change in difference.provenance if not _is_circumstance(change.path)]
+    versions = [
+        change
+        for change in difference.provenance
+        if change.path not in _CIRCUMSTANCES and not change.path.endswith(".state")
+    ]
     for change in (*difference.environment.description, *versions)[:_MAX_CHANGES]:
         lines.append(f"  {change.path}: {change.a} in A, {change.b} in B")
     return "\n".join(lines)
-
-
-def _is_circumstance(path: str) -> bool:
-    return path in _CIRCUMSTANCES or path.endswith(".state")
 
 
 def record_environment(make: Callable[[], Any], episodes: int, max_steps: int, recordings: Path) -> Run:

@@ -67,7 +67,9 @@ class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
                     except ConfigError as error:
                         self._loop.leave_out(error)
             if self._has_messages:
-                self._record_messages(info, terminated or truncated)
+                if self._options.info:
+                    self._messages.info(self._phase, info)
+                self._record_frame(is_over=terminated or truncated)
         except Exception as error:
             self._loop.fail(error)
         return result
@@ -75,12 +77,6 @@ class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """Reset the environment, and record it: the seed, the options, the observation."""
         return self._recorded_reset(seed, options)
-
-    def _record_messages(self, info: Mapping[str, object], over: bool) -> None:
-        """Record info and frame of the step that was just put down, where the options include them."""
-        if self._options.info:
-            self._messages.info(self._phase, info)
-        self._record_frame(is_over=over)
 
 
 def record(

@@ -66,16 +66,16 @@ def first_differing_row(recorded: Array, got: Array, tolerance: float) -> int | 
         left, right = recorded[start : start + rows], got[start : start + rows]
         if left.tobytes() == right.tobytes():
             continue
-        differs = _beyond(left, right, tolerance) if tolerance else _other_bytes(left, right)
+        if tolerance:
+            differs = _beyond(left, right, tolerance)
+        else:
+            a, b = (
+                np.ascontiguousarray(each).view(np.uint8).reshape(len(left), -1) for each in (left, right)
+            )
+            differs = (a != b).any(axis=1)
         if differs.any():
             return start + int(np.argmax(differs))
     return None
-
-
-def _other_bytes(recorded: Array, got: Array) -> NDArray[np.bool_]:
-    n = len(recorded)
-    left, right = (np.ascontiguousarray(each).view(np.uint8).reshape(n, -1) for each in (recorded, got))
-    return np.asarray((left != right).any(axis=1))
 
 
 def _beyond(recorded: NDArray[Any], got: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:

@@ -139,19 +139,13 @@ def _target(recording: Recording, phase: str, number: int) -> _Target:
         RecordingError: there is no such episode, or it has no reset.
     """
     span, n = recording.episode_span(phase, number), recording.environments
-    stop_time = _time_of(recording, phase, number, span[-1])
+    ended = recording.episodes(phase, number, number + 1)
+    stop_time = int(ended["log_time"][0]) if len(ended) else _step_time(recording, phase, span[-1])
     for reset in _resets_back(recording, phase, stop_time):
         if reset.environment % n == span[0] % n and reset.step <= span[0]:
             others = n - 1 - reset.environment % n  # their steps follow at once
             return _Target(phase, number, reset.environment, reset, stop_time + others * STEP_NANOSECONDS)
     raise RecordingError(f"{recording.path}: {phase} episode {number} has no reset before it.")
-
-
-def _time_of(recording: Recording, phase: str, number: int, step: int) -> int:
-    """Return the `log_time` of the last step of an episode, which is that of its end if it ended."""
-    if len(ended := recording.episodes(phase, number, number + 1)):
-        return int(ended["log_time"][0])
-    return _step_time(recording, phase, step)
 
 
 def _step_time(recording: Recording, phase: str, step: int) -> int:

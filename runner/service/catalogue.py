@@ -62,7 +62,8 @@ class Catalogue:
         now = version()
         if now is None or not self._is_current(now):
             return None
-        self._scan_if_due()
+        if time.monotonic() - self._started > self._interval:
+            self._start_scan()
         return now
 
     def changed(self) -> None:
@@ -139,10 +140,6 @@ class Catalogue:
     @property
     def _interval(self) -> float:
         return min(max(MIN_INTERVAL, INTERVAL_FACTOR * self._duration), MAX_INTERVAL)
-
-    def _scan_if_due(self) -> None:
-        if time.monotonic() - self._started > self._interval:
-            self._start_scan()
 
     def _start_scan(self) -> Future[None]:
         """Return a scan that starts now, or one that runs and started after the last change."""
