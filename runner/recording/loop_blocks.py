@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -73,6 +73,22 @@ class Block:
         """Whether a segment continues an episode of the block before."""
 
 
+def aligned(
+    blocks: Iterable[NDArray[np.void]], n: int, stop: int | None = None
+) -> Iterator[tuple[NDArray[np.void], int]]:
+    """Yield steps, up to number `stop`, in blocks of as many of each of n environments, and how many wait."""
+    left: NDArray[np.void] | None = None
+    done = 0
+    for block in blocks:
+        rows = block if left is None or not len(left) else np.concatenate([left, block])
+        if stop is not None:
+            rows = rows[: max(stop - done, 0)]
+        whole = len(rows) - len(rows) % n
+        left = rows[whole:]
+        done += whole
+        yield rows[:whole], len(left)
+
+
 class Blocks:
     """The blocks of a phase, each of whole steps of all environments.
 
@@ -97,26 +113,15 @@ class Blocks:
         if not self._complete:  # the number of the step after the last recorded reset
             blocks = records_of(self._recording, f"/{self._phase}/reset")
             stop = max((int(block["step"][-1]) for block in blocks), default=0)
-        for rows in self._aligned(stop):
-            yield self._block(self.steps, rows)
-            self.steps += len(rows)
-
-    def _aligned(self, stop: int | None) -> Iterator[NDArray[np.void]]:
-        """Yield the steps up to number `stop`, as many of each environment in every block."""
-        left: NDArray[np.void] | None = None
-        done = 0
-        for block in self._steps:
-            rows = block if left is None or not len(left) else np.concatenate([left, block])
-            if stop is not None:
-                rows = rows[: max(stop - done, 0)]
-            whole = len(rows) - len(rows) % self._n
-            left = rows[whole:]
-            if whole:
-                yield rows[:whole]
-            done += whole
-        if left is not None and len(left) and self._complete:
+        left = 0
+        for rows, waiting in aligned(self._steps, self._n, stop):
+            left = waiting
+            if len(rows):
+                yield self._block(self.steps, rows)
+                self.steps += len(rows)
+        if left and self._complete:
             raise Inconsistent(
-                f"/{self._phase}/step: found {done + len(left)} steps, expected as many of each of the "
+                f"/{self._phase}/step: found {self.steps + left} steps, expected as many of each of the "
                 f"{self._n} environments"
             )
 

@@ -241,6 +241,15 @@ def log_level(number: int) -> str:
     return LOG_LEVELS[number] if number in range(len(LOG_LEVELS)) else LOG_LEVELS[0]
 
 
+def media_type(data: bytes) -> str | None:
+    """Return the media type of a picture; None if it is neither PNG, JPEG nor WebP."""
+    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "image/png"
+    if data.startswith(b"\xff\xd8\xff"):
+        return "image/jpeg"
+    return "image/webp" if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else None
+
+
 def encode_image(data: bytes, kind: str, position: int, frame_id: str) -> bytes:
     """Return a `foxglove.CompressedImage` logged after `position` steps; `kind` is `png` or `jpeg`."""
     seconds, nanos = divmod(position * STEP_NANOSECONDS, 10**9)

@@ -16,6 +16,7 @@ from runner.environments.gym_types import Value
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.actions import kept_dtype
+from runner.recording.loop_blocks import aligned
 from runner.recording.reader import Recording
 from runner.recording.reset_states import ResetState
 from runner.recording.schema import STEP_NANOSECONDS
@@ -211,7 +212,8 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
     n = recording.environments
     resets = resets_of(recording, phase, start_time, None if stop_time is None else stop_time - 1)
     waiting = next(resets, None)
-    rows = _aligned(_blocks(recording, phase, start_time, stop_time), n)
+    blocks = aligned(_blocks(recording, phase, start_time, stop_time), n)
+    rows = (block for block, _ in blocks if len(block))
     if "content_digest" not in recording.result:
         stop = recording.whole_steps(phase)
         rows = (whole for block in rows if len(whole := block[block["step"] < stop]))
@@ -336,17 +338,6 @@ def _row_dtype(recording: Recording, phase: str) -> np.dtype[np.void]:
     kinds |= {"action": "O", "next_observation": "O"}
     names = [field.name for field in topic.message.fields]
     return np.dtype([*((name, kinds.get(name, "i8")) for name in names), ("log_time", "u8")])
-
-
-def _aligned(blocks: Iterator[NDArray[np.void]], n: int) -> Iterator[NDArray[np.void]]:
-    """Yield the same steps in blocks that hold as many of each of the n environments."""
-    left: NDArray[np.void] | None = None
-    for block in blocks:
-        rows = block if left is None or not len(left) else np.concatenate([left, block])
-        whole = len(rows) - len(rows) % n
-        left = rows[whole:]
-        if whole:
-            yield rows[:whole]
 
 
 def ended_episode(recording: Recording, phase: str, environment: int, step: int) -> int | None:

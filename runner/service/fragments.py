@@ -55,6 +55,7 @@ from runner.recording import schema
 from runner.recording.clock import read_clock
 from runner.recording.console import read_console
 from runner.recording.host import read_host
+from runner.recording.messages import media_type
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.addresses import link, places_in
@@ -265,9 +266,9 @@ def pictures(path: Path) -> bytes:
     figures = [
         Markup(
             '<figure><img src="data:{};base64,{}" alt=""><figcaption>{}, step {:,}</figcaption></figure>'
-        ).format(media_type, base64.b64encode(data).decode(), name, step)
+        ).format(kind, base64.b64encode(data).decode(), name, step)
         for name, step, data in reversed(last)
-        if (media_type := _media_type(data))
+        if (kind := media_type(data))
     ]
     texts = ["No picture was logged."] if not total else []
     if len(figures) < total:
@@ -275,15 +276,6 @@ def pictures(path: Path) -> bytes:
     return str(
         partials().paragraphs(texts) + Markup('<div class="logged">{}</div>').format(Markup().join(figures))
     ).encode()
-
-
-def _media_type(data: bytes) -> str | None:
-    """Return the media type of a picture; None if it is none that browsers show."""
-    if data.startswith(b"\x89PNG\r\n\x1a\n"):
-        return "image/png"
-    if data.startswith(b"\xff\xd8\xff"):
-        return "image/jpeg"
-    return "image/webp" if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else None
 
 
 def console(path: Path, sought: str, stream: str) -> bytes:

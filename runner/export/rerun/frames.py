@@ -16,7 +16,7 @@ from runner.export.painting import EnvironmentDiffers, redrawn
 from runner.export.pictures import Source, source_of
 from runner.export.rerun.members import entity_name
 from runner.export.rerun.selection import MAX_MEMBERS
-from runner.recording.messages import frame_place
+from runner.recording.messages import frame_place, media_type
 from runner.recording.reader import Recording
 from runner.recording.schema import IMAGE_TOPIC, STEP_NANOSECONDS
 from runner.replay.steps import environment_of, frames_every, log_times_of
@@ -55,7 +55,7 @@ class FrameSender:
         """Send the pictures that were logged under a name; of a film its first frame."""
         for image in self._recording.decoded(IMAGE_TOPIC):
             name, data = entity_name(image["frame_id"]), image["data"]
-            if (kind := _media_type(data)) is None:
+            if (kind := media_type(data)) not in ("image/png", "image/jpeg"):
                 data, kind = _first_frame(data), "image/png"
             if data:
                 self._logged[name] = None
@@ -104,7 +104,7 @@ class FrameSender:
         if not is_each_step or sent.get(environment, -1) < step:
             sent[environment] = step
             self._stream.set_time("step", sequence=step)
-            image = rr.EncodedImage(contents=data, media_type=_media_type(data) or "image/jpeg")
+            image = rr.EncodedImage(contents=data, media_type=media_type(data) or "image/jpeg")
             self._stream.log(self._entity(phase, environment), image)
 
     def views(self) -> list[rrb.Container]:
@@ -130,13 +130,6 @@ class FrameSender:
 
     def _entity(self, phase: str, environment: int) -> str:
         return "/".join([self._root, phase, *filter(None, [self._names[environment]]), "frame"])
-
-
-def _media_type(data: bytes) -> str | None:
-    """Return the media type of a picture if Rerun shows it."""
-    if data.startswith(b"\x89PNG"):
-        return "image/png"
-    return "image/jpeg" if data.startswith(b"\xff\xd8") else None
 
 
 def _first_frame(data: bytes) -> bytes:
