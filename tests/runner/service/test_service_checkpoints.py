@@ -7,28 +7,14 @@ import httpx2
 import pytest
 from blake3 import blake3
 from click.testing import CliRunner
-from served import Served
 
 import runner
 from runner.cli import cli
 from runner.client.client import Client
 from runner.client.connection import ServerError
-from runner.client.outbox import outbox_folder
 from runner.runs.store import Store
 
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    with Served(tmp_path_factory.mktemp("server") / "runs") as started:
-        yield started
-
-
-@pytest.fixture(autouse=True)
-def outbox(tmp_path, monkeypatch):
-    for name in ("DUALTAXI_TOKEN", "DUALTAXI_TOKEN_FILE", "DUALTAXI_SERVER"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    return outbox_folder()
+pytestmark = pytest.mark.usefixtures("outbox")
 
 
 def record_loop(recordings, name):

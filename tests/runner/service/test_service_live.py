@@ -12,7 +12,7 @@ import gymnasium
 import httpx2
 import pytest
 from selenium.webdriver.common.by import By
-from served import Served, wait
+from served import wait
 
 import runner
 from runner.errors import RunnerError
@@ -23,12 +23,6 @@ from runner.runs.run import RUN_FILE
 from tests.runner.loops.making import make, play
 from tests.runner.service.test_service_upload_routes import PIECE, UPLOADS, complete, message, patch
 from tests.waiting import until
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    with Served(tmp_path_factory.mktemp("server") / "runs") as started:
-        yield started
 
 
 @pytest.fixture(autouse=True)
