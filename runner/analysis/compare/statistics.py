@@ -141,6 +141,22 @@ def stratified(
     return value, ends[0], ends[1]
 
 
+def bootstrap_means(values: Values) -> list[Estimate]:
+    """Return the mean of each row, and its percentile bootstrap interval; all rows are resampled alike.
+
+    Args:
+        values: of the same seeds in each row, [rows, seeds]; of one seed the interval is nan.
+    """
+    n = values.shape[1]
+    low = high = np.full(len(values), np.nan)
+    if n > 1:
+        drawn = np.random.default_rng(_SEED).integers(n, size=(RESAMPLES, n))
+        weights = np.array([np.bincount(row, minlength=n) for row in drawn], np.float64) / n
+        low, high = np.quantile(weights @ values.T, _TAILS, axis=0)
+    rows = zip(values.mean(axis=1).tolist(), low.tolist(), high.tolist(), strict=True)
+    return [Estimate(*row) for row in rows]
+
+
 def improvement(a: Values, b: Values) -> Estimate:
     """Return the probability that a run of A has a higher value than one of B; equal ones count half.
 
