@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import runner.integrations as integrations  # noqa: PLR0402
     from runner.api import run, run_all
     from runner.config import ExperimentConfig
+    from runner.debugging.branch import branch
     from runner.debugging.explain import explain
     from runner.debugging.what_if import what_if
     from runner.debugging.when import when
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from runner.execution.resume import resume
     from runner.execution.verify import verify
     from runner.loops.batches import record_batches
-    from runner.loops.branch import branch
     from runner.loops.env import record
     from runner.loops.parallel import record_aec, record_parallel
     from runner.loops.vector import record_vector
@@ -78,7 +78,7 @@ _HOME = {
     "Recording": "runner.recording.reader",
     "Run": "runner.runs.run",
     "RunnerError": "runner.errors",
-    "branch": "runner.loops.branch",
+    "branch": "runner.debugging.branch",
     "evaluate": "runner.execution.rerecord",
     "explain": "runner.debugging.explain",
     "find_run": "runner.runs.resolve",

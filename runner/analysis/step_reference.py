@@ -10,9 +10,14 @@ from __future__ import annotations
 import dataclasses
 import re
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
-from runner.errors import RunnerError
+from runner.errors import RecordingError, RunnerError
+from runner.recording import schema
+from runner.replay.steps import step_of_episode
+
+if TYPE_CHECKING:
+    from runner.recording.reader import Recording
 
 EXPECTED: Final = "EPISODE:T such as 120:5, or eval:N:TRIAL:T; a TRIAL or T that is left out is 0"
 _NUMBER: Final = "([0-9]{1,15})"
@@ -73,3 +78,55 @@ class StepRef:
     def replay_address(self, run_id: str) -> str:
         """Return the page of the replay of a run at the frame after the step."""
         return f"/runs/{run_id}/replay/{self.episode_path}?t={self.outcome.t}"
+
+
+def parse_step(text: str) -> int | StepRef:
+    """Return the step that a text refers to; a number alone is a training step, counted over the run.
+
+    Raises:
+        RunnerError: the text is no step reference.
+    """
+    return int(text) if text.isascii() and text.isdecimal() and len(text) < 16 else StepRef.parse(text)
+
+
+def training_steps(recording: Recording) -> int:
+    """Return the number of training steps of a job, also if they were not recorded."""
+    ended = step_of_episode(recording, recording.count(schema.TRAIN_EPISODE))
+    return max(recording.done()["train_steps"], ended)
+
+
+def training_step(recording: Recording, at: int | StepRef) -> int:
+    """Return the number of a training step of a job, also of one that recorded no steps.
+
+    Raises:
+        RecordingError: there is no such step.
+        RunnerError: the reference is to a step of an evaluation.
+    """
+    taken = training_steps(recording)
+    if isinstance(at, int):
+        if not 0 <= at < taken:
+            raise RecordingError(
+                f"{recording.path}: found no training step {at:,}; there are {taken:,}, from 0."
+            )
+        return at
+    if at.after is not None:
+        raise RunnerError(f"found {at}, expected a step of training: EPISODE:T, or its number alone.")
+    ended = recording.count(schema.TRAIN_EPISODE)
+    start = step_of_episode(recording, min(at.episode, ended))
+    stop = taken if at.episode >= ended else step_of_episode(recording, at.episode + 1)
+    if at.episode > ended or start == stop:
+        raise RecordingError(
+            f"{recording.path}: found no training episode {at.episode:,}; there are {ended:,}, from 0."
+        )
+    if start + at.t >= stop:
+        raise RecordingError(
+            f"{recording.path}: found no step {at.t:,} of training episode {at.episode:,}, which has "
+            f"{stop - start:,}, from 0."
+        )
+    return start + at.t
+
+
+def reference_to(recording: Recording, step: int) -> StepRef:
+    """Return the reference to a training step of a job, by its episode and its place in it."""
+    episode = recording.first_from(schema.TRAIN_EPISODE, "last_step", step)
+    return StepRef(episode, step - step_of_episode(recording, episode))

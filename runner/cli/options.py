@@ -173,6 +173,12 @@ def _step(text: str) -> StepRef:
     return StepRef.parse(text)
 
 
+def _place(text: str) -> int | StepRef:
+    from runner.analysis.step_reference import parse_step
+
+    return parse_step(text)
+
+
 def _target(text: str) -> tuple[str, float]:
     from runner.analysis.series import parse_target  # loads NumPy
 
@@ -202,6 +208,7 @@ GRID: Final = Parsed("RxC", "ROWSxCOLUMNS up to 8x8, such as 3x3", lambda text: 
 TARGET: Final = Parsed("METRIC=LEVEL", "METRIC=LEVEL such as success_percent=80", _target)
 AXIS: Final = Parsed("axis", "episodes, steps, updates or time", _axis)
 STEP: Final = Parsed("step", "EPISODE:T, or eval:N:TRIAL:T", _step)
+PLACE: Final = Parsed("step", "EPISODE:T, the number of a training step, or eval:N:TRIAL:T", _place)
 DIRECTORY: Final = click.Path(file_okay=False, path_type=Path)
 FILE: Final = click.Path(dir_okay=False, path_type=Path)
 COUNT: Final = click.IntRange(1)

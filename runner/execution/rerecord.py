@@ -159,6 +159,7 @@ def evaluation_of(
             "start": "each" if trials is None else start,
         },
         snapshots={"every": None},
+        branches=[],
         recording=original.to_mapping()["recording"] | {"steps": "all"},
     )
 

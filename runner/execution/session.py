@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Any, Final, Protocol
@@ -18,7 +18,7 @@ from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.errors import Diverged, RunnerError, StorageError, truncated_message
 from runner.execution.initial_tables import configured_tables, resolve_job
-from runner.learning.learner import Learner
+from runner.learning.learner import Held, Learner
 from runner.planning import ExactEvaluator
 from runner.recording import schema
 from runner.recording.messages import QTable, encode, encode_log, encode_q_table
@@ -83,6 +83,7 @@ def run_job(
     observer: Observer | None = None,
     mdp: Mdp | None = None,
     threads: bool = True,
+    initial: Sequence[Held] | None = None,
 ) -> Run:
     """Train, evaluate and record a job; return its run, finished or interrupted.
 
@@ -95,6 +96,7 @@ def run_job(
         observer: sees every step and metric as they come.
         mdp: the job's environment, if it is loaded already.
         threads: False records in the learning thread: quicker if it has one processor to itself.
+        initial: the tables to begin with instead of those that the configuration names.
 
     Raises:
         RunnerError: the environment cannot be used, or the disk is full; the run is then marked failed.
@@ -103,8 +105,10 @@ def run_job(
     code = CodeCollector(run.folder.parent, job.config.recording.code)
     with _failing(run):
         mdp = mdp or load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
-        job, run = resolve_job(job, run)
-        learner = Learner(job.config, mdp, job.seed, configured_tables(job, run, mdp))
+        if initial is None:
+            job, run = resolve_job(job, run)
+            initial = configured_tables(job, run, mdp)
+        learner = Learner(job.config, mdp, job.seed, initial)
         file = create_recording(run.folder / runs.RECORDING_FILE)
     with file:
         with _failing(run):

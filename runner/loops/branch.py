@@ -85,7 +85,7 @@ class _Task:
     """Where the module of a policy is looked for."""
 
 
-def branch(
+def branch_episode(
     run: Run,
     *,
     at: str | StepRef,

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from runner.util.values import is_whole
+from runner.util.values import flatten, is_whole
 
-ORIGIN: Final = "config.origin."
-"""What the paths of its fields in a configuration begin with."""
+PATHS: Final = ("config.origin.", "branches")
+"""What the paths of origins in configurations begin with."""
 _MAX_NUMBER: Final = 2**62
 
 
@@ -42,15 +42,50 @@ class BranchOrigin:
         return f"at {self.at}, action {self.action}{named}, then {self.policy}"
 
 
-def origin_in(config: Mapping[str, object]) -> BranchOrigin | None:
+@dataclass(frozen=True)
+class TrainingOrigin:
+    """The run and the step that the training of a run was branched from, and what was changed there."""
+
+    run: str
+    """The run id of the parent."""
+    step: int
+    """The first training step that may differ."""
+    actions: Mapping[str, str]
+    """Agent to the action that it took at this step, where that was set."""
+    settings: Mapping[str, object]
+    """The settings that changed from this step on, as the configuration has them."""
+
+    def __str__(self) -> str:
+        """Describe the branch: `at training step 4,000,000: taxi 1 north, epsilon 0.1`."""
+        changes = [f"{agent.replace('_', ' ')} {action}" for agent, action in self.actions.items()]
+        changes += [f"{path} {value}" for path, value in flatten(self.settings).items()]
+        return f"at training step {self.step:,}: {', '.join(changes) or 'nothing changed'}"
+
+
+Origin = BranchOrigin | TrainingOrigin
+
+
+def training_branches(config: Mapping[str, object]) -> list[TrainingOrigin]:
+    """Return the branches that led to the job with this configuration, the first one first."""
+    branches = config.get("branches")
+    found = map(parse_origin, branches) if isinstance(branches, list) else ()
+    return [origin for origin in found if isinstance(origin, TrainingOrigin)]
+
+
+def origin_in(config: Mapping[str, object]) -> Origin | None:
     """Return what the run with this configuration was branched from; None if it is no branch."""
+    if branches := training_branches(config):
+        return branches[-1]
     settings = config.get("config")
-    found = settings.get("origin") if isinstance(settings, Mapping) else None
-    return parse_origin(found) if isinstance(found, Mapping) else None
+    return parse_origin(settings.get("origin")) if isinstance(settings, Mapping) else None
 
 
-def parse_origin(found: Mapping[str, Any]) -> BranchOrigin | None:
+def parse_origin(found: object) -> Origin | None:
     """Return the origin with these fields, among others; None if one is missing or of another type."""
+    if not isinstance(found, Mapping):
+        return None
+    if "phase" not in found:
+        return _parse_training(found)
     values: dict[str, Any] = {name: found.get(name) for name in BranchOrigin.__dataclass_fields__}
     are_numbers = all(is_whole(values[name], 0, _MAX_NUMBER) for name in ("episode", "t", "seed"))
     values["action_name"] = found.get("action_name", "")
@@ -60,3 +95,32 @@ def parse_origin(found: Mapping[str, Any]) -> BranchOrigin | None:
     return (
         BranchOrigin(**values) if are_numbers and are_texts and values["phase"] in ("train", "eval") else None
     )
+
+
+def _parse_training(found: Mapping[str, object]) -> TrainingOrigin | None:
+    run, step = found.get("run"), found.get("step")
+    actions, settings = found.get("actions", {}), found.get("settings", {})
+    if not (isinstance(run, str) and is_whole(step, 0, _MAX_NUMBER)):
+        return None
+    if not (isinstance(actions, Mapping) and isinstance(settings, Mapping)):
+        return None
+    return TrainingOrigin(run, step, {str(agent): str(action) for agent, action in actions.items()}, settings)
+
+
+@dataclass(frozen=True)
+class BranchNode:
+    """A run in the tree of branches that it belongs to."""
+
+    run: str
+    """Its run id."""
+    name: str | None
+    """None if the run was removed, or is in another folder."""
+    status: str
+    success_percent: float | None
+    """Of its last evaluation."""
+    mean_return: float | None
+    """Of its last evaluation; of a loop without one, of its last training episodes."""
+    origin: Origin | None
+    """What it was branched from."""
+    branches: tuple[BranchNode, ...]
+    """The oldest first."""

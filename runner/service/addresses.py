@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from urllib.parse import urlencode
 
 from runner.analysis.step_reference import StepRef
-from runner.runs.branches import origin_in
+from runner.runs.branches import BranchOrigin, origin_in
 from runner.runs.run import Run
 
 
@@ -52,10 +52,10 @@ def link(path: str, values: Mapping[str, object]) -> str:
 
 
 def places_in(runs: Sequence[Run], step: StepRef) -> list[StepRef]:
-    """Return the step in each of two runs: a branch has its parent's episode as its only one."""
+    """Return the step in each of two runs: a branch of a loop has its parent's episode as its only one."""
     alone = StepRef(0, step.t, None if step.after is None else 0)
     origins = [origin_in(run.file.config) for run in runs]
     return [
-        step if origin is None or origin.run != other.run_id else alone
+        alone if isinstance(origin, BranchOrigin) and origin.run == other.run_id else step
         for origin, other in zip(origins, reversed(runs), strict=True)
     ]

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, TypedDict
 
-from runner.analysis.diff.causes import Cause, Row, find_cause, find_kind
+from runner.analysis.diff.causes import Cause, Row, branch_relation, find_cause, find_kind, with_branch
 from runner.analysis.diff.code import FileChange, code_changes
 from runner.analysis.diff.divergence import (
     Divergence,
@@ -37,7 +37,7 @@ from runner.analysis.diff.settings import (
 from runner.analysis.diff.tables import Cell, TableDiff, table_diffs
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.runs.branches import BranchOrigin, origin_in
+from runner.runs.branches import BranchOrigin, origin_in, training_branches
 from runner.runs.run import Run
 
 __all__ = [
@@ -142,7 +142,7 @@ def diff(
     for branch, parent, names in ((b, a, "B is a branch of A"), (a, b, "A is a branch of B")):
         origin = origin_in(branch.config)
         if (
-            origin is not None
+            isinstance(origin, BranchOrigin)
             and origin.run == parent.run_id
             and have_same_spaces(a, b)
             and a.kind != "variable"
@@ -158,10 +158,13 @@ def _diff_jobs(
     difference = replace(difference, notes=_notes(a, b))
     if difference.same_content:
         return difference
-    visits = None
+    visits, relation = None, branch_relation(a, b)
     if can_compare_steps(a, b):
         divergence = training_divergence(a, b)
-        cause = None if divergence is None else (find_kind if first else find_cause)(divergence, a, b)
+        cause = None
+        if divergence is not None:
+            cause = (find_kind if first else find_cause)(divergence, a, b)
+            cause = with_branch(cause, divergence, relation)
         difference = replace(difference, divergence=divergence, cause=cause)
         if not first:
             overlap, (visits_a, visits_b) = training_overlap(a, b)
@@ -171,6 +174,8 @@ def _diff_jobs(
             if (found := next(evaluation_divergences(a, b), None)) is not None:
                 why = find_cause(found, a, b, known)
                 difference = replace(difference, evaluation_divergence=found, evaluation_cause=why)
+    if relation is not None and difference.divergence is None:
+        difference.notes.append(relation.text)
     if first:
         return difference
     tables = list(table_diffs(a, b, visits)) if _same_sizes(a, b) else []
@@ -308,8 +313,11 @@ def _values_by_path(
     jobs = a.has_tables and b.has_tables
     values = {
         "config": [
-            {key: value for key, value in one.config.items() if key != "seeds"} | {"seed": one.seed}
+            {key: value for key, value in one.config.items() if key != "seeds"}
+            | {"seed": one.seed}
+            | ({"branches": [f"{each.run} {each}" for each in branches]} if branches else {})
             for one in (a, b)
+            for branches in [training_branches(one.config)]
         ],
         "provenance": [one.provenance for one in (a, b)],
         "costs": [_costs(one) | ({} if jobs else loop_means(one)) for one in (a, b)],

@@ -20,6 +20,7 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.steps import check_steps
+from runner.runs.branches import training_branches
 
 if TYPE_CHECKING:
     from runner.analysis.diff.updates import Update
@@ -49,6 +50,44 @@ class Cause:
     rows: list[Row] = field(default_factory=list)
     """The Q-values of each agent in the state in which the greedy actions differ."""
     update: Update | None = None
+
+
+class BranchRelation(NamedTuple):
+    """How two jobs are related by branches."""
+
+    step: int
+    """The first training step at which either was changed and the other was not."""
+    sets_actions: bool
+    """Whether an action was set at this step."""
+    text: str
+
+
+def branch_relation(a: Recording, b: Recording) -> BranchRelation | None:
+    """Return how two jobs are related, if one is a branch of the other, or both of a third one."""
+    ours, theirs = training_branches(a.config), training_branches(b.config)
+    while ours and theirs and ours[0] == theirs[0]:
+        ours, theirs = ours[1:], theirs[1:]
+    lines = [", then ".join(map(str, line)) for line in (ours, theirs)]
+    if ours and theirs and ours[0].run == theirs[0].run:
+        text = f"Both are branches of run {ours[0].run}: A {lines[0]}, B {lines[1]}"
+    elif theirs and not ours and theirs[0].run == a.run_id:
+        text = f"B is a branch of A, {lines[1]}"
+    elif ours and not theirs and ours[0].run == b.run_id:
+        text = f"A is a branch of B, {lines[0]}"
+    else:
+        return None
+    step = min(origin.step for origin in (*ours, *theirs))
+    return BranchRelation(step, any(one.actions for one in (*ours, *theirs) if one.step == step), text)
+
+
+def with_branch(cause: Cause, divergence: Divergence, relation: BranchRelation | None) -> Cause:
+    """Return the cause of a divergence of training with the branch that explains it, if one does."""
+    if relation is None or divergence.step < relation.step:
+        return cause  # something else differs before
+    text = f"{relation.text}; training is the same for {divergence.step:,} steps"
+    if divergence.step > relation.step or not relation.sets_actions:
+        text = f"{text}, then {cause.text}"
+    return replace(cause, kind="branch", text=text)
 
 
 class _Side(NamedTuple):

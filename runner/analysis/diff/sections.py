@@ -12,7 +12,7 @@ from runner.analysis.diff.settings import changes_in
 from runner.analysis.sections import Grid, Section
 from runner.environments.naming import spoken
 from runner.recording.reader import Recording
-from runner.runs.branches import ORIGIN
+from runner.runs.branches import PATHS
 from runner.util.humanize import UNKNOWN
 
 _MAX_SETTINGS: Final = 4
@@ -74,7 +74,7 @@ def summary(difference: RunDiff) -> str:
     settings = [
         change
         for change in difference.config
-        if change.path.split(".")[0] not in NOT_CONTENT and not (is_branch and change.path.startswith(ORIGIN))
+        if change.path.split(".")[0] not in NOT_CONTENT and not (is_branch and change.path.startswith(PATHS))
     ]
     if settings:
         values = [("not set" if c.a is None else c.a, "not set" if c.b is None else c.b) for c in settings]

@@ -137,8 +137,8 @@ def _describe_update(a: Recording, b: Recording, step: int, replays: Sequence[Ta
 
 def _reasons(a: Recording, b: Recording, records: Sequence[np.void]) -> list[str]:
     """Return descriptions of the inputs of an update that differ."""
-    configs = [from_mapping(recording.config) for recording in (a, b)]
     episode, step = int(records[0]["episode"]), int(records[0]["step"])
+    configs = [from_mapping(recording.config).from_step(step) for recording in (a, b)]
     reasons = []
     rewards = [record["rewards"].tolist() for record in records]
     if rewards[0] != rewards[1]:

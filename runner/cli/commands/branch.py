@@ -1,113 +1,178 @@
-"""`dualtaxi branch`: take another action at a recorded step, and see where it leads."""
+"""`dualtaxi branch`: change a recorded step, and see where that leads."""
 
 from __future__ import annotations
 
+import contextlib
+import signal
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from runner.cli import Command
-from runner.cli.options import COUNT, INDEX, STEP, json_option, recordings_option, run_argument, trust_option
-from runner.cli.output import draw, facts, print_json, table
+from runner.cli.options import (
+    COUNT,
+    INDEX,
+    PLACE,
+    json_option,
+    recordings_option,
+    run_argument,
+    set_option,
+    trust_option,
+)
+from runner.cli.output import draw, facts, print_json, say, table
 from runner.cli.progress import steps_line
-from runner.cli.runs import find_recorded, run_facts
+from runner.cli.runs import command_for, compilation_notice, find_recorded, run_as_json, run_facts
+from runner.errors import ExitCode
 from runner.util.humanize import number
 
 if TYPE_CHECKING:
     from runner.analysis.step_reference import StepRef
+    from runner.execution.branching import TrainingBranch
+    from runner.loops.branch import Branch
+    from runner.runs.run import Run
 
 
 @click.command("branch", cls=Command)
 @run_argument
 @click.option(
     "--at",
-    type=STEP,
+    type=PLACE,
     metavar="STEP",
-    help="The step: EPISODE:T of training, or eval:N:TRIAL:T of an evaluation.",
+    help="The step: EPISODE:T, or a training step's number; eval:N:TRIAL:T of an evaluation.",
 )
 @click.option(
     "--action",
     "actions",
     multiple=True,
     metavar="VALUE",
-    help="The action there; of a game AGENT=VALUE, may be repeated.  [default: the recorded one]",
+    help="The action there; of one of several agents AGENT=VALUE, may be repeated.  [default: as recorded]",
+)
+@set_option
+@click.option(
+    "--episodes", type=COUNT, metavar="N", help="Training episodes in all.  [default: as many as RUN]"
 )
 @click.option(
     "--policy",
     default="recorded",
     show_default=True,
     metavar="recorded|random|constant|MODULE:FUNCTION",
-    help="What acts after it.",
+    help="Of a loop: what acts after the step.",
 )
-@click.option("--seed", type=INDEX, default=0, show_default=True, help="Seed of the random policy.")
+@click.option(
+    "--seed", type=INDEX, default=0, show_default=True, help="Of a loop: seed of the random policy."
+)
 @click.option("--name", help="Name of the new run.  [default: RUN.branch]")
 @click.option(
-    "--max-steps", type=COUNT, default=100_000, show_default=True, metavar="N", help="Stop after N steps."
+    "--max-steps",
+    type=COUNT,
+    default=100_000,
+    show_default=True,
+    metavar="N",
+    help="Of a loop: stop after N steps.",
 )
 @trust_option
 @recordings_option
 @json_option
+@click.pass_context
 def branch_command(
+    ctx: click.Context,
+    /,
     run_name: str,
-    at: StepRef | None,
+    at: int | StepRef | None,
     actions: tuple[str, ...],
-    policy: str,
-    seed: int,
-    name: str | None,
-    max_steps: int,
-    trust: bool,
-    recordings: Path | None,
     as_json: bool,
+    **options: Any,
 ) -> None:
-    """Take another action at a step of an episode of RUN, a loop, and play on to the end of the episode.
+    """Change one step of RUN, and record what follows as a run of its own, with the same luck.
 
-    The environment is made again and brought to the step by the recorded reset and actions, compared with the
-    recording on the way, so that its luck is the same too. The branch is recorded as a run of its own.
+    A run that was trained here is trained again, the same up to the step: there agents take other actions, or
+    from there on settings are others (--set: step size, discount, epsilon, exploration, quirks and the
+    parameters of the algorithm), and every draw that this does not touch stays the same. The branch can be
+    verified, resumed, compared and branched as every run.
 
-    An action is a number or a name, numbers separated by commas, or JSON where the space is a Dict or Tuple.
-    After it act the recorded actions, until they run out; random ones; the same action again and again; or a
-    function of yours, from an observation to an action.
+    With --action all, and of a trial of an evaluation, nothing is trained: the episode is played on from the
+    step with each joint action, or those that are named, by the tables of that moment.
+
+    Of a loop, an episode is played on from the step. Its environment is made again and brought there by the
+    recorded reset and actions, compared with the recording on the way. Then the recorded actions act, until
+    they run out; random ones; the same action again and again; or a function of yours, from an observation
+    to an action. An action is a number or a name, numbers separated by commas, or JSON where the space is a
+    Dict or Tuple.
 
     Examples:
+      dualtaxi branch cooperative --at 120:5 --action taxi_1=north
+      dualtaxi branch cooperative --at 400000 --set epsilon=0.3 --name curious
+      dualtaxi branch cooperative --at eval:3000:7:5 --action all
       dualtaxi branch cartpole --at 12:40 --action 1
       dualtaxi branch taxi --at eval:3000:7:5 --action north --policy random --seed 3
       dualtaxi branch lander --at 4:100 --action 0.5,-0.2 --policy agent:act
       dualtaxi branch spread --at 0:10 --action agent_0=1 --action agent_2=4
     """
-    run = find_recorded(run_name, recordings)
-    if at is None:
-        raise click.UsageError("expected --at EPISODE:T or --at eval:N:TRIAL:T, the step to branch at")
-    if run.can_train_again:
-        from runner.cli.what_if import print_what_if
+    from runner.api import interruptible
+    from runner.debugging.branch import branch
+    from runner.execution.branching import TrainingBranch
 
+    run = find_recorded(run_name, options["recordings"])
+    if at is None:
+        raise click.UsageError("expected --at EPISODE:T, the step to branch at")
+    if run.can_train_again and ("all" in actions or (not isinstance(at, int) and at.after is not None)):
+        from runner.analysis.step_reference import reference_to
+        from runner.cli.what_if import print_what_if
+        from runner.recording.reader import open_recording
+
+        if isinstance(at, int):
+            with open_recording(run.recording) as recording:
+                at = reference_to(recording, at)
         print_what_if(run, at, actions, as_json)
         return
-    from runner.loops.branch import Outcome, branch
+    action = _action(actions, run)
+    with contextlib.ExitStack() as stack:
+        report = stack.enter_context(steps_line("training" if run.can_train_again else "branching"))
+        if run.can_train_again:
+            stack.enter_context(compilation_notice())
+            options["stop"] = stack.enter_context(interruptible(second=signal.SIG_DFL))
+        found = branch(run, at=at, action=action, report=report, **options)
+    if isinstance(found, TrainingBranch):
+        _print_training(ctx, run, found, as_json)
+    else:
+        _print_episode(run, found, as_json)
 
-    action: Any = actions[0] if len(actions) == 1 else None
+
+def _action(actions: tuple[str, ...], run: Run) -> Any:
+    """Return the action that the options give: of one agent or all, or of some by their names."""
+    pairs = [text.partition("=") for text in actions]
+    if actions and all(equals for _, equals, _ in pairs) and (run.can_train_again or len(actions) > 1):
+        return {agent: value for agent, _, value in pairs}
     if len(actions) > 1:
-        pairs = [text.partition("=") for text in actions]
-        if not all(equals for _, equals, _ in pairs):
-            raise click.UsageError("--action: several are for the agents of a game: AGENT=VALUE each.")
-        action = {agent: value for agent, _, value in pairs}
-    with steps_line("branching") as report:
-        found = branch(
-            run,
-            at=at,
-            action=action,
-            policy=policy,
-            seed=seed,
-            name=name,
-            recordings=recordings,
-            max_steps=max_steps,
-            trust=trust,
-            report=report,
-        )
+        raise click.UsageError("--action: several are for the agents of a game: AGENT=VALUE each.")
+    return actions[0] if actions else None
+
+
+def _print_training(ctx: click.Context, parent: Run, branch: TrainingBranch, as_json: bool) -> None:
+    run = branch.run
     if as_json:
-        outcomes = {"parent": asdict(found.parent), "branch": asdict(found.outcome)}
-        print_json({"run_id": found.run.run_id, "origin": asdict(found.origin)} | outcomes)
+        print_json(run_as_json(run) | {"origin": asdict(branch.origin), "at": str(branch.at)})
+    else:
+        results = [each.summary.last_evaluation for each in (parent, run)]
+        success = [None if each is None else each.values.get("success_percent") for each in results]
+        rows = run_facts(run) | {"branched": f"run {parent.run_id} {branch.origin} (step {branch.at})"}
+        if None not in success:
+            rows["success"] = (
+                f"{number(success[1])} % in the last evaluation, {number(success[0])} % in the parent"
+            )
+        draw(facts(rows | {"next": command_for(parent, "diff", run.run_id)}))
+    if run.status == "interrupted":
+        say(f"Interrupted: what was recorded is kept; `{command_for(run, 'resume')}` trains the rest.")
+        ctx.exit(ExitCode.INTERRUPTED)
+
+
+def _print_episode(parent: Run, branch: Branch, as_json: bool) -> None:
+    from runner.loops.branch import Outcome
+
+    if as_json:
+        outcomes = {"parent": asdict(branch.parent), "branch": asdict(branch.outcome)}
+        print_json({"run_id": branch.run.run_id, "origin": asdict(branch.origin)} | outcomes)
         return
 
     def returns(outcome: Outcome) -> str:
@@ -119,9 +184,9 @@ def branch_command(
 
     grid = table("", "run", "return", "length", "end", left=("run", "return", "end"))
     for title, run_id, each in (
-        ("parent", run.run_id, found.parent),
-        ("branch", found.run.run_id, found.outcome),
+        ("parent", parent.run_id, branch.parent),
+        ("branch", branch.run.run_id, branch.outcome),
     ):
         grid.add_row(title, run_id, returns(each), f"{each.length:,}", each.end)
-    rows = run_facts(found.run) | {"branched": f"run {run.run_id} {found.origin}"}
-    draw(facts(rows), grid, facts({"next": f"dualtaxi diff {run.run_id} {found.run.run_id}"}))
+    rows = run_facts(branch.run) | {"branched": f"run {parent.run_id} {branch.origin}"}
+    draw(facts(rows), grid, facts({"next": command_for(parent, "diff", branch.run.run_id)}))

@@ -43,7 +43,7 @@ _SPOOL_BYTES: Final = 8 << 20
 
 _DEFAULT_COLUMNS: Final = (
     *("id", "name", "config", "seed", "status", "tag", "episodes", "success_percent", "mean_return"),
-    *("logged", "bytes", "age", "same_as", "folder"),
+    *("logged", "bytes", "age", "same_as", "parent", "folder"),
 )
 """Columns of the table, unless they hold nothing of interest."""
 _OPTIONAL: Final = ("config", "logged", "bytes", "episodes", "seed", "folder", "age")
@@ -99,15 +99,15 @@ def ls_command(
 
     \b
       id name config seed status tag note created age episodes steps success_percent
-      mean_length mean_penalties mean_return logged seconds bytes digest mode
+      mean_length mean_penalties mean_return logged seconds bytes digest parent mode
       environment host git archive folder, and config.PATH for any value of the
       configuration
 
     Shown are the training episodes done (and to do, if some are missing), the percentage of the last
     evaluation's trials that finished, the size of the recording, how long ago the run began, and which run
-    recorded the same content before; of a loop also the mean return in its last evaluation (in its last 100
-    training episodes, if it has none) and the last values it logged. Some columns are left out where a
-    terminal is narrow.
+    recorded the same content before, and of which run it is a branch; of a loop also the mean return in its
+    last evaluation (in its last 100 training episodes, if it has none) and the last values it logged. Some
+    columns are left out where a terminal is narrow.
 
     Examples:
       dualtaxi ls
@@ -244,6 +244,7 @@ def _informative(rows: Sequence[Row], folders: int) -> list[str]:
         "config": any(row["name"] != row["config"] for row in rows),
         "tag": any(row["tags"] for row in rows),
         "same_as": any(row["same_as"] for row in rows),
+        "parent": any(row["parent"] for row in rows),
         "folder": folders > 1,
         "success_percent": has_success or not has_return,
         "mean_return": has_return,

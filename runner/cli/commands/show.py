@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from runner.recording.metadata import Shard
     from runner.recording.reader import Recording
     from runner.recording.run_file import Summary
-    from runner.runs.branches import BranchOrigin
+    from runner.runs.branches import Origin
     from runner.runs.run import Run
 
 MAX_PROCESSES: Final = 16
@@ -52,7 +52,8 @@ def show_command(run_name: str, recordings: Path | None, as_json: bool, code: bo
     its exact measures, if the run takes them; under `train` one for each report of training; under `loop` the
     last results of a loop: its last evaluation, the means of its last 100 training episodes and the last
     values it logged; under `extras` the names of the values that it recorded with its steps; under
-    `checkpoints` what it kept of its agent; under `branches` its branches, by run id.
+    `checkpoints` what it kept of its agent; under `origin` what it was branched from, under `branches` its
+    branches by run id.
 
     Examples:
       dualtaxi show @latest
@@ -60,6 +61,7 @@ def show_command(run_name: str, recordings: Path | None, as_json: bool, code: bo
       dualtaxi show k3v9m2xq --code | git apply
     """
     from runner.analysis.summary import describe_run
+    from runner.runs.branches import origin_in
     from runner.runs.catalogue.index import look
 
     run = restored(find(run_name, recordings))
@@ -70,7 +72,12 @@ def show_command(run_name: str, recordings: Path | None, as_json: bool, code: bo
     folders = [] if run.stands_alone else [run.folder.parent]
     branches = look(folders, lambda index: index.branches(run.run_id), say)
     if as_json:
-        print_json(details.as_json() | {"branches": {name: asdict(each) for name, each in branches.items()}})
+        origin = origin_in(details.config)
+        print_json(
+            details.as_json()
+            | {"origin": None if origin is None else asdict(origin)}
+            | {"branches": {name: asdict(each) for name, each in branches.items()}}
+        )
     else:
         draw(*_parts(details, branches))
 
@@ -100,7 +107,7 @@ def _print_code(run: Run, as_json: bool) -> None:
         click.echo("\n".join(head) + "\n\n" + found.to_patch(), nl=False)
 
 
-def _parts(details: RunDetails, branches: Mapping[str, BranchOrigin]) -> list[RenderableType]:
+def _parts(details: RunDetails, branches: Mapping[str, Origin]) -> list[RenderableType]:
     from runner.analysis.summary import brief_provenance, random_policy_sentence
     from runner.cli.evaluations import evaluation_table
     from runner.recording.reader import open_recording

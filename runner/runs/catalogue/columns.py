@@ -151,6 +151,7 @@ COLUMNS: Final = {
             read=lambda row: row["same_as"],
             if_empty="",
         ),
+        Column("parent", Kind.START, "the run that it is a branch of", heading="branch of", if_empty=""),
         Column("mode", Kind.TEXT, "cooperative or competitive"),
         Column("environment", Kind.TEXT, "the environment's id", aliases=("env",)),
         Column("host", Kind.TEXT, "the machine it ran on"),

@@ -16,7 +16,7 @@ from typing import Any, Final, TypeVar
 from peewee import DatabaseError, OperationalError, SqliteDatabase, Tuple, Value, chunked, fn
 
 from runner.errors import RunnerError, nearest
-from runner.runs.branches import ORIGIN, BranchOrigin, parse_origin
+from runner.runs.branches import BranchNode, Origin, parse_origin
 from runner.runs.catalogue.columns import SETTING, IndexRow, Kind, field_of, with_same_as
 from runner.runs.catalogue.database import Report, create, index_path, open_index, renew, tuples_of, version
 from runner.runs.catalogue.filters import ANY_RUN, Filter, matches, setting_path
@@ -26,6 +26,8 @@ from runner.runs.run import check_folder_name
 
 Result = TypeVar("Result")
 
+MAX_TREE: Final = 300
+"""Runs in a tree of branches."""
 _MAX_VALUES: Final = 1000
 """Values in one query."""
 
@@ -171,15 +173,47 @@ class Index:
         """Return rows with `same_as`: the id of another run that recorded the same content first, or None."""
         return list(with_same_as(rows, self.originals([row["digest"] for row in rows if row["digest"]])))
 
-    def branches(self, run_id: str) -> dict[str, BranchOrigin]:
+    def branches(self, run_id: str) -> dict[str, Origin]:
         """Return the branches of a run by run id, the newest first."""
-        branches = {}
-        for row in self.rows(Filter(Row.parent == run_id), columns=("id", "settings")):
-            settings = json.loads(row["settings"])
-            values = {key.removeprefix(ORIGIN): value for key, value in settings.items()}
-            if (origin := parse_origin(values)) is not None:
-                branches[row["id"]] = origin
-        return branches
+        rows = self.rows(Filter(Row.parent == run_id), columns=("id", "origin"))
+        return {row["id"]: origin for row in rows if (origin := parse_origin(json.loads(row["origin"])))}
+
+    def branch_tree(self, run_id: str) -> BranchNode:
+        """Return the tree of branches that a run belongs to, from the first run that it descends from.
+
+        At most `MAX_TREE` runs; where there are more, the newest are left out.
+        """
+        columns = ("id", "name", "status", "success_percent", "mean_return", "parent", "origin")
+        above, top = {run_id}, run_id
+        while (rows := self.select(Filter(Row.id == top), columns=("parent",))) and rows[0]["parent"]:
+            top = rows[0]["parent"]
+            if top in above or len(above) == MAX_TREE:
+                break  # a configuration that names itself
+            above.add(top)
+        found = {row["id"]: row for row in self.rows(Filter(Row.id == top), columns=columns)}
+        below: dict[str, list[str]] = {}
+        level = [top]
+        while level and len(found) < MAX_TREE:
+            rows = self.select(Filter(Row.parent.in_(level[:_MAX_VALUES])), Row.created, columns=columns)
+            new = {row["id"]: row for row in rows[: MAX_TREE - len(found)] if row["id"] not in found}
+            for row in new.values():
+                below.setdefault(row["parent"], []).append(row["id"])
+            found |= new
+            level = list(new)
+
+        def node(name: str) -> BranchNode:
+            row = found.get(name, {})
+            return BranchNode(
+                run=name,
+                name=row.get("name"),
+                status=row.get("status") or "removed",
+                success_percent=row.get("success_percent"),
+                mean_return=row.get("mean_return"),
+                origin=parse_origin(json.loads(row.get("origin") or "null")),
+                branches=tuple(map(node, below.get(name, ()))),
+            )
+
+        return node(top)
 
     def named(self, name: str) -> list[tuple[Any, ...]]:
         """Return the runs of a name, or whose ids begin with it, the newest first.

@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from itertools import islice
 from typing import Any, Final
 
@@ -75,8 +76,7 @@ class Row(Model):
     status: TextField
     created: BigIntegerField
     digest: TextField
-    parent = TextField(null=True)
-    """The id of the run that it is a branch of."""
+    parent: TextField
     words: TextField
     settings: TextField
     used_recording = BigIntegerField(null=True)
@@ -105,6 +105,7 @@ for _column in COLUMNS.values():
     if _column.type:
         _field = SeedField if _column.kind is Kind.WHOLE else _FIELDS[_column.type]
         Row._meta.add_field(_column.name, _field(null=True))
+Row._meta.add_field("origin", TextField(null=True))  # what it was branched from: a JSON object
 # The long texts come last, so that SQLite reads the other columns without them.
 Row._meta.add_field("words", TextField(null=True))  # id, name, configuration's name, tags, note: a line each
 Row._meta.add_field("settings", TextField(null=True))  # the configuration: a JSON object of dotted paths
@@ -151,6 +152,7 @@ def row_of(run: Run, size: int | None) -> dict[str, object]:
         "bytes": size,
         "digest": summary.content_digest,
         "parent": None if origin is None else text(origin.run),
+        "origin": None if origin is None else json.dumps(asdict(origin)),
         "mode": _MODES.get(f"{config.get('tables')} {config.get('rewards')}"),
         "environment": text(environment.get("id") if isinstance(environment, Mapping) else None),
         "host": text(run.file.provenance.get("host") or run.file.owner.get("host")),

@@ -16,12 +16,12 @@ from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.evaluations import evaluations_of
-from runner.analysis.step_reference import StepRef
+from runner.analysis.step_reference import StepRef, reference_to
 from runner.drawing import svg
 from runner.errors import RunnerError
 from runner.export.reports.rendering import Link, View
-from runner.recording.reader import open_recording
-from runner.runs.branches import origin_in
+from runner.recording.reader import Recording, open_recording
+from runner.runs.branches import BranchOrigin, Origin, origin_in
 from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.addresses import link
@@ -213,7 +213,8 @@ async def _replay(
     await preparing
 
     def show() -> Response:  # in a thread, as it reads the recording
-        branches = _branches(run, catalogue)
+        with open_recording(run.recording) as recording:
+            branches = _branches(recording, run, catalogue)
         if isinstance(part, RunnerError):
             view = _view(run, which, branches, None, message_of(part, request))
             return page(request, view, HTTPStatus.NOT_FOUND)
@@ -222,19 +223,18 @@ async def _replay(
     return await run_in_threadpool(show)
 
 
-def _branches(run: Run, catalogue: Catalogue) -> list[Link]:
+def _branches(recording: Recording, run: Run, catalogue: Catalogue) -> list[Link]:
     """Return links to the comparisons of a run with its parent, if it is a branch, and with its branches."""
 
-    def comparison(parent: str, branch: str, at: str) -> str:
+    def comparison(parent: str, branch: str, origin: Origin) -> str:
+        at = origin.at if isinstance(origin, BranchOrigin) else str(reference_to(recording, origin.step))
         return link("/compare/replay", {"run": [parent, branch], "at": at})
 
     own = origin_in(run.file.config)
-    parent = (
-        [] if own is None else [Link(f"Branch of {own.run} {own}", comparison(own.run, run.run_id, own.at))]
-    )
+    parent = [] if own is None else [Link(f"Branch of {own.run} {own}", comparison(own.run, run.run_id, own))]
     branches = catalogue.read(lambda index: index.branches(run.run_id))
     return parent + [
-        Link(f"Branch {name} {origin}", comparison(run.run_id, name, origin.at))
+        Link(f"Branch {name} {origin}", comparison(run.run_id, name, origin))
         for name, origin in islice(branches.items(), MAX_BRANCHES)
     ]
 

@@ -229,6 +229,7 @@ OF_THE_COMMAND = (
     "accept-changes",
     "dry-run",
     "episode",
+    "episodes",
     "eval",
     "name",
     "output",

@@ -278,8 +278,14 @@ def test_what_cannot_be_branched_leaves_no_run(runs, tmp_path):
         with pytest.raises(error, match=message):
             runner.branch(run, recordings=tmp_path, **options)
     job = runner.run("quick", overrides=["episodes=2", "evaluation.trials=1"], recordings=tmp_path / "own")
-    with pytest.raises(RunnerError, match="only episodes of loops are branched"):
-        runner.branch(job, at="0:1", recordings=tmp_path)
+    with pytest.raises(ConfigError, match="policy, seed and max_steps are for loops"):
+        runner.branch(job, at="0:1", policy="random", recordings=tmp_path)
+    for message, options in (
+        ("are for runs that were trained here", {"at": "0:1", "overrides": ["epsilon=0.1"]}),
+        ("expected EPISODE:T, such as 7:0", {"at": "7"}),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            runner.branch(run, recordings=tmp_path, **options)
     own = recorded(tmp_path / "own", Rooms())
     with pytest.raises(CannotRedo, match="not made by gymnasium"):
         runner.branch(own, at="0:1", recordings=tmp_path)

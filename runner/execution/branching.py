@@ -1,0 +1,173 @@
+"""Branch the training of a job: another action at a step, or other settings from it on, with the same luck.
+
+    branch = branch_training(run, at="120:5", action={"taxi_1": "north"}, overrides=["epsilon=0.1"])
+
+A branch is a job of its own: the configuration of its parent, and in `branches` what was changed at which
+step. It is trained from the beginning, as a resumed run is, in the environment that the parent recorded. A
+draw is a function of the seed, the episode and its place in it, so that every step before the branch comes
+out as in the parent, and after it every draw that the change does not touch.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from runner.analysis.diff.divergence import first_difference, unbroken
+from runner.analysis.step_reference import StepRef, parse_step, reference_to, training_step, training_steps
+from runner.config import ExperimentConfig, from_mapping
+from runner.config.branches import Branch, Changes
+from runner.config.job import Job
+from runner.environments.mdp import Mdp
+from runner.environments.naming import agent_actions, agent_of, joint_action, numbered_actions, own_action
+from runner.errors import ConfigError, RunnerError
+from runner.execution.initial_tables import recorded_tables
+from runner.execution.session import Report, Stop, run_job
+from runner.recording import schema
+from runner.recording.reader import Recording, open_recording
+from runner.runs.branches import TrainingOrigin, origin_in
+from runner.runs.run import Run, create_run, recordings_folder, unless_empty
+from runner.util.values import checked_run_name
+
+Action = str | int | Mapping[str, str | int]
+"""A joint action, or the actions of some agents, by name or number."""
+
+OF_THE_WHOLE: Final = ("episodes", "recording")
+"""Keys that a branch may have of its own, since they change no step before it."""
+
+
+@dataclass(frozen=True)
+class TrainingBranch:
+    """A branch of training."""
+
+    run: Run
+    """The run that it was recorded in."""
+    origin: TrainingOrigin
+    at: StepRef
+    """The step by its episode."""
+
+
+def branch_training(
+    run: Run,
+    *,
+    at: str | int | StepRef,
+    action: Action | None = None,
+    overrides: Sequence[str] = (),
+    episodes: int | None = None,
+    name: str | None = None,
+    recordings: str | os.PathLike[str] | None = None,
+    report: Report = lambda _: None,
+    stop: Stop = lambda: False,
+) -> TrainingBranch:
+    """Train a job again with a change at one of its training steps, and record it as a run of its own.
+
+    Args:
+        run: a run that was trained here, with or without recorded steps; it may be a branch itself.
+        at: the first step that may differ: its number, or `EPISODE:T`.
+        action: what is done at this step instead: by agent, where the other agents act as they would, or a
+            joint action such as `north + east`; each a name or a number.
+        overrides: `KEY=VALUE` each, as for `--set`: the settings from this step on. Also
+            `recording.KEY=VALUE`, which holds for the whole branch.
+        episodes: the training episodes of the branch, counted from the beginning; the parent's by default.
+        name: of the new run; `NAME.branch` by default.
+        recordings: the folder of the new run: $DUALTAXI_RECORDINGS, or ./recordings, by default.
+        report: called with the progress a few times a second.
+        stop: called every few milliseconds; return True to stop.
+
+    Raises:
+        ConfigError: there is no such agent, action or setting, or the setting cannot change at a step.
+        RecordingError: there is no such step, or the recording is damaged.
+        RunnerError: the episodes before the branch are not those of the parent.
+        StorageError: the folder of the new run cannot be written.
+    """
+    place = parse_step(at) if isinstance(at, str) else at
+    run_name, folder = checked_run_name(name), recordings_folder(recordings)
+    with open_recording(run.recording) as recording:
+        job, where = _job_of(recording, place, action, overrides, episodes)
+        fresh = create_run(folder, job.config, job.seed, run_name or f"{run.name[:90]}.branch")
+        with unless_empty(fresh):
+            own = run_job(job, fresh, report, stop, mdp=recording.mdp, initial=recorded_tables(recording))
+        _check_beginning(recording, own, where.episode)
+    origin = origin_in(job.config.to_mapping())
+    assert isinstance(origin, TrainingOrigin)
+    return TrainingBranch(own, origin, where)
+
+
+def _job_of(
+    recording: Recording,
+    at: int | StepRef,
+    action: Action | None,
+    overrides: Sequence[str],
+    episodes: int | None,
+) -> tuple[Job, StepRef]:
+    """Return the job of a branch, and its step by its episode."""
+    parent, taken = from_mapping(recording.config), training_steps(recording)
+    step = taken if at == taken else training_step(recording, at)  # from the end on, training can be longer
+    where, now = reference_to(recording, step), parent.from_step(step)
+    total = [] if episodes is None else [f"episodes={episodes}"]
+    wanted = from_mapping(now.to_mapping(), [*overrides, *total])
+    if wanted.episodes <= where.episode:
+        raise ConfigError(
+            f"episodes: found {wanted.episodes:,}, expected more than {where.episode:,}: the branch begins "
+            "in this training episode, and those before it count too."
+        )
+    branch = Branch(
+        run=recording.run_id,
+        step=step,
+        actions=chosen_actions(recording.mdp, action),
+        settings=_changes(now, wanted),
+    )
+    seed, given = recording.seed or 0, wanted.to_mapping()
+    branches = [each.model_dump(mode="json") for each in (*parent.branches, branch)]
+    changes = {key: given[key] for key in OF_THE_WHOLE} | {"seeds": [seed], "branches": branches}
+    return Job(from_mapping(parent.to_mapping() | changes), seed), where
+
+
+def chosen_actions(mdp: Mdp, action: Action | None) -> dict[str, str]:
+    """Return the action of each agent that has one, both by their names."""
+    if action is None:
+        return {}
+    if isinstance(action, Mapping):
+        chosen = [(agent_of(mdp, agent), str(value)) for agent, value in action.items()]
+        own = {agent: own_action(mdp, agent, value) for agent, value in chosen}
+    else:
+        own = dict(enumerate(agent_actions(mdp, joint_action(mdp, str(action)))))
+    names = numbered_actions(mdp)
+    return {mdp.agents[agent]: names[agent][value] for agent, value in own.items()}
+
+
+def _changes(now: ExperimentConfig, wanted: ExperimentConfig) -> Changes:
+    """Return the settings of a branch.
+
+    Raises:
+        ConfigError: something differs that cannot change at a step.
+    """
+    differing = [key for key, value in wanted if value != getattr(now, key)]
+    fixed = [key for key in differing if key not in (*Changes.model_fields, *OF_THE_WHOLE)]
+    if fixed:
+        raise ConfigError(
+            f"{fixed[0]}: cannot change at a step of training; {', '.join(Changes.model_fields)} can. "
+            "A new run with this setting can begin with the tables of a step: "
+            "`initial_q: {run: RUN, step: STEP}`."
+        )
+    return Changes(**{key: getattr(wanted, key) for key in differing if key in Changes.model_fields})
+
+
+def _check_beginning(parent: Recording, own: Run, episodes: int) -> None:
+    """Check that the episodes before a branch are those of its parent.
+
+    Raises:
+        RunnerError: they are not.
+    """
+    with open_recording(own.recording) as recording:
+        count = min(episodes, unbroken(parent)[1], recording.count(schema.TRAIN_EPISODE))
+        ours, theirs = (one.blocks(schema.TRAIN_EPISODE, 0, count) for one in (recording, parent))
+        found = first_difference(ours, theirs, ("episode", "last_step", "returns"))
+    if found is not None:
+        raise RunnerError(
+            f"run {own.run_id}: training episode {found[0]:,} is not that of its parent {parent.run_id}, "
+            "though the branch begins later: the parent was recorded with other versions of NumPy or Numba, "
+            f"or on another kind of processor. `dualtaxi diff {parent.run_id} {own.run_id}` shows them."
+        )
