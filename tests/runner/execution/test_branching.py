@@ -171,7 +171,7 @@ def test_draws_that_the_change_does_not_touch_are_the_same(parent, tmp_path):
         {(int(s["episode"]), int(s["t"])): s for s in training(run)} for run in (parent, branch.run)
     )
     shared = ours.keys() & theirs.keys()
-    assert len(shared) > 1000
+    assert len(shared) > 500
     assert all(ours[key]["explored"] == theirs[key]["explored"] for key in shared)
     assert all(ours[key]["state"] == theirs[key]["state"] for key in shared if key[1] == 0)
     both = [key for key in shared if ours[key]["explored"] == 3]
@@ -224,7 +224,7 @@ def test_a_branch_of_a_branch_names_both(parent, tmp_path):
 def test_an_interrupted_branch_is_resumed(parent, tmp_path):
     step, options = middle_of(parent, 0.2), {"overrides": ["epsilon=0.8"], "recordings": tmp_path}
     whole = branch_training(parent, at=step, **options).run
-    part = branch_training(parent, at=step, stop=stopping_after(12), **options).run
+    part = branch_training(parent, at=step, stop=stopping_after(3), **options).run
     assert part.status == "interrupted"
     assert resume(part).summary.content_digest == whole.summary.content_digest
     # an interrupted or resumed run is a parent as well
@@ -301,7 +301,7 @@ def test_the_difference_of_parent_and_branch_is_the_branch(parent, tmp_path):
         later = diff(a, c, first=True)
         assert later.divergence.step >= step + 5
         assert later.cause.text.startswith(f"B is a branch of A, {curious.origin}; training is the same for ")
-        assert "A " in later.cause.text.partition(", then ")[2]
+        assert " in A, " in later.cause.text or "A explored" in later.cause.text
         siblings = diff(b, c, first=True)
         assert siblings.cause.text.startswith(
             f"Both are branches of run {parent.run_id}: A {acted.origin}, B "
@@ -310,7 +310,7 @@ def test_the_difference_of_parent_and_branch_is_the_branch(parent, tmp_path):
 
 
 def test_branches_are_listed_as_a_tree(folder, parent, tmp_path):
-    root = runner.Run(shutil.copytree(parent.folder, tmp_path / parent.run_id), parent.file)
+    root = runner.Run(shutil.copytree(parent.folder, tmp_path / parent.run_id), parent.facts)
     first = branch_training(root, at=9, overrides=["epsilon=0.8"], name="first", recordings=tmp_path)
     second = branch_training(first.run, at=8, overrides=["epsilon=0.7"], recordings=tmp_path)
     third = branch_training(root, at=7, recordings=tmp_path)
