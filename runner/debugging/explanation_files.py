@@ -7,6 +7,7 @@ recordings/.explain/A-B-1f2e3d4c/success_percent.json   the explanation of a met
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Final
 
@@ -52,7 +53,11 @@ def read_explanation(name: str, recordings: Path) -> Explanation:
             content = file.read(MAX_BYTES + 1)
         if len(content) > MAX_BYTES:
             raise RunnerError(f"{path}: larger than {MAX_BYTES >> 20} MiB, expected an explanation.")
-        return TypeAdapter(Explanation).validate_json(content)
+        explanation = TypeAdapter(Explanation).validate_json(content)
     except (OSError, ValidationError) as error:
         reason = str(error).splitlines()[0]
         raise RunnerError(f"{path}: no longer describes an explanation ({reason}).") from error
+    numbers = [explanation.difference.value, *(value for one in explanation.mixtures for value in one.values)]
+    if not explanation.mixtures or not all(map(math.isfinite, numbers)):
+        raise RunnerError(f"{path}: no longer describes an explanation (a value is not finite).")
+    return explanation

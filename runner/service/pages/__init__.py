@@ -8,6 +8,7 @@ from runner.service.pages import (
     compare,
     environments,
     episodes,
+    explanations,
     jobs,
     machine,
     replay,
@@ -29,6 +30,6 @@ __all__ = ["add_error_handlers", "refused", "router"]
 router = APIRouter(include_in_schema=False)
 for _module in (
     *(runs, rerun, run, setup, replay, when, why, what_if, environments, episodes),
-    *(compare, machine, submit, jobs, sweeps, static),
+    *(compare, machine, submit, jobs, sweeps, explanations, static),
 ):
     router.include_router(_module.router)

@@ -15,6 +15,7 @@ from fastapi import Path as InPath
 from fastapi.responses import HTMLResponse
 from starlette.concurrency import run_in_threadpool
 
+from runner.debugging.explanation_files import explanations_in
 from runner.errors import RunnerError, RunNotFound
 from runner.export.reports.rendering import View
 from runner.runs.catalogue.filters import parse
@@ -56,6 +57,8 @@ class ListedSweep:
 class _SweepsView(View):
     TEMPLATE: ClassVar = "sweeps.html"
     sweeps: list[ListedSweep]
+    explanations: list[str]
+    """The names of what `dualtaxi explain` left."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,8 @@ def sweeps(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Re
             found.append(
                 ListedSweep(name, "", sweep.file.strategy, parameters, sweep.objective.description, runs)
             )
-    return page(request, _SweepsView(found))
+    names = [name for folder in settings.recordings for name in explanations_in(folder)]
+    return page(request, _SweepsView(found, names))
 
 
 @router.get("/{name}")
