@@ -21,11 +21,32 @@ def measure(quick: bool) -> list[Figure]:
     repetitions, times = (3, 2) if quick else (7, 10)
     with tempfile.TemporaryDirectory() as folder:
         run(run_command(CONFIG, folder))
-        figures = when(folder, repetitions)
+        figures = [*what_if(folder, repetitions), *when(folder, repetitions)]
     with tempfile.TemporaryDirectory() as folder:
         run(run_command(CONFIG, folder, f"episodes={50_000 * times}"))
         longer = [command(folder, "when", "@latest", text, "--all") for text in (STATE, PATH, "reward > 0")]
-    return [*figures, _peak(f"  when, for a run {times} times as long", longer)]
+        last = command(folder, "branch", "@latest", "--at", f"{50_000 * times - 1}:0", "--action", "all")
+    return [
+        *figures,
+        _peak(f"  when, for a run {times} times as long", longer),
+        _peak(f"  branch, all actions, for a run {times} times as long", [last]),
+    ]
+
+
+def what_if(folder: str, repetitions: int) -> list[Figure]:
+    """Return the figures of `dualtaxi branch --action all`."""
+    places = {
+        "branch, all actions, of a trial": "eval:50000:3:5",
+        "branch, all actions, of a training episode": "49000:3",
+    }
+    figures, processes = [], []
+    for what, at in places.items():
+        words = ("branch", "@latest", "--at", at, "--action", "all")
+        command(folder, *words)  # compiles
+        done = [command(folder, *words) for _ in range(repetitions)]
+        figures.append(_seconds(what, done, (1, 0.3)))
+        processes += done
+    return [*figures, _peak("  peak memory", processes)]
 
 
 def when(folder: str, repetitions: int) -> list[Figure]:
