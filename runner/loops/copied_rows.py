@@ -31,7 +31,17 @@ class Copied:
 
 
 class _Copies(Rows):
-    """What copied rows have in common."""
+    """What copied rows have in common.
+
+    Args:
+        recorder: takes them.
+        copied: the kind and the table of the recording.
+        phase: `train` or `eval`.
+    """
+
+    def __init__(self, recorder: Recorder, copied: Copied, phase: str) -> None:
+        self._fields = _SHARED_FIELDS + (_STEP_FIELDS if copied.kind == "step" else _TRANSITION_FIELDS)
+        super().__init__(recorder, copied, phase, lambda _: None)  # type: ignore[arg-type]
 
     def _set_leaves(self, described: object) -> None:
         """Do nothing: values are copied."""
@@ -43,19 +53,7 @@ class _Copies(Rows):
 
 
 class CopiedRows(_Copies):
-    """Rows of one size that are copied.
-
-    Args:
-        recorder: takes them.
-        copied: the kind and the table of the recording.
-        phase: `train` or `eval`.
-    """
-
-    def __init__(self, recorder: Recorder, copied: Copied, phase: str) -> None:
-        super().__init__(recorder, copied, phase, lambda _: None)  # type: ignore[arg-type]
-        is_step = copied.kind == "step"
-        self._fields = _SHARED_FIELDS + (_STEP_FIELDS if is_step else _TRANSITION_FIELDS)
-        self._state_fields = _STEP_FIELDS if is_step else ()
+    """Rows of one size that are copied."""
 
     def put_reset(self, reset: Mapping[str, Any], environment: int) -> None:
         """Copy a reset."""
@@ -105,7 +103,7 @@ class CopiedRows(_Copies):
         return np.asarray(self._block["rewards"][:n, 0])
 
     def _transitions(self, n: int) -> tuple[Ints, Ints, Ints]:
-        if not self._state_fields:
+        if "state" not in self._fields:
             return super()._transitions(n)
         state, action, after = (self._block[name][:n].astype(np.int64) for name in _STEP_FIELDS)
         return state, action, after
@@ -118,13 +116,10 @@ class CopiedRows(_Copies):
 
 
 class CopiedMessages(_Copies):
-    """Rows whose values vary in size, that are copied; arguments as for `CopiedRows`."""
-
-    def __init__(self, recorder: Recorder, copied: Copied, phase: str) -> None:
-        self._paid = np.zeros(4096)
-        super().__init__(recorder, copied, phase, lambda _: None)  # type: ignore[arg-type]
+    """Rows whose values vary in size, that are copied."""
 
     def _open_steps(self) -> tuple[int, int]:
+        self._paid = np.zeros(4096)
         return len(self._paid), len(self._paid)
 
     def put_reset(self, reset: Mapping[str, Any], environment: int) -> None:

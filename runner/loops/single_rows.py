@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Final, SupportsFloat
 
 import numpy as np
@@ -16,7 +16,6 @@ from runner.loops.values import lone_number, require_reset, warn_user, whole_num
 from runner.recording import schema
 from runner.recording.gym_values import filler, filler_by_agent, leaves_by_agent, value_bytes
 from runner.recording.messages import encode
-from runner.recording.recorder import Recorder
 from runner.util.arrays import Ints
 
 _DISCRETE: Final = struct.Struct("<qqd??")
@@ -34,12 +33,7 @@ class BlockRows(Rows):
 
     _scratch_dtype: np.dtype[np.void]
     """What a step brings that waits until its block is completed."""
-
-    def __init__(
-        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[object], None]
-    ) -> None:
-        self._scratch = np.zeros(0, self._scratch_dtype)
-        super().__init__(recorder, described, phase, first_action)
+    _scratch: NDArray[np.void] = np.zeros(0, "V1")
 
     def _open_steps(self) -> tuple[int, int]:
         self._block = self._recorder.block(self._steps)
@@ -67,15 +61,12 @@ class DiscreteRows(BlockRows):
     """Rows of `dualtaxi.Step`: both spaces are `Discrete`."""
 
     _scratch_dtype = _DISCRETE_DTYPE
+    _state: int | None = None
+    """The state before the first row; None before any reset."""
 
-    def __init__(
-        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[object], None]
-    ) -> None:
+    def _set_leaves(self, described: Described) -> None:
         self._state_start = int(described.observation.start)  # type: ignore[attr-defined]
         self._action_start = int(described.action.start)  # type: ignore[attr-defined]
-        self._state: int | None = None
-        """The state before the first row; None before any reset."""
-        super().__init__(recorder, described, phase, first_action)
 
     def _open_steps(self) -> tuple[int, int]:
         rooms = super()._open_steps()
@@ -190,15 +181,7 @@ class ArrayRows(BlockRows):
 class AgentRows(BlockRows):
     """Rows of `dualtaxi.Transition` of all agents of a PettingZoo parallel environment."""
 
-    def __init__(
-        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[object], None]
-    ) -> None:
-        self._agents = described.agents
-        self._is_settled = False
-        self._scratch_dtype = np.dtype(
-            [("reward", "<f8", (len(self._agents),)), ("terminated", "?"), ("truncated", "?")]
-        )
-        super().__init__(recorder, described, phase, first_action)
+    _is_settled = False
 
     @property
     def place(self) -> tuple[int, int]:
@@ -206,6 +189,10 @@ class AgentRows(BlockRows):
         return super().place[0], self._ended + len(self._ends)
 
     def _set_leaves(self, described: Described) -> None:
+        self._agents = described.agents
+        self._scratch_dtype = np.dtype(
+            [("reward", "<f8", (len(self._agents),)), ("terminated", "?"), ("truncated", "?")]
+        )
         self._own_observations = leaves_by_agent(described.observation, "observation", warn_user)
         self._own_actions = leaves_by_agent(described.recorded_action, "action", warn_user)
 
@@ -253,14 +240,10 @@ class AgentRows(BlockRows):
 class VariableRows(Rows):
     """Rows of `dualtaxi.Transition` where a space has texts: each message is made when it comes."""
 
-    def __init__(
-        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[object], None]
-    ) -> None:
-        self._paid = np.zeros(_VARIABLE_ROWS)
-        self._is_settled = False
-        super().__init__(recorder, described, phase, first_action)
+    _is_settled = False
 
     def _open_steps(self) -> tuple[int, int]:
+        self._paid = np.zeros(_VARIABLE_ROWS)
         return _VARIABLE_ROWS, _VARIABLE_ROWS
 
     @property
