@@ -314,6 +314,19 @@ trial_option: Final = click.option(
     metavar="N:TRIAL",
     help="A trial, counted from 0, of the evaluation after N training episodes.",
 )
+best_option: Final = click.option("--best", is_flag=True, help="The episode of the highest return.")
+worst_option: Final = click.option("--worst", is_flag=True, help="The episode of the lowest return.")
+
+
+def require_one_choice(**choices: object) -> None:
+    """Refuse options that exclude each other, given by name; None and False are not given.
+
+    Raises:
+        UsageError: there is more than one.
+    """
+    given = [f"--{name}" for name, value in choices.items() if value is not None and value is not False]
+    if len(given) > 1:
+        raise click.UsageError(f"{' and '.join(given[:2])} exclude each other: choose one.")
 
 
 def output_option(default: Path | str, metavar: str = "FILE") -> Decorator:

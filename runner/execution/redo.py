@@ -41,6 +41,8 @@ class Redone:
     verdict: Literal["reproduced", "differs", "impossible"]
     episodes: int = 0
     """Episodes that were compared."""
+    unfinished: int = 0
+    """Those of them that were in progress when the recording ended."""
     steps: int = 0
     """Steps that were compared; all before the first difference were equal."""
     left_out: int = 0
@@ -132,7 +134,8 @@ def _compare_all(recording: Recording, tolerance: float, trust: bool) -> Redone:
                 steps=found.steps + len(steps),
                 difference=steps.difference,
             )
-        found = replace(found, left_out=replay.skipped)
+        ended = sum(recording.count(recording.topic(f"/{phase}/episode")) for phase in schema.PHASES)
+        found = replace(found, left_out=replay.skipped, unfinished=max(0, found.episodes - ended))
     if found.difference is None and "content_digest" not in recording.result:
         found = replace(found, cut_off=sum(left.values()))
     if found.difference is not None:

@@ -36,7 +36,7 @@ from runner.recording.writer import RecordingFile, create_recording
 from runner.runs import run as runs
 from runner.runs.code import CodeCollector
 from runner.runs.provenance import provenance
-from runner.runs.redaction import redacted_line
+from runner.runs.redaction import LineRedactor
 from runner.runs.run import Run
 
 REPORT_SECONDS: Final = 0.1
@@ -369,7 +369,7 @@ def recorder_for(
         threads=threads,
         clock=clock,
         system=options.system,
-        console=redacted_line if options.console else None,
+        console=LineRedactor() if options.console else None,
     )
 
 

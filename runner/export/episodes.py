@@ -82,6 +82,12 @@ def ranked_episodes(recording: Recording) -> tuple[str, NDArray[np.int64]]:
     return phase, _by_rank(records)
 
 
+def extreme_episode(recording: Recording, best: bool) -> EpisodePlace:
+    """Return the best or the worst of the episodes that `ranked_episodes` ranks; errors as there."""
+    phase, ranked = ranked_episodes(recording)
+    return named_episode(recording, phase, int(ranked[-1 if best else 0]))
+
+
 def named_episode(recording: Recording, phase: str, number: int) -> EpisodePlace:
     """Return where an episode of a phase stands, counted over the phase."""
     if phase == "train":

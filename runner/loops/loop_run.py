@@ -40,7 +40,7 @@ from runner.runs import run as runs
 from runner.runs.code import CodeCollector
 from runner.runs.listing import run_at
 from runner.runs.provenance import provenance
-from runner.runs.redaction import redacted_line
+from runner.runs.redaction import LineRedactor
 from runner.runs.run import RECORDING_FILE, Run, new_run, recordings_folder, unless_empty
 from runner.runs.shards import RUN_VARIABLE, new_shard
 
@@ -94,7 +94,7 @@ class LoopRun:
             watch=self._watch,
             before=self.describe,
             system=options.packing.system and not is_shard,
-            console=redacted_line if options.packing.console and not is_shard else None,
+            console=LineRedactor() if options.packing.console and not is_shard else None,
         )
         self._actions = (
             ActionRecorder(self.recorder, described.environments, options.packing.chunk_steps)

@@ -61,6 +61,9 @@ _HINTS: Final = (
 )
 """Each secret that is known by its name or shape has one of these around it, in any case."""
 _SHAPES: Final = re.compile("|".join(shape for _, shape in SHAPES))
+_KEY_BEGIN: Final = re.compile(r"-----BEGIN [A-Z ]{0,30}PRIVATE KEY-----")
+_KEY_END: Final = re.compile(r"-----END [A-Z ]{0,30}PRIVATE KEY-----")
+_MAX_KEY_LINES: Final = 200
 _ADDRESS: Final = re.compile(r"(?<=://)(?!git@)[^\s/@\"'<>]{1,500}(?=@)")
 _PARAMETER: Final = re.compile(
     rf"([?&][\w-]{{0,40}}{_IN_SOURCES}[\w-]{{0,40}}=)[^&\s\"'\[]{{1,500}}", re.IGNORECASE
@@ -134,6 +137,24 @@ def redacted_line(text: str) -> str:
     if any(hint in lowered for hint in _HINTS) or any(value in text for value in secrets):
         return redacted_text(text)
     return text
+
+
+class LineRedactor:
+    """Redacts the lines of an output one after the other, and every line of a private key."""
+
+    def __init__(self) -> None:
+        self._key_lines = 0
+        """The most lines that the private key which has begun still has."""
+
+    def __call__(self, text: str) -> str:
+        """Return the next line without secrets."""
+        if self._key_lines:
+            self._key_lines = 0 if _KEY_END.search(text) else self._key_lines - 1
+            return REDACTED
+        if (begin := _KEY_BEGIN.search(text)) and not _KEY_END.search(text):
+            self._key_lines = _MAX_KEY_LINES
+            return redacted_line(text[: begin.start()]) + REDACTED
+        return redacted_line(text)
 
 
 @lru_cache(1)

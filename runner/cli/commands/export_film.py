@@ -11,10 +11,13 @@ from runner.cli import Command
 from runner.cli.options import (
     EXPORTS,
     GRID,
+    best_option,
     episode_option,
+    require_one_choice,
     run_argument,
     trial_option,
     trust_option,
+    worst_option,
     writing_options,
 )
 from runner.cli.output import print_written, say
@@ -41,8 +44,8 @@ _MAX_GIF_FPS = 50
 @run_argument
 @episode_option
 @trial_option
-@click.option("--best", is_flag=True, help="The episode of the highest return.")
-@click.option("--worst", is_flag=True, help="The episode of the lowest return.")
+@best_option
+@worst_option
 @click.option(
     "--grid",
     type=GRID,
@@ -95,13 +98,10 @@ def command(
       dualtaxi export film k3v9m2xq --eval 3000:7 -o trial.gif
       dualtaxi export film k3v9m2xq --grid 3x3 -o nine.webm --fps 60
     """
-    choices = {"--episode": episode, "--eval": trial, "--best": best, "--worst": worst, "--grid": grid}
-    given = [name for name, value in choices.items() if value is not None and value is not False]
-    if len(given) > 1:
-        raise click.UsageError(f"{' and '.join(given[:2])} exclude each other: choose one.")
+    require_one_choice(episode=episode, eval=trial, best=best, worst=worst, grid=grid)
     from runner.export import film
     from runner.export.encoder import format_of
-    from runner.export.episodes import chosen_episode
+    from runner.export.episodes import chosen_episode, extreme_episode
     from runner.export.pictures import Source, pictures, source_of
     from runner.export.places import require_new, write_new
 
@@ -109,8 +109,10 @@ def command(
         path = output or EXPORTS / f"{run.file_stem}.mp4"
         format_of(path)
         require_new(path, force)
-        if grid or best or worst:
-            shown = _ranked(recording, grid, best)
+        if best or worst:
+            shown = [extreme_episode(recording, best)]
+        elif grid:
+            shown = _ranked(recording, grid)
         else:
             shown = [chosen_episode(recording, episode, trial)]
         is_scene = source_of(recording, shown[0].phase, trust)[0] is Source.SCENE
@@ -153,13 +155,11 @@ def command(
         raise SystemExit(ExitCode.DIFFERENT)
 
 
-def _ranked(recording: Recording, grid: tuple[int, int] | None, best: bool) -> list[EpisodePlace]:
-    """Return the best episode, the worst, or those of a grid from the best to the worst."""
+def _ranked(recording: Recording, grid: tuple[int, int]) -> list[EpisodePlace]:
+    """Return the episodes of a grid, from the best to the worst."""
     from runner.export.episodes import named_episode, ranked_episodes
 
     phase, ranked = ranked_episodes(recording)
-    if grid is None:
-        return [named_episode(recording, phase, int(ranked[-1 if best else 0]))]
     cells = grid[0] * grid[1]
     if len(ranked) < cells:
         say(f"There are only {len(ranked):,} episodes: {cells - len(ranked)} cells of the grid are empty.")

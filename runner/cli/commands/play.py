@@ -16,12 +16,15 @@ import click
 
 from runner.cli import Command
 from runner.cli.options import (
+    best_option,
     episode_option,
     json_option,
     recordings_option,
+    require_one_choice,
     run_argument,
     trial_option,
     trust_option,
+    worst_option,
 )
 from runner.cli.output import console, print_json, say
 from runner.cli.progress import stage_line
@@ -59,6 +62,8 @@ _POLL_SECONDS: Final = 0.02
 @run_argument
 @episode_option
 @trial_option
+@best_option
+@worst_option
 @click.option(
     "--speed",
     type=click.FloatRange(0, min_open=True),
@@ -75,6 +80,8 @@ def play_command(
     run_name: str,
     episode: int | None,
     trial: tuple[int, int] | None,
+    best: bool,
+    worst: bool,
     speed: float,
     no_pictures: bool,
     trust: bool,
@@ -85,9 +92,9 @@ def play_command(
 
     By default it is the typical trial of the last evaluation: the median by success, return and length; of
     your own loop the first trial of its last evaluation; of a run without evaluations the last training
-    episode. The space bar pauses, the arrow keys (or b and n) step back and forward, and q quits. Where
-    stdout is no terminal, the frames come one after another, without waiting. With --json, one line for each
-    step.
+    episode. --best and --worst choose among the trials of all evaluations, or else the training episodes. The
+    space bar pauses, the arrow keys (or b and n) step back and forward, and q quits. Where stdout is no
+    terminal, the frames come one after another, without waiting. With --json, one line for each step.
 
     In a terminal it shows pictures, as `dualtaxi export film` does: by the terminal's graphics (kitty,
     sixel), else by coloured half blocks. Scenes are drawn in text where there are no graphics. NO_COLOR and
@@ -96,17 +103,20 @@ def play_command(
     Examples:
       dualtaxi play @latest
       dualtaxi play k3v9m2xq --eval 3000:7 --speed 10
+      dualtaxi play k3v9m2xq --best
       dualtaxi play k3v9m2xq --episode 0 | less
     """
-    if episode is not None and trial is not None:
-        raise click.UsageError("--episode and --eval exclude each other: choose one.")
+    require_one_choice(episode=episode, eval=trial, best=best, worst=worst)
     from runner.cli.episode import Episode
-    from runner.export.episodes import chosen_episode
+    from runner.export.episodes import chosen_episode, extreme_episode
     from runner.recording.reader import open_recording
 
     run, terminal = find_recorded(run_name, recordings), console()
     with open_recording(run.recording) as recording, contextlib.ExitStack() as stack:
-        choice = chosen_episode(recording, episode, trial)
+        if best or worst:
+            choice = extreme_episode(recording, best)
+        else:
+            choice = chosen_episode(recording, episode, trial)
         played = Episode(recording, choice, f"{run.title}: {choice.title}")
         if as_json:
             for step in played.steps():

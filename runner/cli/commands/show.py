@@ -52,8 +52,8 @@ def show_command(run_name: str, recordings: Path | None, as_json: bool, code: bo
     its exact measures, if the run takes them; under `train` one for each report of training; under `loop` the
     last results of a loop: its last evaluation, the means of its last 100 training episodes and the last
     values it logged; under `extras` the names of the values that it recorded with its steps; under
-    `checkpoints` what it kept of its agent; under `origin` what it was branched from, under `branches` its
-    branches by run id.
+    `checkpoints` what it kept of its agent; under `processes` those that recorded it together; under `origin`
+    what it was branched from, under `branches` its branches by run id.
 
     Examples:
       dualtaxi show @latest

@@ -106,6 +106,8 @@ def _redone(redone: Redone) -> dict[str, str]:
     """Return what came of doing a loop again, as rows."""
     steps, of = counted(redone.steps, "step"), redone.of_episodes
     episodes = counted(redone.episodes if of is None else of, "episode")
+    if redone.unfinished:
+        episodes += f" ({redone.unfinished:,} unfinished)"
     compared = f"{episodes if of is None else f'{redone.episodes:,} of {episodes}'}, {steps}"
     exactness = f"within {redone.tolerance:g}" if redone.tolerance else "every byte"
     rows = {"verdict": f"reproduced: {compared}, {exactness}"}

@@ -85,6 +85,7 @@ def test_archived_and_removed_a_run_is_listed_and_restored_the_same(run, recordi
     ],
     ids=lambda words: words[1] if words[0] == "export" else words[0],
 )
+@pytest.mark.usefixtures("own_folder")
 def test_commands_that_read_a_run_read_an_archived_one(words, run, command, tmp_path):
     names = {"RUN": run.run_id, "OTHER": str(run.recording), "DIR": str(tmp_path)}
 

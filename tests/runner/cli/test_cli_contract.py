@@ -145,7 +145,7 @@ def place(tmp_path_factory, recorded_run, command_in):
 
 
 @pytest.fixture(autouse=True)
-def server(monkeypatch, tmp_path, recorded_run):
+def server(monkeypatch, tmp_path, recorded_run, own_folder):
     """Stand in for a server, and keep tokens in a folder of the test."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     pulled = SimpleNamespace(run=recorded_run, content_digest="0" * 64, already=True)

@@ -77,13 +77,22 @@ def test_a_trial_of_an_evaluation(recorded, recorded_run, trial, number):
         (["--episode", "30"], "no training episode 30"),
         (["--episode", "-1"], "--episode"),
         (["--speed", "0"], "--speed"),
-        (["--episode", "1", "--eval", "20:0"], "exclude each other"),
+        (["--episode", "1", "--eval", "20:0"], "--episode and --eval exclude each other"),
+        (["--best", "--worst"], "--best and --worst exclude each other"),
     ],
 )
 def test_missing_episodes_are_refused(recorded, words, message):
     result = recorded("play", "tiny", *words)
     assert result.exit_code == 2
     assert message in result.stderr
+
+
+def test_the_best_and_the_worst_trial(recorded, recorded_run):
+    with runner.open_recording(recorded_run.recording) as recording:
+        returns = recording.episodes("eval")["returns"].sum(axis=1)
+    for option, value in (("--best", returns.max()), ("--worst", returns.min())):
+        steps = map(json.loads, recorded("play", "tiny", option, "--json").stdout.splitlines())
+        assert sum(sum(step["rewards"].values()) for step in steps) == value
 
 
 def test_without_evaluations_the_last_episode_is_played(command, tiny):

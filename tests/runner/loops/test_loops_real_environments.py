@@ -21,6 +21,7 @@ from tests.runner.loops.making import Rooms, drive, parallel, play
 gymnasium.register_envs(ale_py)
 
 pytestmark = [
+    pytest.mark.usefixtures("own_folder"),
     # Of MuJoCo's, pygame's and the environments' own makers, not of what is tested.
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),
     pytest.mark.filterwarnings("ignore::UserWarning"),

@@ -29,6 +29,7 @@ from tests.runner.replay.loops import SEEDING, record, redone
 gymnasium.register_envs(ale_py)
 
 pytestmark = [
+    pytest.mark.usefixtures("own_folder"),
     # Of MuJoCo and of environments' own makers, not of what is tested.
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),
     pytest.mark.filterwarnings("ignore::UserWarning"),

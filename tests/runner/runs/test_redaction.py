@@ -10,6 +10,7 @@ from runner.runs.provenance import VARIABLES
 from runner.runs.redaction import (
     REDACTED,
     SECRET_NAMES,
+    LineRedactor,
     is_secret_name,
     redacted_arguments,
     redacted_line,
@@ -147,3 +148,18 @@ def test_a_variable_that_the_process_sets_itself_is_a_secret(monkeypatch):
     redacted_line("nothing")
     monkeypatch.setenv("SVC_TOKEN", "correcthorsebattery")
     assert redacted_line("it is correcthorsebattery") == f"it is {REDACTED}"
+
+
+def test_a_private_key_that_is_printed_line_by_line():
+    key = ["-----BEGIN RSA PRIVATE KEY-----", "MIIEowIBAAKCAQEA", "", "abc=", "-----END RSA PRIVATE KEY-----"]
+    redact = LineRedactor()
+    assert [redact(line) for line in ["before", "key: " + key[0], *key[1:], "after"]] == [
+        "before",
+        f"key: {REDACTED}",
+        *[REDACTED] * 4,
+        "after",
+    ]
+    redact(key[0])
+    shown = [redact(f"line {k}") for k in range(300)]
+    assert shown[0] == REDACTED
+    assert shown[-1] == "line 299", "a key without an end hides a bounded number of lines"
