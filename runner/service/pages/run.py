@@ -25,6 +25,7 @@ from runner.recording.labels import MAX_NOTE
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics, RecentTraining
+from runner.runs.branches import BranchNode
 from runner.runs.run import Run
 from runner.runs.shards import shards_in_words
 from runner.service import fragments
@@ -47,6 +48,7 @@ from runner.service.pages.rendering import Form, message_of, page
 from runner.util import humanize
 
 if TYPE_CHECKING:
+    from runner.service.catalogue import Catalogue
     from runner.service.jobs.queue import JobQueue
     from runner.service.processes import ProcessPool
     from runner.service.response_cache import ResponseCache
@@ -84,6 +86,8 @@ class _OverviewView(RunView):
     random_policy: str
     problem: str
     """Why labels were refused."""
+    branches: BranchNode
+    """The tree that the run belongs to; the run alone if it is no branch and has none."""
     max_note: int = MAX_NOTE
 
 
@@ -114,12 +118,13 @@ async def overview(
     run: FoundRun,
     jobs: JobsOf,
     settings: SettingsOf,
+    catalogue: CatalogueOf,
     cache: CacheOf,
     processes: ProcessesOf,
 ) -> Response:
-    """Show the status of a run, and its metrics."""
+    """Show the status of a run, its metrics, and the tree of branches that it belongs to."""
     random = await _random_policy(run, cache, processes)
-    view = await run_in_threadpool(_overview, run, jobs, settings, random)
+    view = await run_in_threadpool(_overview, run, jobs, settings, catalogue, random)
     return await run_in_threadpool(page, request, view)
 
 
@@ -138,18 +143,20 @@ def label(
     try:
         relabelled(run, changed, catalogue)
     except RunnerError as error:
-        view = _overview(run, jobs, settings, problem=message_of(error, request))
+        view = _overview(run, jobs, settings, catalogue, problem=message_of(error, request))
         return page(request, view, HTTPStatus.BAD_REQUEST)
     return RedirectResponse(f"/runs/{run.run_id}#labels-title", HTTPStatus.SEE_OTHER)
 
 
 @router.post("/stop")
-def stop(request: Request, run: FoundRun, jobs: JobsOf, settings: SettingsOf) -> Response:
+def stop(
+    request: Request, run: FoundRun, jobs: JobsOf, settings: SettingsOf, catalogue: CatalogueOf
+) -> Response:
     """Request that the loop which records the run stops."""
     try:
         run.request_stop()
     except RunnerError as error:
-        view = _overview(run, jobs, settings, problem=message_of(error, request))
+        view = _overview(run, jobs, settings, catalogue, problem=message_of(error, request))
         return page(request, view, HTTPStatus.BAD_REQUEST)
     return RedirectResponse(f"/runs/{run.run_id}", HTTPStatus.SEE_OTHER)
 
@@ -221,9 +228,15 @@ async def _random_policy(run: Run, cache: ResponseCache, processes: ProcessPool)
 
 
 def _overview(
-    run: Run, jobs: JobQueue, settings: Settings, random_policy: str = "", problem: str = ""
+    run: Run,
+    jobs: JobQueue,
+    settings: Settings,
+    catalogue: Catalogue,
+    random_policy: str = "",
+    problem: str = "",
 ) -> _OverviewView:
-    return _OverviewView(head_of(run), "", _status(run, jobs, settings), random_policy, problem)
+    tree = catalogue.read(lambda index: index.branch_tree(run.run_id))
+    return _OverviewView(head_of(run), "", _status(run, jobs, settings), random_policy, problem, tree)
 
 
 def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:

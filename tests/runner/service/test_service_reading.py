@@ -38,7 +38,7 @@ def recording(recordings):
 def test_a_run_is_described_as_by_show(client, recordings):
     shown_here = client.get(RUN).json()
     shown = _printed("show", "first", "--json", "--recordings", str(recordings))
-    same = set(shown) - {"eval", "train", "optimality", "checkpoints", "branches", "path"}
+    same = set(shown) - {"eval", "train", "optimality", "checkpoints", "branches", "origin", "path"}
     assert {key: shown_here[key] for key in same} == {key: shown[key] for key in same}
     assert shown_here["last_evaluation"] == shown["eval"][-1]
     assert "path" not in shown_here
