@@ -6,9 +6,11 @@ import statistics
 import sys
 import tempfile
 from collections.abc import Sequence
+from pathlib import Path
 
 from benchmarks.figures import Figure, figure
 from benchmarks.processes import Process, run, run_command
+from runner.config import load
 
 CONFIG = "tutorial_cooperative"
 STATE = 'q[300, "north + east"] > q[300, "west + east"]'
@@ -26,6 +28,7 @@ def measure(quick: bool) -> list[Figure]:
         run(run_command(CONFIG, folder, f"episodes={50_000 * times}"))
         longer = [command(folder, "when", "@latest", text, "--all") for text in (STATE, PATH, "reward > 0")]
         last = command(folder, "branch", "@latest", "--at", f"{50_000 * times - 1}:0", "--action", "all")
+    figures += explain(1 if quick else 3)
     return [
         *figures,
         _peak(f"  when, for a run {times} times as long", longer),
@@ -64,6 +67,20 @@ def when(folder: str, repetitions: int) -> list[Figure]:
         figures.append(_seconds(what, done, targets))
         processes += done
     return [*figures, _peak("  peak memory", processes)]
+
+
+def explain(repetitions: int) -> list[Figure]:
+    """Return the figures of `dualtaxi explain` for four settings and twenty seeds, 5,000 episodes each."""
+    words = ["explain", CONFIG, "other.yaml", "--at", "5000", "--seeds", "20"]
+    processes = []
+    for _ in range(repetitions + 1):  # the first one compiles
+        with tempfile.TemporaryDirectory() as folder:
+            other = load("tutorial_text_cooperative", ["step_size=0.3", "discount=0.9"])
+            words[2] = str(Path(folder, "other.yaml"))
+            Path(words[2]).write_text(other.to_yaml(), encoding="utf-8")
+            processes.append(command(folder, *words))
+    figures = [_seconds("explain, 4 settings, 20 seeds, 5,000 episodes", processes[1:], (60, 25))]
+    return [*figures, _peak("  peak memory of its main process", processes)]
 
 
 def command(folder: str, *words: str) -> Process:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 
 import pytest
+from click.testing import CliRunner
 
 import runner
+from runner.cli import cli
 from runner.config import from_mapping
-from runner.debugging.explanation import sections
+from runner.debugging.explanation import plots, sections
 from runner.debugging.explanation_files import explanations_in, read_explanation
 from runner.debugging.factors import mix
 from runner.errors import RunnerError
@@ -193,3 +195,37 @@ def test_a_damaged_result_is_named(tmp_path):
         read_explanation(found.name, tmp_path)
     with pytest.raises(RunnerError, match="no explanation 'other'"):
         read_explanation("other", tmp_path)
+
+
+def test_the_command_plans_answers_and_prints_json(tmp_path):
+    a, b = tmp_path / "a.yaml", tmp_path / "b.yaml"
+    a.write_text(json.dumps(LAKE | {"discount": 0.9}))
+    b.write_text(json.dumps(LAKE | PLANTED | {"step_size": 0.5}))
+
+    def typed(*words, code=0):
+        options = ["--recordings", str(tmp_path / "runs"), "--workers", "1", "--seeds", "2"]
+        done = CliRunner().invoke(cli, ["explain", str(a), str(b), *options, *words])
+        assert done.exit_code == code, done.stderr
+        return done
+
+    plan = json.loads(typed("--dry-run", "--json").stdout)
+    assert (plan["mixtures"], plan["seeds"], plan["known"]) == (4, 2, 4)
+    assert plan["seconds"] > 0
+    whole = typed()
+    assert "8 runs: 4 mixtures of 2 settings, 2 seeds each, 4 of them known" in whole.stderr
+    assert "epsilon alone makes 100 % of it" in whole.stdout
+    found = json.loads(typed("--json").stdout)
+    assert found["smallest"]["settings"] == ["epsilon"]
+    assert sum(setting["share"]["value"] for setting in found["settings"]) == pytest.approx(100.0)
+    assert typed("--markdown").stdout.startswith("## a (A) and b (B)")
+    assert "expected one that evaluations of both have" in typed("--metric", "nothing", code=2).stderr
+
+
+def test_a_run_is_explained_by_its_configuration_and_seed(tmp_path):
+    run = runner.run(LAKE | PLANTED, seed=7, recordings=tmp_path)
+    found = explained(run, LAKE | PLANTED | {"step_size": 0.5}, tmp_path, seeds=2)
+    assert (found.a.run_id, found.seeds) == (run.run_id, (7, 8))
+    assert found.mixtures[0].values[0] == run.summary.last_evaluation.values["success_percent"]
+    assert any("same seeds" in note for note in found.notes)
+    assert "<svg" in found._repr_html_()
+    assert plots(found)[0].title == "Shares"
