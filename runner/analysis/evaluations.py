@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.messages import Message
 from runner.recording.metrics import METRICS, defined_metrics, finite_mean, is_usable
 from runner.recording.reader import Recording
 from runner.recording.run_file import EvaluationMetrics, RecentTraining, Summary
@@ -189,9 +190,7 @@ def evaluation_records(recording: Recording) -> list[EvaluationRecord]:
     return [_loop_record(recording, one, trials[one.start : one.stop]) for one in evaluations_of(recording)]
 
 
-def evaluation_record(
-    metrics: Mapping[str, Any], agents: Sequence[str], events: Sequence[str]
-) -> EvaluationRecord:
+def evaluation_record(metrics: Message, agents: Sequence[str], events: Sequence[str]) -> EvaluationRecord:
     """Return the record of a job's evaluation from its message, in which NaN stands for unknown."""
     return EvaluationRecord(
         number=metrics["evaluation"],
@@ -242,7 +241,7 @@ def training_records(recording: Recording) -> list[TrainingRecord]:
     return [_training_record(metrics, agents) for metrics in recording.metrics("train")]
 
 
-def _training_record(metrics: Mapping[str, Any], agents: Sequence[str]) -> TrainingRecord:
+def _training_record(metrics: Message, agents: Sequence[str]) -> TrainingRecord:
     return TrainingRecord(
         episode=metrics["episode"],
         step=metrics["step"],

@@ -30,6 +30,7 @@ from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
 from runner.replay.steps import steps_of
 from runner.runs.run import Run
+from runner.util.arrays import Array
 from runner.util.extras import require
 from runner.util.values import flatten
 
@@ -130,7 +131,7 @@ def transition_table(
     return _frame(transition_columns(load_mdp(env_id, kwargs or {}, rewards)))
 
 
-def transition_columns(mdp: Mdp) -> dict[str, NDArray[Any]]:
+def transition_columns(mdp: Mdp) -> dict[str, Array]:
     """Return the columns of `transition_table`, a value for each outcome with a probability above 0."""
     states, actions = states_in_words(mdp), actions_in_words(mdp)
     state, action, outcome = np.nonzero(mdp.probability)
@@ -153,7 +154,7 @@ def transition_columns(mdp: Mdp) -> dict[str, NDArray[Any]]:
 
 def episode_columns(
     recording: Recording, phase: Phase = "train", start: int = 0, stop: int | None = None
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, Array]:
     """Return the columns of `episodes`, an array each.
 
     Raises:
@@ -173,7 +174,7 @@ def step_columns(
     episode: int | None = None,
     start: int = 0,
     stop: int | None = None,
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, Array]:
     """Return the columns of `steps`, an array each.
 
     Raises:
@@ -239,14 +240,14 @@ def _evaluation_column(key: str) -> str:
     return rest if first == "events" else f"{names.get(first, first)}{dot}{rest}"
 
 
-def _plain_columns(records: NDArray[np.void], names: Sequence[str]) -> dict[str, Any]:
+def _plain_columns(records: NDArray[np.void], names: Sequence[str]) -> dict[str, Array]:
     """Return fields of records as arrays of their own."""
     return {name: records[name].copy() for name in names}
 
 
-def _spread(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def _spread(columns: Mapping[str, NDArray[Any]]) -> dict[str, Array]:
     """Return columns of which those of composed values, such as a `Dict` space's, are a column a part."""
-    spread: dict[str, NDArray[Any]] = {}
+    spread: dict[str, Array] = {}
     for name, values in columns.items():
         if values.dtype.names is None:
             spread[name] = values
@@ -255,6 +256,6 @@ def _spread(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     return spread
 
 
-def _by_name(values: NDArray[Any], names: Sequence[str]) -> dict[str, Any]:
+def _by_name(values: Array, names: Sequence[str]) -> dict[str, Array]:
     """Return the columns of [N, names] by name."""
     return {name: values[:, i].copy() for i, name in enumerate(names)}

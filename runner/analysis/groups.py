@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from runner.analysis.axes import Axis
 from runner.analysis.series import RunSeries
@@ -236,7 +236,7 @@ def _value_at(path: str, series: Sequence[RunSeries]) -> Callable[[RunSeries], s
     """Return a function that returns a run's value at a path of the configuration, as JSON."""
 
     def paths(values: Mapping[str, object], prefix: str = "") -> dict[str, object]:
-        found: dict[str, Any] = {}
+        found: dict[str, object] = {}
         for key, value in values.items():
             found[f"{prefix}{key}"] = value
             if isinstance(value, Mapping):

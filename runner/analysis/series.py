@@ -7,7 +7,7 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,10 @@ from runner.analysis.evaluations import (
 from runner.environments.naming import event_in_words, spoken
 from runner.errors import RunnerError, shortened
 from runner.recording import schema
+from runner.recording.messages import Message
 from runner.recording.metrics import LARGEST, METRIC_OF, METRICS, SHARES, finite_mean, is_usable
 from runner.recording.reader import Recording
+from runner.util.values import JsonView
 
 Readings = dict[str, dict[str, float]]
 """Metric -> line (an agent, a reward, or "") -> value."""
@@ -51,7 +53,7 @@ class RunSeries:
     """None for a loop without one."""
     status: str
     """`finished`, `interrupted` or `failed`."""
-    config: Mapping[str, Any]
+    config: JsonView
     evaluation: list[tuple[float, Readings]]
     """(position, readings) of every evaluation; positions on an axis of whole numbers are integers."""
     training: list[tuple[float, Readings]]
@@ -248,7 +250,7 @@ def evaluation_readings(record: EvaluationRecord) -> Readings:
     return readings
 
 
-def exact_readings(measures: Mapping[str, Any], agents: Sequence[str]) -> Readings:
+def exact_readings(measures: Message, agents: Sequence[str]) -> Readings:
     """Return exact measures next to those of the optimum."""
     readings = {
         name: {"": measures[name], "optimum": measures[f"optimal_{name}"]}
@@ -390,7 +392,7 @@ def _mean_scalars(
         return {name: sums[name] / counts[name] for name in sums}
 
 
-def training_step(scalar: Mapping[str, Any]) -> int:
+def training_step(scalar: Message) -> int:
     """Return the training steps before a logged value; one logged in evaluation has steps of its own."""
     step = int(scalar["step"])
     return step if scalar["phase"] == "train" else scalar["log_time"] // schema.STEP_NANOSECONDS - step

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from runner.analysis.evaluations import (
     EvaluationRecord,
@@ -16,11 +15,13 @@ from runner.analysis.evaluations import (
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.clock import Clock, read_clock
+from runner.recording.messages import Message
 from runner.recording.metadata import Shard
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import Summary
 from runner.runs.checkpoints import Checkpoint, read_checkpoints
 from runner.runs.run import Run
+from runner.util.values import JsonView
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class RunDetails:
     """All about a run; of one whose recording is missing or unreadable the contents of `run.json`."""
 
     run: Run
-    config: Mapping[str, Any]
+    config: JsonView
     episodes: int | None = None
     train_steps: int | None = None
     eval_steps: int | None = None
@@ -68,7 +69,7 @@ class RunDetails:
     success_events: tuple[str, ...] = ()
     tables: tuple[TableFill, ...] = ()
     evaluations: tuple[EvaluationRecord, ...] = ()
-    optimality: tuple[Mapping[str, Any], ...] = ()
+    optimality: tuple[Message, ...] = ()
     """The exact measures of the evaluations."""
     training: tuple[TrainingRecord, ...] = ()
     loop: Summary | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +19,7 @@ from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS, Topic
+from runner.util.values import Json
 
 _ROWS_AT_ONCE: Final = 1024
 _BYTES_AT_ONCE: Final = 4 << 20
@@ -66,7 +67,7 @@ class Batches:
         if table.topics[0] in self.shape.sizes:
             yield from (batch for _, _, batch in self.blocks(table))
             return
-        rows: list[dict[str, Any]] = []
+        rows: list[Json] = []
         size = 0
         merged_rows = heapq.merge(*map(self._rows, table.topics), key=lambda pair: pair[0]["position"])
         for row, message_size in merged_rows:
@@ -111,7 +112,7 @@ class Batches:
             f"cannot be archived{why}; `dualtaxi verify` names the damage."
         )
 
-    def _rows(self, topic: Topic) -> Iterator[tuple[dict[str, Any], int]]:
+    def _rows(self, topic: Topic) -> Iterator[tuple[Json, int]]:
         """Yield a row for each message, and the message's size in bytes."""
         for position, payload in self.messages(topic):
             try:

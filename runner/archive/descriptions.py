@@ -63,7 +63,7 @@ def _transitions(mdp: Mdp, shape: Shape) -> pa.Table:
     """Return a row for each possible outcome of a state and an action."""
     possible = mdp.probability > 0
     state, action, _ = np.nonzero(possible)
-    columns: dict[str, Any] = {
+    columns: dict[str, object] = {
         "state": state.astype(np.int32),
         "action": action.astype(np.int32),
         "next_state": mdp.next_state[possible],
@@ -79,7 +79,7 @@ def _transitions(mdp: Mdp, shape: Shape) -> pa.Table:
 
 def _states(mdp: Mdp, shape: Shape) -> pa.Table:
     """Return a row for each state: description, start probability, and positions of the things."""
-    columns: dict[str, Any] = {
+    columns: dict[str, object] = {
         "state": np.arange(mdp.states, dtype=np.int32),
         "words": states_in_words(mdp).tolist(),
         "start_probability": mdp.start,
@@ -97,7 +97,7 @@ def _states(mdp: Mdp, shape: Shape) -> pa.Table:
 def _actions(mdp: Mdp, shape: Shape) -> pa.Table:
     """Return a row for each joint action: description, and each agent's own action."""
     action = np.arange(mdp.joint_actions, dtype=np.int32)
-    columns: dict[str, Any] = {"action": action, "words": actions_in_words(mdp).tolist()}
+    columns: dict[str, object] = {"action": action, "words": actions_in_words(mdp).tolist()}
     if shape.own_actions:
         own = mdp.own_actions.T.astype(np.int32)
         columns |= dict(zip(shape.own_actions, own, strict=True))

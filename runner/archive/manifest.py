@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Any, Final
+from typing import Final
 
 from blake3 import blake3
 
@@ -15,7 +15,7 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.digest import combined_digest
 from runner.util.files import hash_of
-from runner.util.values import is_whole
+from runner.util.values import JsonView, is_whole
 
 MAX_MANIFEST_BYTES: Final = 1 << 20
 _MAX_SIZE: Final = 2**53
@@ -33,7 +33,7 @@ class Entry:
 class Manifest:
     """The description of an archive."""
 
-    run: Mapping[str, Any]
+    run: JsonView
     """Id, name, seed, creation and status of the run, and the content digest that its result states."""
     topics: Mapping[str, Entry]
     """The messages in the archive, by topic."""
@@ -92,7 +92,7 @@ def read_manifest(data: bytes, where: str) -> Manifest:
     return manifest
 
 
-def _entries(values: Mapping[str, Any]) -> dict[str, Entry]:
+def _entries(values: JsonView) -> dict[str, Entry]:
     entries = {name: Entry(entry["size"], entry["blake3"]) for name, entry in values.items()}
     for name, entry in entries.items():
         sound = (

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -25,6 +25,7 @@ from runner.recording.metadata import check_run, json_object
 from runner.recording.records import MAX_UNPACKED_RATIO
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.util.files import open_regular
+from runner.util.values import Json
 
 MAX_DESCRIPTION_BYTES: Final = 64 << 20
 MAX_ROWS_A_GROUP: Final = 1 << 21
@@ -100,7 +101,7 @@ class Archive(RunDescription):
         return named
 
     @cached_property
-    def _description(self) -> dict[str, Any]:
+    def _description(self) -> Json:
         return json_object(self._bytes(layout.METADATA), str(self.folder / layout.METADATA))
 
     def _invalid(self, error: Exception) -> RecordingError:

@@ -37,6 +37,7 @@ from runner.replay.snapshots import DerivedTables, SnapshotVisitor
 from runner.replay.step_replay import StepReplay
 from runner.util.files import storage_errors
 from runner.util.packing import Packing
+from runner.util.values import Json
 
 _ROWS_AT_ONCE: Final = 1024
 _MAX_STEPS: Final = 2**63 // STEP_NANOSECONDS
@@ -82,7 +83,7 @@ class _Row:
     """A row of snapshots, and its step."""
 
     step: int
-    row: dict[str, Any]
+    row: Json
 
 
 class _Restorer:
@@ -203,7 +204,7 @@ class _Restorer:
         self._pending.acquire()
         self._pipeline.send(topic, records, times, offsets, done=self._pending.release)
 
-    def _rows(self, table: Table) -> Iterator[dict[str, Any]]:
+    def _rows(self, table: Table) -> Iterator[Json]:
         """Yield the rows of a table."""
         limit = BLOCK_BYTES // layout.row_bytes(table.columns)
         has_bytes = any(map(pa.types.is_binary, table.columns.types))

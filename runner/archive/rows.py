@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from blake3 import blake3
 
@@ -13,6 +12,7 @@ from runner.archive.columns import Shape
 from runner.recording import schema
 from runner.recording.messages import Message, QTable, decode, encode, encode_image, encode_log, log_level
 from runner.recording.schema import STEP_NANOSECONDS, Topic
+from runner.util.values import JsonView
 
 _WITH_SPACES: Final = (schema.TRANSITION, schema.RESET)
 """The messages with values of spaces, whose columns differ between runs."""
@@ -57,7 +57,7 @@ def message_row(topic: Topic, payload: bytes, shape: Shape) -> Message:
     return ({"phase": topic.phase} if topic.phase else {}) | values
 
 
-def message_payload(topic: Topic, position: int, row: Mapping[str, Any], shape: Shape) -> bytes:
+def message_payload(topic: Topic, position: int, row: JsonView, shape: Shape) -> bytes:
     """Return the message of a row."""
     if topic.message is schema.LOG:
         return encode_log(row["message"], position * STEP_NANOSECONDS / 1e9, row["level"], row["name"])

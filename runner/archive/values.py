@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from runner.archive.layout import Column, Records
 from runner.recording.spaces import Leaf, encode_text, leaves_of
 from runner.util.arrays import Array
+from runner.util.values import Json, JsonView
 
 MAX_NUMBERS: Final = 64
 """An array with more numbers is one column of bytes."""
@@ -113,13 +114,13 @@ class SpaceColumns:
         ]
         self.columns: list[Column] = [column for _, own in self.columns_by_leaf for column in own]
 
-    def row(self, value: bytes) -> dict[str, Any]:
+    def row(self, value: bytes) -> Json:
         """Return the columns of one encoded value.
 
         Raises:
             ValueError: it is not a value of the space.
         """
-        row: dict[str, Any] = {}
+        row: Json = {}
         at = 0
         for part in self._leaves:
             if part.leaf.dtype is None:
@@ -136,7 +137,7 @@ class SpaceColumns:
             raise ValueError(f"{len(value):,} bytes, expected {at:,}")
         return row
 
-    def value(self, row: Mapping[str, Any]) -> bytes:
+    def value(self, row: JsonView) -> bytes:
         """Return the encoded value of a row of columns."""
         pieces = []
         for part in self._leaves:

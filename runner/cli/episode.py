@@ -58,7 +58,7 @@ class Episode:
         self._length = len(recording.episode_span(choice.phase, choice.number))
         self._title = title
 
-    def steps(self) -> Iterator[dict[str, Any]]:
+    def steps(self) -> Iterator[dict[str, object]]:
         """Yield each step as JSON: with names where the environment's table has them."""
         recording, agents = self._recording, self._recording.agents
         describe = _named(recording) if recording.tabular else _valued(recording, self._phase)
@@ -148,17 +148,17 @@ def _state_drawer(recording: Recording, phase: str, episode: int) -> Callable[..
     return drawn
 
 
-def _named(recording: Recording) -> Callable[[Any], dict[str, Any]]:
+def _named(recording: Recording) -> Callable[[Any], dict[str, object]]:
     """Return a function that gives the states, action and events of a step with their names."""
     mdp, agents = recording.mdp, recording.agents
     states, actions = states_in_words(mdp), actions_in_words(mdp)
     words = {"state": states, "action": actions, "next_state": states}
 
-    def describe(row: Any) -> dict[str, Any]:
+    def describe(row: Any) -> dict[str, object]:
         step = np.asarray(row).reshape(1)
         check_steps(step, mdp, str(recording.path), "recorded")
         events, explored = int(events_of(mdp, step)[0]), int(row["explored"])
-        found: dict[str, Any] = {}
+        found: dict[str, object] = {}
         for name, names in words.items():
             found |= {name: int(row[name]), f"{name}_in_words": names[int(row[name])]}
         return found | {
@@ -169,7 +169,7 @@ def _named(recording: Recording) -> Callable[[Any], dict[str, Any]]:
     return describe
 
 
-def _valued(recording: Recording, phase: str) -> Callable[[Any], dict[str, Any]]:
+def _valued(recording: Recording, phase: str) -> Callable[[Any], dict[str, object]]:
     """Return a function that gives the action of a step, by name where it has one, and the observation."""
     agents = recording.agents if len(recording.agents) > 1 else ("",)
     words = {
@@ -178,7 +178,7 @@ def _valued(recording: Recording, phase: str) -> Callable[[Any], dict[str, Any]]
         if recording.action_names(phase, agent)
     }
 
-    def describe(row: Any) -> dict[str, Any]:
+    def describe(row: Any) -> dict[str, object]:
         if recording.kind == "step":
             found: dict[str, Any] = {name: int(row[name]) for name in ("state", "action", "next_state")}
         else:

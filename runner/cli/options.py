@@ -11,6 +11,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from runner.errors import RunnerError
+from runner.util.values import Json
 
 if TYPE_CHECKING:
     from runner.analysis.axes import Axis
@@ -125,7 +126,7 @@ def _settings(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
     return {f"{key}=": text for key, text in _keys(json_schema()).items()}
 
 
-def _keys(schema: dict[str, Any], part: dict[str, Any] | None = None, prefix: str = "") -> dict[str, str]:
+def _keys(schema: Json, part: Json | None = None, prefix: str = "") -> dict[str, str]:
     """Return the paths of a schema's values, sections included, and what each means."""
     keys = {}
     for name, value in (schema if part is None else part).get("properties", {}).items():

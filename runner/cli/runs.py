@@ -6,9 +6,9 @@ import contextlib
 import os
 import shlex
 import signal
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from runner.archive.places import at_hand
 from runner.cli.output import draw, facts, print_json, say
@@ -17,6 +17,7 @@ from runner.errors import RecordingError, RunnerError, RunNotFound
 from runner.runs.resolve import find_run, find_runs
 from runner.runs.run import RECORDING_FILE, RUN_FILE, SHARDS_FOLDER, recordings_folder
 from runner.util.humanize import UNKNOWN, duration, size
+from runner.util.values import Json, JsonView
 
 if TYPE_CHECKING:
     from runner.api import Interrupt
@@ -183,7 +184,7 @@ def identity(run: Run) -> dict[str, object]:
     return {"run_id": run.run_id, "name": run.name, "seed": run.seed, "status": run.status, "path": path}
 
 
-def run_as_json(run: Run) -> dict[str, Any]:
+def run_as_json(run: Run) -> Json:
     """Return a run that is over and its results as JSON."""
     summary = _summary(run)
     keys = ("content_digest", "episodes", "train_steps", "eval_steps", "seconds", "bytes", "last_evaluation")
@@ -202,7 +203,7 @@ def run_facts(run: Run) -> dict[str, str]:
     }
 
 
-def _summary(run: Run) -> Mapping[str, Any]:
+def _summary(run: Run) -> JsonView:
     """Return the summary of a run; of one that was killed, what its recording holds."""
     from runner.recording.reader import open_recording
 

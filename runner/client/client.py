@@ -23,6 +23,7 @@ from runner.errors import RunnerError
 from runner.recording.labels import as_json
 from runner.runs.run import Run
 from runner.util.files import hash_of
+from runner.util.values import Json
 
 if TYPE_CHECKING:
     from runner.runs.importing import Imported
@@ -138,8 +139,8 @@ class Client(Connection):
     def _deliver(
         self,
         path: Path,
-        announced: dict[str, Any],
-        about: dict[str, Any],
+        announced: Json,
+        about: Json,
         report: Report,
         begun: UploadStatus | None,
     ) -> UploadStatus:

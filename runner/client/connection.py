@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 
 from runner.errors import RunnerError
 from runner.util.extras import require
+from runner.util.values import Json
 
 if TYPE_CHECKING:
     import httpx2
@@ -152,7 +153,7 @@ class Connection:
             self._check(response)
             return response
 
-    def request_object(self, method: str, path: str, **options: Any) -> dict[str, Any]:
+    def request_object(self, method: str, path: str, **options: Any) -> Json:
         """Return the JSON object that a server responds with; errors as for `request`."""
         response = self.request(method, path, **options)
         try:

@@ -7,10 +7,11 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from runner.client.connection import FIRST_PAUSE, ServerUnavailable
 from runner.errors import RunnerError
+from runner.util.values import Json, JsonView
 
 if TYPE_CHECKING:
     from runner.client.connection import Connection
@@ -80,7 +81,7 @@ class BestTrial:
     trial: int
     value: float | None
     """None for a level that was never reached."""
-    values: dict[str, Any]
+    values: Json
     """The parameters of the trial."""
 
 
@@ -129,7 +130,7 @@ class JobEvent:
         return {key: value for key, value in values.items() if value is not None}
 
     @classmethod
-    def from_json(cls, kind: str, values: Mapping[str, Any], event_id: str = "") -> JobEvent:
+    def from_json(cls, kind: str, values: JsonView, event_id: str = "") -> JobEvent:
         """Return an event from a stream or the database.
 
         Raises:
@@ -158,7 +159,7 @@ class RemoteJob:
     runs: int
     """Its number of runs."""
     error: str
-    progress: dict[str, Any] | None
+    progress: Json | None
     """Its progress, if it is running and its worker has reported any."""
     begun: dict[int, str]
     """The ids of started runs by seed; empty for a sweep, whose runs have the tag sweep=NAME."""
@@ -169,7 +170,7 @@ class RemoteJob:
         return self.state in OVER
 
     @classmethod
-    def from_json(cls, response: Mapping[str, Any]) -> RemoteJob:
+    def from_json(cls, response: JsonView) -> RemoteJob:
         """Return the job in a response.
 
         Raises:

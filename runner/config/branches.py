@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import AfterValidator, Field, PlainSerializer, model_serializer
 
 from runner.config.schedules import Probability, StepSize
 from runner.config.sections import Exploration, Hysteretic, Quirks, WolfPhc
 from runner.config.values import FrozenMapping, Optional, Section
+from runner.util.values import Json
 
 
 class Changes(Section):
@@ -24,7 +25,7 @@ class Changes(Section):
     quirks: Optional[Quirks] = Field(default=None, description="The whole section.")
 
     @property
-    def given(self) -> dict[str, Any]:
+    def given(self) -> Json:
         """The settings that change, by key."""
         return {key: value for key, value in self if value is not None}
 

@@ -30,7 +30,7 @@ from runner.config.sections import Recording
 from runner.config.shipped import config_path, suggestion
 from runner.config.values import MAX_DEPTH, Path, Section
 from runner.errors import ConfigError, shortened
-from runner.util.values import NAME_EXPECTED, NAME_PATTERN
+from runner.util.values import NAME_EXPECTED, NAME_PATTERN, Json, JsonView
 
 MAX_BYTES: Final = 1 << 20
 """The largest file that is read; a configuration of a thousand lines is a twentieth of it."""
@@ -166,7 +166,7 @@ def experiment_in(
         raise refuse(problems_in(error, resolved), document) from None
 
 
-def _contradictions(given: Mapping[str, Any]) -> list[Problem]:
+def _contradictions(given: JsonView) -> list[Problem]:
     """Return the problems of keys that are valid alone and contradict each other."""
     problems = []
     mode = given.get("mode")
@@ -300,7 +300,7 @@ def _position(part: str | int, items: Sequence[object]) -> int | None:
     return int(text) if text.isascii() and text.isdecimal() and int(text) < len(items) else None
 
 
-def _default(key: str) -> dict[str, Any]:
+def _default(key: str) -> Json:
     """Return the default of a section as plain values; empty for other keys."""
     field = ExperimentFile.model_fields.get(key)
     default = field.default if field else None

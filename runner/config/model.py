@@ -29,7 +29,7 @@ from runner.config.sections import (
     WolfPhc,
 )
 from runner.config.values import Optional, Section, refusal
-from runner.util.values import NAME_EXPECTED, NAME_PATTERN
+from runner.util.values import NAME_EXPECTED, NAME_PATTERN, Json
 
 Mode = Literal["cooperative", "competitive"]
 Tables = Literal["joint", "per_agent"]
@@ -267,7 +267,7 @@ class ExperimentConfig(Settings):
         """The keys that this experiment has no value for."""
         return {key for key in (*SECTION_OF, "branches") if not getattr(self, key)}
 
-    def to_mapping(self) -> dict[str, Any]:
+    def to_mapping(self) -> Json:
         """Return plain values, fit for JSON, which `from_mapping` takes back to an equal object.
 
         Sections of other algorithms are left out, and `branches` if there are none.

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from runner.config.values import Count, Fraction, Section, refusal
 from runner.errors import nearest
+from runner.util.values import Json
 
 By = Annotated[
     Literal["episode", "step"],
@@ -27,7 +28,7 @@ Point = Annotated[
 ]
 
 
-def _names_itself(schema: dict[str, Any]) -> None:
+def _names_itself(schema: Json) -> None:
     """Require the key `schedule` in a file, where it distinguishes the kinds; in Python the class does."""
     schema["required"] = ["schedule", *schema.get("required", [])]
 

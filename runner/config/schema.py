@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 from runner.config.model import KEYS, ExperimentFile
+from runner.util.values import Json, JsonView
 
-Schema = Mapping[str, Any]
+Schema = JsonView
 
 
-def json_schema() -> dict[str, Any]:
+def json_schema() -> Json:
     """Return the JSON Schema (draft 2020-12) of what a YAML file may contain, shorthands included."""
     return copy.deepcopy(_schema())
 
 
 @functools.cache
-def _schema() -> dict[str, Any]:
+def _schema() -> Json:
     from pydantic.json_schema import GenerateJsonSchema
 
     schema = ExperimentFile.model_json_schema()
@@ -39,7 +40,7 @@ def _schema() -> dict[str, Any]:
     }
 
 
-def without_references(schema: Mapping[str, Any]) -> Schema:
+def without_references(schema: JsonView) -> Schema:
     """Return a schema with each `$ref` followed and its name as `ref`; it must not contain itself."""
 
     def followed(node: Any) -> Any:

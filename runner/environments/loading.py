@@ -24,7 +24,7 @@ from runner.environments.toy_text import grid_world
 from runner.errors import EnvironmentNotUsable
 
 
-def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> Mdp:
+def load_mdp(env_id: str, kwargs: Mapping[str, object], rewards: str = "team") -> Mdp:
     """Make the environment and return its arrays.
 
     Args:
@@ -52,7 +52,7 @@ def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> M
     return mdp
 
 
-def mdp_of(env: Any, kwargs: Mapping[str, Any]) -> Mdp:
+def mdp_of(env: Any, kwargs: Mapping[str, object]) -> Mdp:
     """Return the arrays of an environment made with `kwargs`, whose agents share the reward.
 
     Raises:
@@ -70,7 +70,7 @@ def mdp_of(env: Any, kwargs: Mapping[str, Any]) -> Mdp:
     return mdp
 
 
-def _read(env_id: str, kwargs: Mapping[str, Any], env: Any, rewards: str) -> Mdp:
+def _read(env_id: str, kwargs: Mapping[str, object], env: Any, rewards: str) -> Mdp:
     """Return the attributes of an environment, not yet checked; a team shares the summed reward."""
     from runner.config.values import plain  # reading a recording needs none of it
 
@@ -108,7 +108,7 @@ def _one_reward_only(env_id: str) -> EnvironmentNotUsable:
     )
 
 
-def _make(env_id: str, kwargs: dict[str, Any]) -> Any:
+def _make(env_id: str, kwargs: Mapping[str, Any]) -> Any:
     """Return the environment, without the wrappers that only check or render."""
     import gymnasium
 

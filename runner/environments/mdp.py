@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from runner.environments.scene import SceneDescription, scene_mistake
 from runner.errors import EnvironmentNotUsable
 from runner.util.arrays import Array
-from runner.util.values import is_text, is_whole
+from runner.util.values import Json, JsonView, is_text, is_whole
 
 Indices = NDArray[np.integer[Any]]
 """Numbers of states or actions, as recorded in one integer type or another."""
@@ -41,7 +41,7 @@ class Mdp:
     """A Markov decision process: S states, J joint actions, at most K outcomes a pair, R reward columns."""
 
     env_id: str
-    kwargs: Mapping[str, Any]
+    kwargs: JsonView
     next_state: NDArray[np.int32]
     """[S, J, K]."""
     probability: NDArray[np.float64]
@@ -111,7 +111,7 @@ class Mdp:
             "all: set `rewards: team`, or `tables: per_agent`."
         )
 
-    def description(self) -> dict[str, Any]:
+    def description(self) -> Json:
         """Return all fields that are not arrays, as JSON can hold them."""
         return {
             "env_id": self.env_id,
@@ -125,7 +125,7 @@ class Mdp:
             "scene": None if self.scene is None else dict(self.scene),
         }
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
+    def arrays(self) -> dict[str, Array]:
         """Return the arrays by field name."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return {name: value for name, value in fields.items() if isinstance(value, np.ndarray)}
@@ -187,7 +187,7 @@ def _events(mdp: Mdp, steps: NDArray[np.void]) -> NDArray[np.uint32]:
     return np.where(likely.any(axis=1), mdp.events[state, action, outcome], np.uint32(0))
 
 
-def from_parts(description: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Mdp:
+def from_parts(description: JsonView, arrays: Mapping[str, NDArray[Any]]) -> Mdp:
     """Return the Mdp that `description()` and `arrays()` came from, checked like a new one.
 
     Raises:
@@ -299,7 +299,7 @@ def _in_words(found: object) -> str:
     return f"{found!r:.100}"
 
 
-def _range(values: NDArray[Any]) -> str:
+def _range(values: Array) -> str:
     return f"{values.min()} to {values.max()}" if values.size else "none"
 
 

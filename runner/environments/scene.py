@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, NotRequired, TypedDict, TypeGuard
+from typing import Final, NotRequired, TypedDict, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.util.values import is_text, is_whole
+from runner.util.values import JsonView, is_text, is_whole
 
 MAX_CELLS: Final = 2**15 - 1
 """Cells are numbered in int16."""
@@ -132,7 +132,7 @@ def _is_pair(value: object) -> TypeGuard[Sequence[object]]:
     return isinstance(value, list | tuple) and len(value) == 2
 
 
-def _has_texts(value: object, *keys: str) -> TypeGuard[Mapping[str, Any]]:
+def _has_texts(value: object, *keys: str) -> TypeGuard[JsonView]:
     return isinstance(value, Mapping) and all(is_text(value.get(key)) for key in keys)
 
 
@@ -149,7 +149,7 @@ def _is_thing(value: object) -> bool:
     return _has_texts(value, "name", "label", "kind") and _is_optional(value, "agent", "colour")
 
 
-def _is_optional(value: Mapping[str, Any], *keys: str) -> bool:
+def _is_optional(value: JsonView, *keys: str) -> bool:
     return all(value.get(key) is None or is_text(value[key]) for key in keys)
 
 

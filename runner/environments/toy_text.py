@@ -29,7 +29,7 @@ Events = Mapping[str, NDArray[np.bool_]]
 class GridWorld:
     """What an adapter adds to an environment's transition table."""
 
-    scene: Mapping[str, Any]
+    scene: Mapping[str, object]
     scene_cells: NDArray[np.int16]
     """[S, things]."""
     scene_carriers: NDArray[np.int8]

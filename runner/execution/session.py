@@ -21,7 +21,7 @@ from runner.execution.initial_tables import configured_tables, resolve_job
 from runner.learning.learner import Held, Learner
 from runner.planning import ExactEvaluator
 from runner.recording import schema
-from runner.recording.messages import QTable, encode, encode_log, encode_q_table
+from runner.recording.messages import Message, QTable, encode, encode_log, encode_q_table
 from runner.recording.metadata import (
     Attachments,
     environment_attachments,
@@ -52,7 +52,7 @@ class Progress:
     train_steps: int = 0
     eval_steps: int = 0
     bytes_written: int = 0
-    evaluations: list[dict[str, Any]] = field(default_factory=list)
+    evaluations: list[Message] = field(default_factory=list)
     """The metrics of every evaluation so far; `optimality` has the exact ones, if they are computed."""
     log: list[str] = field(default_factory=list)
     """The log so far; of a resumed run, what its recording did not have before."""
@@ -67,7 +67,7 @@ class Observer(Protocol):
     def steps(self, phase: str, before: int, steps: NDArray[np.void]) -> None:
         """See new steps of a phase; `before` steps of both phases were executed before the first."""
 
-    def metrics(self, phase: str, time: int, metrics: dict[str, Any]) -> None:
+    def metrics(self, phase: str, time: int, metrics: Message) -> None:
         """See new metrics of a phase, after `time` steps of both."""
 
 
@@ -282,7 +282,7 @@ class Session:
         if self._observer is not None:
             self._observer.metrics(phase, sum(self.recorder.steps.values()), metrics)
 
-    def _measure_exactly(self, metrics: dict[str, Any]) -> None:
+    def _measure_exactly(self, metrics: Message) -> None:
         """Record what the evaluated policy gets from every start state, and the optimum."""
         exact = self._exact_evaluator.measure(self._learner.policy, metrics["discount"])
         position = {name: metrics[name] for name in ("step", "episode", "evaluation")}
@@ -323,7 +323,7 @@ class Session:
         self._report(progress)
 
 
-def evaluation_metrics(learner: Learner, evaluation: int, trials: Any) -> dict[str, Any]:
+def evaluation_metrics(learner: Learner, evaluation: int, trials: Any) -> Message:
     """Return the metrics of an evaluation from its episode records, and of training at that moment."""
     known = bool(learner.mdp.success_events)
     successes = int(trials["success"].sum())
@@ -338,7 +338,7 @@ def evaluation_metrics(learner: Learner, evaluation: int, trials: Any) -> dict[s
     }
 
 
-def evaluation_brief(metrics: dict[str, Any]) -> dict[str, Any]:
+def evaluation_brief(metrics: Message) -> Message:
     """Return the metrics of an evaluation for a summary; unknown values are None."""
     values = {metric.name: metrics[metric.field] for metric in METRICS if not metric.per_agent}
     return {

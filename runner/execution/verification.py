@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from runner.errors import Diverged
 from runner.recording.reader import Recording
 from runner.runs.provenance import Differences
+from runner.util.values import Json
 
 LOOP_NOT_COMPARED: Final = (
     "how its environment is described: scene, names of actions, agents, events and landmarks, step limit"
@@ -86,7 +87,7 @@ def compare_values(path: str, found: object, expected: object) -> None:
         raise Diverged("environment.json", path, found, expected)
 
 
-def compare_result(found: Verification, recording: Recording, expected: dict[str, Any]) -> Verification:
+def compare_result(found: Verification, recording: Recording, expected: Json) -> Verification:
     """Compare the result in a recording with the computed one."""
     for key, value in expected.items():
         if recording.result.get(key) != value:

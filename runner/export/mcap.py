@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from runner.errors import RecordingError, RunnerError
 from runner.export.places import write_new
@@ -16,6 +16,7 @@ from runner.recording.rewriting import rewrite
 from runner.recording.schema import CONSOLE_TOPIC
 from runner.runs.importing import EXPORT_RECORD
 from runner.runs.run import Run
+from runner.util.values import Json
 
 PRIVATE: Final = ("host", "user", "command", "directory")
 """The entries of provenance that identify persons and places."""
@@ -71,7 +72,7 @@ def _record(run: Run, anonymous: bool) -> dict[str, object]:
     summary = {key: run.summary[key] for key in ("seconds", "error", "bytes") if key in run.summary}
     if anonymous and "error" in summary:
         summary["error"] = LEFT_OUT
-    record: dict[str, Any] = {"anonymous": anonymous, "status": run.status, "name": run.file.name}
+    record: Json = {"anonymous": anonymous, "status": run.status, "name": run.file.name}
     record |= {"summary": summary, "labels": as_json(run.labels)}
     return record | ({"proof": run.file.proof} if run.file.proof else {})
 

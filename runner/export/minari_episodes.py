@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.export.contents import Ranges
 from runner.recording import schema
+from runner.recording.messages import Message
 from runner.recording.reader import Recording
 
 MAX_EPISODE_BYTES: Final = 1 << 30
 """The limit of one episode, which Minari needs in memory."""
-Steps = NDArray[np.void] | list[dict[str, Any]]
+Steps = NDArray[np.void] | list[Message]
 """Records of one size, or mappings where values vary in size."""
 
 
@@ -164,7 +165,7 @@ def _extend(
 
 def _variable_steps(
     recording: Recording, phase: str, lengths: Mapping[int, int]
-) -> Iterator[tuple[int, list[dict[str, Any]]]]:
+) -> Iterator[tuple[int, list[Message]]]:
     """Yield the steps of each episode of the only environment."""
     for _, group in groupby(recording.transitions(phase), key=lambda step: step["episode"]):
         steps = list(group)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 from collections import deque
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from typing import Any, Final
 
@@ -20,6 +20,7 @@ from runner.drawing.raster import Pixels, SceneRaster
 from runner.errors import RecordingError
 from runner.export.values import Values
 from runner.recording import schema
+from runner.recording.messages import Message
 from runner.recording.reader import Recording
 from runner.replay.environment import redo_in_child
 from runner.replay.steps import check_steps, recorded_frames, reset_of, transitions_of
@@ -52,7 +53,7 @@ def paint_scene(recording: Recording, phase: str, episode: int) -> Painted:
 
 def paint_recorded(recording: Recording, phase: str, episode: int) -> Painted:
     """Show the last frame that was recorded up to each step."""
-    last: Mapping[str, Any] = {}
+    last: Message = {}
     shown: Pixels | None = None
     for frame in recorded_frames(recording, phase, episode):
         if shown is None or frame is not last:
@@ -60,7 +61,7 @@ def paint_recorded(recording: Recording, phase: str, episode: int) -> Painted:
         yield shown
 
 
-def _pixels(recording: Recording, frame: Mapping[str, Any], before: Pixels | None) -> Pixels:
+def _pixels(recording: Recording, frame: Message, before: Pixels | None) -> Pixels:
     """Return a recorded frame in the size of the one before it, if there is one.
 
     Raises:

@@ -16,13 +16,14 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from runner.analysis.series import training_step
 from runner.errors import RecordingError
 from runner.recording.clock import read_clock
+from runner.recording.messages import Message
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording
 from runner.recording.schema import PHASES, SCALAR_TOPIC, STEP_NANOSECONDS
@@ -150,11 +151,11 @@ def created(recording: Recording) -> float:
         ) from error
 
 
-def _measures(phase: str, row: Mapping[str, Any], values: Mapping[str, float]) -> Measures:
+def _measures(phase: str, row: Message, values: Mapping[str, float]) -> Measures:
     return Measures(phase, row["log_time"] // STEP_NANOSECONDS, row["step"], row["episode"], values)
 
 
-def _named(row: Mapping[str, Any], fields: Mapping[str, str], owners: Sequence[str]) -> dict[str, float]:
+def _named(row: Message, fields: Mapping[str, str], owners: Sequence[str]) -> dict[str, float]:
     """Return the known values of fields by name; a list has a value for each owner, `NAME/OWNER`."""
     values: dict[str, float] = {}
     for name, field in fields.items():

@@ -335,9 +335,9 @@ def _arrays(state: Mapping[object, object], prefix: str = "") -> Iterator[tuple[
             yield f"{prefix}{key}", value
 
 
-def _settings(algorithm: Algorithm) -> dict[str, Any]:
+def _settings(algorithm: Algorithm) -> dict[str, object]:
     """Return the configuration of an algorithm as JSON holds it; what JSON cannot hold, as text."""
-    found: dict[str, Any] = {"algorithm": type(algorithm).__name__}
+    found: dict[str, object] = {"algorithm": type(algorithm).__name__}
     for key, value in algorithm.config.to_dict().items():
         if key == "callbacks":
             continue

@@ -297,9 +297,9 @@ def as_number(name: str, value: object) -> object:
         ) from error
 
 
-def _settings(table: str) -> dict[str, Any]:
+def _settings(table: str) -> dict[str, object]:
     """Return the rows `|name|value|` of a Markdown table; values as Python writes them, else as text."""
-    settings: dict[str, Any] = {}
+    settings: dict[str, object] = {}
     for line in table.splitlines():
         if found := re.fullmatch(r"\|([^|]+)\|(.*)\|", line.strip()):
             name, text = found.groups()

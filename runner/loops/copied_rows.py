@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from runner.environments.mdp import Mdp
 from runner.loops.rows import Rows
 from runner.recording import schema
-from runner.recording.messages import encode
+from runner.recording.messages import Message, encode
 from runner.recording.recorder import Recorder
 from runner.util.arrays import Ints
 
@@ -55,7 +55,7 @@ class _Copies(Rows):
 class CopiedRows(_Copies):
     """Rows of one size that are copied."""
 
-    def put_reset(self, reset: Mapping[str, Any], environment: int) -> None:
+    def put_reset(self, reset: Message, environment: int) -> None:
         """Copy a reset."""
         self._reset_block["environment"][len(self._reset_rows)] = environment
         self.reset(reset["observation"], int(reset["seed"]) if reset["seeded"] else None)
@@ -122,7 +122,7 @@ class CopiedMessages(_Copies):
         self._paid = np.zeros(4096)
         return len(self._paid), len(self._paid)
 
-    def put_reset(self, reset: Mapping[str, Any], environment: int) -> None:
+    def put_reset(self, reset: Message, environment: int) -> None:
         """Copy a reset."""
         fields = {"reset": self.resets, "episode": self.begun + 1, "step": self.place[0]}
         fields |= {"environment": environment}
@@ -131,7 +131,7 @@ class CopiedMessages(_Copies):
         self._recorder.append(self._resets, encode(schema.RESET, _payload(reset) | fields), position)
         self.reset(None, seed)
 
-    def put(self, rows: Sequence[Mapping[str, Any]]) -> None:
+    def put(self, rows: Sequence[Message]) -> None:
         """Copy consecutive steps of the environment that was reset last."""
         for row in rows:
             is_first = row["t"] == 0

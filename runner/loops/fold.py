@@ -22,6 +22,7 @@ from runner.loops.shard_sources import PHASES, Source
 from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.messages import (
+    Message,
     decode,
     encode,
     encode_image,
@@ -278,7 +279,7 @@ class Fold:
             else:
                 yield from self._moment(source, topic, position, fields)
 
-    def _info(self, source: Source, phase: str, fields: dict[str, Any]) -> Iterator[tuple[int, bytes]]:
+    def _info(self, source: Source, phase: str, fields: Message) -> Iterator[tuple[int, bytes]]:
         if not fields["reset"]:
             if fields["step"] < source.stops[phase]:
                 step, position = source.step_place(phase, fields["step"])
@@ -288,7 +289,7 @@ class Fold:
             own = fields | {"step": int(unit["new_step"])}
             yield int(unit["new_position"]), encode(schema.INFO, own)
 
-    def _frame(self, source: Source, phase: str, position: int, fields: dict[str, Any]) -> tuple[int, bytes]:
+    def _frame(self, source: Source, phase: str, position: int, fields: Message) -> tuple[int, bytes]:
         environment, is_reset = frame_place(fields)
         step = source.phase_steps(phase, position)
         if is_reset:
@@ -298,7 +299,7 @@ class Fold:
         return place, encode_image(fields["data"], fields["format"], place, frame_id(phase, None, is_reset))
 
     def _moment(
-        self, source: Source, topic: Topic, position: int, fields: dict[str, Any]
+        self, source: Source, topic: Topic, position: int, fields: Message
     ) -> Iterator[tuple[int, bytes]]:
         """Yield a message that belongs to a moment: a logged number, a text, an array, a checkpoint."""
         key, place = self._place(source, position)

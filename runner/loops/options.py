@@ -18,7 +18,7 @@ from runner.runs.run import Run
 from runner.runs.shards import find_joined
 from runner.util.extras import require
 from runner.util.jsonable import as_json, as_mapping
-from runner.util.values import checked_run_name, is_whole
+from runner.util.values import Json, checked_run_name, is_whole
 
 MADE_BY: Final = "runner.record"
 ALL_INFO: Final = "*"
@@ -110,7 +110,7 @@ class Options:
                 raise ConfigError(f"{key}: found {getattr(self, key)!r}, expected {expected}")
         checked_run_name(self.name)
 
-    def config(self, described: Described) -> dict[str, Any]:
+    def config(self, described: Described) -> Json:
         """Return the configuration that the recording carries.
 
         Raises:

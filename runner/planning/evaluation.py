@@ -328,7 +328,7 @@ def start_mean(mdp: Mdp, values: NDArray[np.float64]) -> float:
     return _mean(values, mdp.start)
 
 
-def _mean(values: NDArray[Any], weights: NDArray[np.float64]) -> float:
+def _mean(values: NDArray[np.float64] | NDArray[np.bool_], weights: NDArray[np.float64]) -> float:
     """Return the weighted mean, correctly rounded sums: 100 % is 100."""
     return math.fsum((values * weights).tolist()) / math.fsum(weights.tolist())
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
 from runner.planning import kernel
+from runner.util.arrays import Scalar
 
 TOLERANCE: Final = 1e-10
 """How far a value may be from the true one."""
@@ -84,7 +85,7 @@ def best_response_to_stochastic(
     widths = tuple(policy.shape[1] for policy in policies)
     states, outcomes = mdp.states, mdp.probability.shape[2]
 
-    def by_own_action(array: NDArray[Any]) -> NDArray[Any]:
+    def by_own_action(array: NDArray[Scalar]) -> NDArray[Scalar]:
         """Return [S, J, K] as [S, own action, others' joint actions and outcomes]."""
         parts = np.moveaxis(array.reshape(states, *widths, outcomes), 1 + learner, 1)
         return parts.reshape(states, widths[learner], -1)

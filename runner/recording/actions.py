@@ -8,9 +8,9 @@ step before of the same environment; and every column byte by byte, as that comp
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from blake3 import blake3
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.messages import Message
 from runner.util.arrays import Array
 
 DIGEST_BYTES: Final = 16

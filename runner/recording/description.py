@@ -7,7 +7,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names, actions_in_words
@@ -29,6 +28,7 @@ from runner.recording.metadata import (
 )
 from runner.recording.run_file import Summary, parse_result
 from runner.recording.schema import Topic
+from runner.util.values import Json
 
 
 class RunDescription(ABC):
@@ -98,7 +98,7 @@ class RunDescription(ABC):
         return tuple(map(str, json.loads(self.run["agents"])))
 
     @cached_property
-    def config(self) -> dict[str, Any]:
+    def config(self) -> Json:
         """The resolved configuration, as `runner.config.from_mapping` takes it."""
         return self._json("config")
 
@@ -142,7 +142,7 @@ class RunDescription(ABC):
             raise RecordingError(f"{self.path}: its result is damaged: {'; '.join(problems)}.")
         return result
 
-    def run_facts(self) -> dict[str, Any]:
+    def run_facts(self) -> Json:
         """Return the contents of `run.json`, from the recording alone; the result in it is unchecked."""
         result = self.raw_result
         return {
@@ -212,7 +212,7 @@ class RunDescription(ABC):
         return schema.KINDS[self.kind]
 
     @cached_property
-    def environment(self) -> dict[str, Any]:
+    def environment(self) -> Json:
         """The environment's description without its arrays: agents, events, scene; not to be changed."""
         return environment_description(self.attachment("environment.json"), str(self.path))
 
@@ -295,7 +295,7 @@ class RunDescription(ABC):
         return environment_of(self.environment, self.attachment, str(self.path))
 
     @cached_property
-    def spaces(self) -> dict[str, Any]:
+    def spaces(self) -> Json:
         """The descriptions of the `observation` and the `action` space of a loop's recording."""
         return spaces_of(self.run, str(self.path))
 

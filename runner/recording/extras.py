@@ -23,7 +23,7 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import Sizes, record_dtype
 from runner.recording.metadata import json_object
-from runner.recording.spaces import dtype_of
+from runner.recording.spaces import Description, dtype_of
 from runner.recording.topic_chunks import TopicChunks
 from runner.util.arrays import Array, MaskedArray
 from runner.util.values import is_text
@@ -62,7 +62,7 @@ class ExtraLayout:
         return record_dtype(schema.EXTRA, self.sizes)
 
     @property
-    def description(self) -> dict[str, Any]:
+    def description(self) -> Description:
         """The names as a `Dict` space, as `spaces` describes one."""
         parts = {}
         for name in self.names:

@@ -6,7 +6,7 @@ runner.register_space(Board, to_json=lambda board: board.cells, from_json=Board.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -82,7 +82,7 @@ def value_of(space: Space, text: str) -> object:
         raise ValueError(f"{type(error).__name__}: {error}") from error
 
 
-def structure_of(space: Space, describe: Callable[[Space], Any]) -> dict[str, Any]:
+def structure_of(space: Space, describe: Callable[[Space], object]) -> Mapping[str, object]:
     """Return what describes a space whose values are recorded as text.
 
     Args:

@@ -6,19 +6,19 @@ import contextlib
 import os
 import socket
 import time
-from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from runner.util.files import read_object
+from runner.util.values import Json, JsonView
 
 _MAX_RUN_FILE_BYTES: Final = 8 << 20
 HEARTBEAT_SECONDS: Final = 15.0
 """On another host, a run without a heartbeat for this long counts as interrupted."""
 
 
-def owner() -> dict[str, Any]:
+def owner() -> Json:
     """Return the identity of this process: host, boot, process id and start."""
     return {"host": socket.gethostname(), **_of_process(os.getpid())}
 
@@ -29,7 +29,7 @@ def _of_process(pid: int) -> dict[str, object]:
     return {"boot_id": boot_id(), "pid": pid, "process_started": process_start(pid)}
 
 
-def is_alive(owner: Mapping[str, Any], heartbeat: Path) -> bool:
+def is_alive(owner: JsonView, heartbeat: Path) -> bool:
     """Return whether an owner is alive: its process, if it is on this machine; else by its last heartbeat.
 
     Args:

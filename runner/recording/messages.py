@@ -263,7 +263,7 @@ def frame_id(phase: str, environment: int | None, is_reset: bool) -> str:
     return "/".join(place)
 
 
-def frame_place(frame: Mapping[str, Any]) -> tuple[int, bool]:
+def frame_place(frame: Message) -> tuple[int, bool]:
     """Return the environment of a decoded frame, and whether it shows the state after a reset.
 
     Recordings of earlier versions do not mark resets.

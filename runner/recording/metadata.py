@@ -9,7 +9,7 @@ import base64
 import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import zstandard
 
@@ -25,7 +25,15 @@ from runner.recording.schema import Topic
 from runner.recording.spaces import dtype_of, leaves_of
 from runner.recording.writer import RecordingFile, storage_error
 from runner.util.arrays import Array
-from runner.util.values import MAX_JSON_DEPTH, is_text, is_too_deep, is_whole, without_surrogates
+from runner.util.values import (
+    MAX_JSON_DEPTH,
+    Json,
+    JsonView,
+    is_text,
+    is_too_deep,
+    is_whole,
+    without_surrogates,
+)
 
 REQUIRED_RECORDS: Final = frozenset({"run", "config", "provenance"})
 """The metadata records without which a recording's messages cannot be interpreted."""
@@ -137,7 +145,7 @@ def kind_of(run: Mapping[str, str]) -> str:
     return run.get("kind", "job")
 
 
-def spaces_of(run: Mapping[str, str], path: str) -> dict[str, Any]:
+def spaces_of(run: Mapping[str, str], path: str) -> Json:
     """Return the descriptions of the spaces, `observation` and `action`, that a loop's recording has.
 
     Raises:
@@ -210,7 +218,7 @@ def lost_ranges(repair: Mapping[str, object], path: str) -> dict[str, list[list[
 # --- the environment ----------------------------------------------------------------------------------
 
 
-def environment_attachments(description: Mapping[str, Any], arrays: Mapping[str, Array]) -> Attachments:
+def environment_attachments(description: JsonView, arrays: Mapping[str, Array]) -> Attachments:
     """Return the attachments that describe an environment: its description, and its arrays if it has any."""
     text = _indented(json.dumps({**description, "arrays": sorted(arrays)}, sort_keys=True))
     return {"environment.json": ("application/json", text.encode())} | {
@@ -239,7 +247,7 @@ def environment_description(text: bytes, path: str) -> dict[str, object]:
     return description
 
 
-def environment_of(description: Mapping[str, Any], attachment: Callable[[str], bytes], path: str) -> Mdp:
+def environment_of(description: JsonView, attachment: Callable[[str], bytes], path: str) -> Mdp:
     """Return the environment that a recording describes.
 
     Args:

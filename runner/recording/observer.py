@@ -15,13 +15,13 @@ import weakref
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from runner.recording import schema
 from runner.recording.clock import SAMPLE_SECONDS, Stopwatch, interval
 from runner.recording.console import ConsoleLog, Tee
 from runner.recording.host import HostSampler
-from runner.recording.messages import encode
+from runner.recording.messages import Message, encode
 from runner.recording.schema import Topic
 
 _MAX_WAITING: Final = 1 << 18
@@ -62,7 +62,7 @@ class Observer:
         """Return whether a sample of the machine is due."""
         return self.host and self._stopwatch.has_begun and self._stopwatch.seconds >= self._next_host
 
-    def see_host(self, sample: dict[str, Any]) -> None:
+    def see_host(self, sample: Message) -> None:
         """Take in a sample of the machine."""
         seconds = self._stopwatch.seconds
         self._next_host = seconds + interval(seconds) - SAMPLE_SECONDS / 2

@@ -27,6 +27,7 @@ from runner.recording.extras import ExtraLayout, Extras, read_layouts
 from runner.recording.labels import read_labels
 from runner.recording.liveness import is_owned
 from runner.recording.messages import (
+    Message,
     QTable,
     Snapshot,
     decode,
@@ -333,21 +334,21 @@ class Recording(TopicReader):
         """Yield the arrays that a loop recorded by `snapshot`, in order."""
         return (array for _, array in self._parsed(schema.ARRAY_TOPIC, decode_array))
 
-    def metrics(self, phase: str) -> list[dict[str, Any]]:
+    def metrics(self, phase: str) -> list[Message]:
         """Return the metrics of a phase, in order.
 
         Raises:
             RecordingError: they are damaged, or more than 131,072; `iter_metrics` yields them one by one.
             ValueError: there is no such phase.
         """
-        metrics: list[dict[str, Any]] = []
+        metrics: list[Message] = []
         for one in self.iter_metrics(phase):
             if len(metrics) == MAX_METRICS:
                 raise RecordingError(f"{self.path}: has more than {MAX_METRICS:,} {phase} metrics.")
             metrics.append(one)
         return metrics
 
-    def iter_metrics(self, phase: str) -> Iterator[dict[str, Any]]:
+    def iter_metrics(self, phase: str) -> Iterator[Message]:
         """Yield the metrics of a phase (`train` or `eval`), in order.
 
         Raises:
@@ -359,7 +360,7 @@ class Recording(TopicReader):
         topic = schema.TRAIN_METRICS_TOPIC if phase == "train" else schema.EVAL_METRICS_TOPIC
         yield from self._measures(topic)
 
-    def optimality(self) -> Iterator[dict[str, Any]]:
+    def optimality(self) -> Iterator[Message]:
         """Yield the exact measures of the evaluations, in order; none unless `evaluation.exact` was set."""
         yield from self._measures(schema.OPTIMALITY_TOPIC)
 

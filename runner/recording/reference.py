@@ -6,15 +6,15 @@ that are still missing. This is how a run is resumed, and how a recording is ver
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import Diverged
 from runner.recording import schema
-from runner.recording.messages import decode
+from runner.recording.messages import Message, decode
 from runner.recording.schema import BLOCK_TOPICS, Topic
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ def _message_difference(topic: Topic, found: tuple[int, bytes], expected: tuple[
     return Diverged(topic.name, "bytes", f"{len(found[1])} bytes", other, **place)
 
 
-def _cell_difference(found: Mapping[str, Any], expected: Mapping[str, Any]) -> tuple[str, object, object]:
+def _cell_difference(found: Message, expected: Message) -> tuple[str, object, object]:
     """Return the first cell in which two Q-tables differ, and its values."""
     left, right = (np.frombuffer(values["data"], "<f8") for values in (found, expected))
     if left.shape != right.shape:

@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple, TypeGuard
 
 from runner.errors import shortened
 from runner.recording.metrics import METRICS
-from runner.util.values import MAX_JSON_DEPTH, is_too_deep
+from runner.util.values import MAX_JSON_DEPTH, JsonView, is_too_deep
 
 STATED_STATUSES: Final = ("running", "finished", "interrupted", "failed")
 """The statuses that a run's owner writes."""
@@ -45,7 +45,7 @@ class EvaluationMetrics:
     """Value by name of a metric; the sum over agents of one that each agent has, known of loops."""
 
     @classmethod
-    def of(cls, record: Mapping[str, Any]) -> EvaluationMetrics:
+    def of(cls, record: JsonView) -> EvaluationMetrics:
         """Return the figures of a summary's `last_evaluation`."""
         values = {metric.name: record.get(metric.name) for metric in METRICS}
         return cls(record.get("episode"), record.get("trials"), values)
@@ -90,7 +90,7 @@ class Summary(Mapping[str, Any]):
     bytes: int | None = None
     """Size of the recording."""
     error: str | None = None
-    values_by_key: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    values_by_key: JsonView = field(default_factory=dict, repr=False)
 
     def __getitem__(self, key: str) -> Any:
         return self.values_by_key[key]
@@ -127,8 +127,8 @@ class RunFile:
     """One of `STATED_STATUSES`; `interrupted` if the file states none of them."""
     created: datetime | None
     """In UTC."""
-    owner: Mapping[str, Any]
-    config: Mapping[str, Any]
+    owner: JsonView
+    config: JsonView
     """As it was written: only its depth is checked."""
     summary: Summary
     archive: ArchiveReference
@@ -172,7 +172,7 @@ def parse_result(record: Mapping[str, object], problems: list[str]) -> Summary:
     return _parse_summary(_without_deep_values(record, problems), "", problems)
 
 
-def _parse_summary(record: Mapping[str, Any], prefix: str, problems: list[str]) -> Summary:
+def _parse_summary(record: JsonView, prefix: str, problems: list[str]) -> Summary:
     values = _valid(record, _SUMMARY, prefix, problems)
     if isinstance(values.get("last_evaluation"), dict):
         values["last_evaluation"] = {
@@ -198,9 +198,7 @@ def run_title(name: str, seed: int | None) -> str:
     return name if seed is None else f"{name}, seed {seed}"
 
 
-def _valid(
-    record: Mapping[str, Any], checks: Mapping[str, Check], prefix: str, problems: list[str]
-) -> dict[str, Any]:
+def _valid(record: JsonView, checks: Mapping[str, Check], prefix: str, problems: list[str]) -> dict[str, Any]:
     """Return the valid values, and those without a check; name the others in `problems`."""
     values = {}
     for key, value in record.items():
@@ -212,7 +210,7 @@ def _valid(
     return values
 
 
-def _archive(record: Mapping[str, Any], problems: list[str]) -> ArchiveReference:
+def _archive(record: JsonView, problems: list[str]) -> ArchiveReference:
     values = _valid(record, _ARCHIVE, "archive.", problems)
     done = _parse_summary(values.get("done") or {}, "archive.done.", problems)
     return ArchiveReference(values.get("target", ""), values.get("digest") or "", done)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property, partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from runner.recording.blocks import record_dtype
 from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.description import RunDescription
 from runner.recording.index import read_index
-from runner.recording.messages import decode
+from runner.recording.messages import Message, decode
 from runner.recording.metadata import check_file, sizes_of
 from runner.recording.record_store import RecordStore
 from runner.recording.schema import Topic
@@ -158,7 +158,7 @@ class TopicReader(RunDescription):
 
     def decoded(
         self, topic: Topic, max_bytes: int = MAX_CHUNK_BYTES, times: range | None = None
-    ) -> Iterator[dict[str, Any]]:
+    ) -> Iterator[Message]:
         """Yield the messages of a topic of variable size: `log_time` and the fields, by name.
 
         Args:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from runner.environments.mdp import Mdp
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.messages import frame_place
+from runner.recording.messages import Message, frame_place
 from runner.recording.reader import Recording
 
 _END_OF_TIME: Final = 2**62
@@ -117,9 +117,7 @@ def reset_of(recording: Recording, phase: str, episode: int) -> Any | None:
     return found
 
 
-def recorded_frames(
-    recording: Recording, phase: str, episode: int, start: int = 0
-) -> Iterator[dict[str, Any]]:
+def recorded_frames(recording: Recording, phase: str, episode: int, start: int = 0) -> Iterator[Message]:
     """Yield the last frame that was recorded up to each step of an episode, as a decoded message.
 
     Args:

@@ -14,7 +14,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.recording.integrity import is_merely_cut_off
@@ -29,7 +29,7 @@ from runner.runs.resolve import run_with_id
 from runner.runs.run import MADE_BY, PREVIEW, RECORDING_FILE, RUN_FILE, Run, new_run_id
 from runner.runs.store import Store
 from runner.util.files import storage_errors, sync, write_object
-from runner.util.values import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN
+from runner.util.values import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN, Json, JsonView
 
 EXPORT_RECORD: Final = "export"
 """The metadata record of an exported recording: what `run.json` and the labels say, as JSON."""
@@ -65,7 +65,7 @@ class Imported:
 def import_recording(
     recording: Path,
     recordings: Path,
-    details: Mapping[str, Any] | None = None,
+    details: JsonView | None = None,
     labels: Labels | None = None,
     as_new: bool = False,
 ) -> Imported:
@@ -131,7 +131,7 @@ def import_recording(
     return Imported(run_at(target), digest, already=False, anonymous=anonymous)
 
 
-def run_facts(recording: Recording, details: Mapping[str, Any]) -> dict[str, Any]:
+def run_facts(recording: Recording, details: JsonView) -> Json:
     """Return the contents of `run.json`: the recording's own, and what only its owner can know.
 
     Name, status, duration, error text and the digest of a recording without steps are taken from `details`
@@ -169,7 +169,7 @@ def _export_record(recording: Recording) -> dict[str, object]:
     return found if isinstance(found, dict) else {}
 
 
-def checked_facts(recording: Recording, details: Mapping[str, Any]) -> dict[str, Any]:
+def checked_facts(recording: Recording, details: JsonView) -> Json:
     """Return the contents of `run.json`.
 
     Raises:
@@ -265,7 +265,7 @@ def _merged(own: Labels, more: Labels) -> Labels:
     return Labels(own.name or more.name, tags, own.note or more.note)
 
 
-def _place(source: Path, target: Path, facts: dict[str, Any], rewritten: bool) -> None:
+def _place(source: Path, target: Path, facts: Json, rewritten: bool) -> None:
     """Copy, link or rewrite a recording, and set its size in the facts.
 
     Args:

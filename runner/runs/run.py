@@ -20,14 +20,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from runner.errors import RunnerError, StorageError
 from runner.recording.labels import LABELS_FILE, Labels, as_json, change_labels, read_labels
 from runner.recording.liveness import is_alive, owner
 from runner.recording.run_file import ArchiveReference, RunFile, Summary, parse_run_file, run_title
 from runner.util.files import storage_errors, write_object
-from runner.util.values import as_utf8, checked_run_name, is_utf8
+from runner.util.values import Json, as_utf8, checked_run_name, is_utf8
 
 if TYPE_CHECKING:  # listing runs must be quick
     from runner.config import ExperimentConfig
@@ -53,7 +53,7 @@ class Run:
     """A run in a recordings folder."""
 
     folder: Path
-    facts: dict[str, Any]
+    facts: Json
     """The contents of `run.json`."""
     restored: Path | None = None
     """The path of its restored recording, if it is archived."""

@@ -11,7 +11,7 @@ import contextlib
 import itertools
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,6 +21,7 @@ from runner.runs.resolve import find_run
 from runner.runs.run import SHARDS_FOLDER, Run, new_run
 from runner.util.files import storage_errors
 from runner.util.humanize import size
+from runner.util.values import JsonView
 
 RUN_VARIABLE: Final = "DUALTAXI_RUN"
 """The folder of the run that this process recorded last, which its child processes can join."""
@@ -75,7 +76,7 @@ def _require_open(run: Run) -> None:
         )
 
 
-def new_shard(joined: Run, name: str | None, config: Mapping[str, Any], seed: int | None, **more: Any) -> Run:
+def new_shard(joined: Run, name: str | None, config: JsonView, seed: int | None, **more: Any) -> Run:
     """Create the folder of a new shard; where the name is taken, `-2`, `-3` ... is added.
 
     Args:

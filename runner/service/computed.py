@@ -45,7 +45,7 @@ from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service.errors import Refused
 from runner.util.extras import require
-from runner.util.values import finite
+from runner.util.values import Json, finite
 
 TABLE_NAME: Final = "scores.csv"
 """Stands for a table of scores in messages."""
@@ -83,7 +83,7 @@ def curves(
             own = axes_of(recording)
             common = [each for each in common if each in own]
     groups = groups_of(series)
-    shown: list[dict[str, Any]] = []
+    shown: list[Json] = []
     with contextlib.suppress(NoMetrics):
         for panel in panels_of(groups):
             if not metrics or panel.metric in metrics:

@@ -22,6 +22,7 @@ from runner.runs.store import Store
 from runner.service.processes import NICENESS
 from runner.service.settings import without_folders
 from runner.util.files import hash_of
+from runner.util.values import Json
 
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Size = Annotated[int, Field(ge=0, lt=1 << 62)]
@@ -75,7 +76,7 @@ class Upload(UploadStatus):
 
     def replace(self, **changes: Any) -> Upload:
         """Return the upload with other values of some fields, and without its problem."""
-        new: dict[str, Any] = {"problem": "", "changed": time.time()} | changes
+        new: Json = {"problem": "", "changed": time.time()} | changes
         return replace(self, **new)
 
     def refused(self, problem: str) -> Upload:

@@ -7,13 +7,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.model import SECTION_OF, Name, Seed, SeveralSeeds
 from runner.config.values import Count, Section, refusal
+from runner.util.values import Json, JsonView
 
 Strategy = Literal["grid", "random", "tpe", "genetic"]
 At = Literal["last", "best", "area", "first_over"]
@@ -190,7 +191,7 @@ class SweepFile(Section):
         default=None, description="When to stop runs that fall behind; null: never."
     )
     limits: Limits = Field(default=Limits(), description="Limits at which the sweep stops.")
-    recording: dict[str, Any] = Field(
+    recording: Json = Field(
         default_factory=lambda: {"steps": "none"},
         description="Overrides of the base's `recording`. By default steps are not recorded; `dualtaxi "
         "rerecord` records those of single runs later.",
@@ -253,7 +254,7 @@ class Sweep:
         assert isinstance(self.file.base, dict)
         return self.file.base
 
-    def config(self, values: Mapping[str, Any]) -> ExperimentConfig:
+    def config(self, values: JsonView) -> ExperimentConfig:
         """Return the experiment with these values of the parameters.
 
         Raises:
@@ -269,6 +270,6 @@ class Sweep:
         others = {key for key, section in SECTION_OF.items() if section.algorithm != values["algorithm"]}
         return {path: value for path, value in values.items() if path.partition(".")[0] not in others}
 
-    def to_mapping(self) -> dict[str, Any]:
+    def to_mapping(self) -> Json:
         """Return plain values, fit for JSON and YAML, from which `from_values` builds an equal sweep."""
         return self.file.model_dump(mode="json") | {"name": self.name}

@@ -18,6 +18,7 @@ from runner.analysis.series import (
     training_readings,
 )
 from runner.errors import RunnerError, nearest
+from runner.recording.messages import Message
 from runner.recording.reader import Recording
 from runner.sweep.model import Objective
 
@@ -44,8 +45,8 @@ def curve_of(recording: Recording, metric: str) -> Curve:
 
 
 def readings(
-    metrics: Mapping[str, object],
-    exact: Mapping[str, object] | None,
+    metrics: Message,
+    exact: Message | None,
     agents: Sequence[str],
     events: Sequence[str],
 ) -> dict[str, float]:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Final, get_args
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from runner.analysis.sections import Grid, Section
 from runner.sweep.importance import Effect, effects_of, effects_of_grid
 from runner.sweep.model import Sweep
 from runner.sweep.trials import State, Trial, Trials, best_of, recorded_trials
+from runner.util.values import Json
 
 DEFAULT_SHOWN: Final = 20
 MIN_SHARE: Final = 0.01
@@ -33,7 +34,7 @@ class Ranked:
     """A trial in the ranking."""
 
     number: int
-    values: dict[str, Any]
+    values: Json
     state: State
     median: float | None
     """The median over the seeds; infinite for a level that was never reached; None without a value."""

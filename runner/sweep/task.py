@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from runner.archive.places import at_hand
 from runner.config import from_mapping
@@ -33,6 +33,7 @@ from runner.sweep.model import Objective
 from runner.sweep.objective import Curve, curve_of, readings, should_prune
 from runner.sweep.state import PRUNED, is_over
 from runner.util.files import replacing, storage_errors
+from runner.util.values import Json
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Task:
     identity: str
     """The identity of its job."""
     seed: int
-    config: dict[str, Any]
+    config: Json
     trial: int
     """The number of the trial."""
     recordings: str

@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from runner.sweep.model import Sweep
 from runner.sweep.objective import Curve, pruning_bounds, value_of
 from runner.sweep.search import Search
 from runner.sweep.task import Result, result_of
+from runner.util.values import Json
 
 State = Literal["finished", "pruned", "unfinished", "failed", "excluded"]
 
@@ -27,8 +28,8 @@ class Trial:
     """Values of the parameters, and the results of their runs."""
 
     number: int
-    values: dict[str, Any]
-    config: dict[str, Any]
+    values: Json
+    config: Json
     """The configuration as plain values; empty if the values contradict each other."""
     identities: dict[int, str]
     """By seed, the identity of its job; empty if the values contradict each other."""

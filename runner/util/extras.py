@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.errors import MissingExtra
+from runner.util.values import Json
 
 _PROJECT: Final = "dualtaxi"
 _PACKAGES: Final = {
@@ -66,7 +67,7 @@ def install_command(extra: str) -> str:
         distribution = metadata.distribution(_PROJECT)
     except metadata.PackageNotFoundError:
         return _command("pip", _clone(code, extra))  # a clone on the path, not installed
-    origin: dict[str, Any] = json.loads(distribution.read_text("direct_url.json") or "{}")
+    origin: Json = json.loads(distribution.read_text("direct_url.json") or "{}")
     url = str(origin.get("url", ""))
     if origin.get("dir_info", {}).get("editable"):
         return _command(_installer(distribution), _clone(_path_of(url), extra))

@@ -9,12 +9,12 @@ import json
 import os
 import secrets
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import BinaryIO, Final
 
 from runner.errors import StorageError
-from runner.util.values import without_surrogates
+from runner.util.values import Json, JsonView, without_surrogates
 
 CACHE_VARIABLE: Final = "XDG_CACHE_HOME"
 EXPORTS: Final = "rerun"
@@ -63,7 +63,7 @@ def hash_of(path: Path) -> tuple[int, str]:
         return stream.tell(), digest.hexdigest()
 
 
-def read_object(path: str | os.PathLike[str], max_bytes: int) -> dict[str, Any]:
+def read_object(path: str | os.PathLike[str], max_bytes: int) -> Json:
     """Return the JSON object in a file; numbers that are not finite become None.
 
     Raises:
@@ -83,7 +83,7 @@ def read_object(path: str | os.PathLike[str], max_bytes: int) -> dict[str, Any]:
     return value
 
 
-def write_object(path: Path, value: Mapping[str, Any], mode: int = 0o666) -> None:
+def write_object(path: Path, value: JsonView, mode: int = 0o666) -> None:
     """Replace a file by one with this JSON object; `mode` is its permissions, less the process's mask.
 
     Raises:

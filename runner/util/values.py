@@ -9,6 +9,10 @@ from typing import Any, Final, TypeGuard
 
 from runner.errors import ConfigError
 
+Json = dict[str, Any]
+"""An object parsed from JSON or YAML: what it holds is checked where it is used."""
+JsonView = Mapping[str, Any]
+"""The same, only to be read."""
 MAX_TEXT: Final = 200
 """The most characters of a short text."""
 MAX_JSON_DEPTH: Final = 100

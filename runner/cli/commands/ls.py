@@ -28,6 +28,7 @@ from runner.runs.catalogue.columns import (
     needed_for,
     with_same_as,
 )
+from runner.util.values import Json
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.filters import Filter
@@ -55,7 +56,7 @@ _SHRINKING: Final = (
 _MIN_WIDTH: Final = 14
 """The width at which a shrinking column can still be read."""
 
-Row = dict[str, Any]
+Row = Json
 Render = Callable[[Iterable[Row], Sequence[str]], Iterator[str]]
 
 

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -18,6 +18,7 @@ from runner.cli.runs import find_recorded, print_received
 from runner.errors import ExitCode, RunnerError
 from runner.runs.run import recordings_folder
 from runner.util.humanize import UNKNOWN, size
+from runner.util.values import Json
 
 if TYPE_CHECKING:
     from runner.client.client import Client, UploadStatus
@@ -124,7 +125,7 @@ def push(
     """
     if bool(names) == outbox:
         raise click.UsageError("expected either runs or --outbox.")
-    runs: list[dict[str, Any]] = []
+    runs: list[Json] = []
     codes: list[int] = []
     for name, upload in _outbox(server) if outbox else _named(names, server, recordings):
         try:
@@ -174,7 +175,7 @@ def _outbox(server: Server) -> Iterator[tuple[str, Upload]]:
         yield run.run_id, functools.partial(upload, run, url)
 
 
-def _stored(status: UploadStatus, name: str, run_bytes: int) -> dict[str, Any]:
+def _stored(status: UploadStatus, name: str, run_bytes: int) -> Json:
     return {"run_id": status.run_id, "name": name, "bytes": run_bytes, "already": status.already}
 
 

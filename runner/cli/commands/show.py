@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import click
 
@@ -15,6 +15,7 @@ from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import console, draw, facts, patch_text, print_json, printable, say, title
 from runner.cli.progress import stage_line
 from runner.cli.runs import command_for, find, restored
+from runner.recording.messages import Message
 from runner.util.humanize import UNKNOWN, age, counted, duration, number, size
 
 if TYPE_CHECKING:
@@ -217,7 +218,7 @@ def _extras(extras: Mapping[str, RecordedExtras]) -> dict[str, str]:
     return rows
 
 
-def _optimality(recording: Recording, measures: Mapping[str, Any]) -> dict[str, str]:
+def _optimality(recording: Recording, measures: Message) -> dict[str, str]:
     """Return the last exact measures, next to the optimum."""
     from runner.environments.naming import states_in_words
 

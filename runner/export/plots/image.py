@@ -86,7 +86,7 @@ def _add_to_figure(mpl: Any, figure: Any, mark: Mark, transform: Any) -> None:
             own.set_transform(transform)
             figure.add_artist(own)
         return
-    style: dict[str, Any] = {"alpha": mark.opacity, "transform": transform}
+    style: dict[str, object] = {"alpha": mark.opacity, "transform": transform}
     if isinstance(mark, Shape) and mark.fill:
         edge = {"edgecolor": mark.stroke or "none", "linewidth": mark.width}
         figure.add_artist(mpl.patches.Polygon(mark.points, facecolor=mark.fill, **edge, **style))

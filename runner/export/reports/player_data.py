@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from runner.drawing import svg
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.util.arrays import Array
+from runner.util.values import Json
 
 MAX_LOGGED: Final = 5000
 """Logged values near a part that a page shows."""
@@ -109,7 +110,7 @@ class Playback:
     """For each step, bit i: the i-th agent's part of the action was chosen at random."""
     choices: list[list[str]] = field(default_factory=list)
     """The names of the actions of each Q-table."""
-    values: list[dict[str, Any]] = field(default_factory=list)
+    values: list[Json] = field(default_factory=list)
     """For each Q-table the highest values before each step, and that of the action taken."""
     grid: Grid | None = None
     trail: int = svg.TRAIL

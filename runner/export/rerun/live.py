@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
 from runner.recording import schema
+from runner.recording.messages import Message
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -101,7 +102,7 @@ class LiveView:
             stop = int(np.searchsorted(steps["episode"], episode, side="right"))
             self._put(Piece(phase, before + start + 1, self._episode, steps[start:stop].copy()))
 
-    def metrics(self, phase: str, time: int, metrics: dict[str, Any]) -> None:
+    def metrics(self, phase: str, time: int, metrics: Message) -> None:
         """Show metrics."""
         self._put(Piece(phase, time, 0, metrics))
 

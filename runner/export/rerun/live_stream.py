@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from runner.export.rerun.metrics import MetricWriter
 from runner.export.rerun.scene import scene_of
 from runner.export.rerun.steps import StepWriter
 from runner.recording import schema
+from runner.recording.messages import Message
 
 FLUSH_SECONDS: Final = 5.0
 """How long the end of a run may wait for its viewer."""
@@ -48,7 +49,7 @@ class LiveStream:
         self._rewards |= set(np.unique(mdp.summed_rewards).tolist())
         self._phase = "train"
 
-    def send_metrics(self, phase: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    def send_metrics(self, phase: str, rows: Sequence[Message]) -> None:
         """Send metrics of a phase."""
         if phase == "eval":
             self._metrics.send_evaluations(rows)

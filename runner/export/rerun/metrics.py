@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.recording import schema
+from runner.recording.messages import Message
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording
 
@@ -22,7 +23,7 @@ TRAINING_MEANS: Final = ("mean_length", "mean_penalties", "mean_return")
 _ONE_PHASE: Final = ("filled_percent", "reward_percent", "events", "episodes")
 """Metrics of several lines whose view shows one phase alone."""
 
-Rows = Sequence[Mapping[str, Any]]
+Rows = Sequence[Message]
 Colour = tuple[int, int, int]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from http import HTTPStatus
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 from fastapi import APIRouter, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
@@ -23,6 +23,7 @@ from runner.service.dependencies import (
 )
 from runner.service.problems import error_docs
 from runner.service.response_cache import ALWAYS
+from runner.util.values import Json
 
 router = APIRouter(
     tags=["comparing"],
@@ -106,7 +107,7 @@ async def compare(
             description="Over environments: `minmax`, or CSV with the columns task, random and expert.",
         ),
     ] = None,
-) -> dict[str, Any]:
+) -> Json:
     """Return what `dualtaxi compare --json` prints; a run's name stands for all runs of that name."""
     runs = await found_runs(catalogue, run, several=True)
     key = ("compare", *map(recording_state, runs), request.url.query)

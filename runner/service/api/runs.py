@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, Field
@@ -21,6 +21,7 @@ from runner.service.computed import as_json
 from runner.service.dependencies import CacheOf, CatalogueOf, FoundRun, SettingsOf
 from runner.service.errors import Refused
 from runner.service.problems import error_docs
+from runner.util.values import Json
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.index import Index
@@ -32,7 +33,7 @@ router = APIRouter(tags=["runs"])
 class RunsPage(BaseModel):
     """Some of the matching runs."""
 
-    runs: list[dict[str, Any]]
+    runs: list[Json]
     """Each by column, as in `dualtaxi ls --json`."""
     total: int
     """The number of matching runs."""
@@ -68,7 +69,7 @@ async def list_runs(
         chosen, order = parse(filter), order_of(sort)
         shown = columns_of(columns) if columns else DEFAULT_JSON
 
-        def work(index: Index) -> dict[str, Any]:
+        def work(index: Index) -> Json:
             rows, total = index.page(chosen, *order, limit=limit, offset=offset)
             runs = [row_as_json(row, shown) for row in index.with_same_as(rows)]
             return {"runs": runs, "total": total, "offset": offset, "limit": limit}
@@ -109,9 +110,9 @@ class RunResponse(BaseModel, extra="allow"):
     created: str
     tags: list[str]
     note: str
-    config: dict[str, Any]
+    config: Json
     provenance: dict[str, object]
-    last_evaluation: dict[str, Any] | None
+    last_evaluation: Json | None
 
 
 @router.get(

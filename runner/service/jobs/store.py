@@ -34,6 +34,7 @@ from runner.config.document import read_yaml, write_yaml
 from runner.errors import RunnerError, StorageError
 from runner.runs.locking import acquired
 from runner.service.errors import JobNotFound, QueueFull
+from runner.util.values import JsonView
 
 if TYPE_CHECKING:
     from filelock import FileLock
@@ -196,7 +197,7 @@ class JobStore:
         name: str,
         runs: int,
         submitted: str,
-        values: Mapping[str, Any],
+        values: JsonView,
         keep: Container[int] = (),
     ) -> Job:
         """Append a job to the queue, on disk, and return it.

@@ -38,6 +38,7 @@ from runner.service.pages.frame import RunHead, has_tables, head_of, last_evalua
 from runner.service.pages.panels import Panel, panel_of
 from runner.service.pages.rendering import page
 from runner.util import humanize
+from runner.util.values import Json
 
 router = APIRouter(prefix="/compare", include_in_schema=False)
 
@@ -297,11 +298,11 @@ def _two(runs: list[Run]) -> list[Run]:
     return runs
 
 
-async def _difference(runs: list[Run], cache: CacheOf, processes: ProcessesOf) -> dict[str, Any]:
+async def _difference(runs: list[Run], cache: CacheOf, processes: ProcessesOf) -> Json:
     """Return the difference of two runs, see `fragments.difference`."""
     key = ("difference", *map(timed_recording_state, runs))
     body = await cache.get_or_await(key, lambda: processes(fragments.difference, *runs), LONG)
-    found: dict[str, Any] = await run_in_threadpool(json.loads, body)
+    found: Json = await run_in_threadpool(json.loads, body)
     return found
 
 

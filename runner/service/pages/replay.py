@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from itertools import islice
-from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple
+from typing import Annotated, ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
 from fastapi import APIRouter, Path, Query, Request, Response
@@ -39,6 +39,7 @@ from runner.service.dependencies import (
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.panels import Panel, panel_of
 from runner.service.pages.rendering import message_of, page
+from runner.util.values import JsonView
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
 
@@ -302,7 +303,7 @@ def shown_step(part: Mapping[str, Any], t: int) -> ShownStep:
     )
 
 
-def _facts(episode: Mapping[str, Any], i: int) -> list[tuple[str, str]]:
+def _facts(episode: JsonView, i: int) -> list[tuple[str, str]]:
     """Return what is known of frame i of a part of an episode, by name, for readers without scripts."""
 
     def named(one: Mapping[str, object]) -> str:

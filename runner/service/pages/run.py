@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from http import HTTPStatus
 from itertools import islice
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
@@ -46,6 +46,7 @@ from runner.service.dependencies import (
 from runner.service.pages.frame import RunView, has_tables, head_of, loop_results
 from runner.service.pages.rendering import Form, message_of, page
 from runner.util import humanize
+from runner.util.values import Json
 
 if TYPE_CHECKING:
     from runner.service.catalogue import Catalogue
@@ -267,7 +268,7 @@ def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:
     )
 
 
-def _done_by(run: Run) -> dict[str, Any]:
+def _done_by(run: Run) -> Json:
     """Return what a loop that is being recorded has done so far."""
     with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
         return {**recording.done(), "bytes": recording.size}
@@ -307,7 +308,7 @@ def _results(run: Run, last: EvaluationMetrics) -> dict[str, str]:
     return {name: text for name, text in measures.items() if humanize.UNKNOWN not in text} | logged
 
 
-def _job_of(run: Run, jobs: JobQueue) -> tuple[int | None, dict[str, Any]]:
+def _job_of(run: Run, jobs: JobQueue) -> tuple[int | None, Json]:
     """Return the job that makes a run, or will resume it, and the run's progress in it."""
     for job in jobs.store.jobs():
         if not job.is_over and run.run_id in jobs.store.run_ids(job.number).values():

@@ -5,14 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, NamedTuple
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
 from runner.errors import RunnerError
 from runner.export.reports.rendering import View
-from runner.runs.catalogue.columns import FIELDS, HEADINGS, SETTING, Kind, as_text, columns_of, field_of
+from runner.runs.catalogue.columns import (
+    FIELDS,
+    HEADINGS,
+    SETTING,
+    IndexRow,
+    Kind,
+    as_text,
+    columns_of,
+    field_of,
+)
 from runner.runs.catalogue.filters import Filter, parse
 from runner.runs.catalogue.index import order_of
 from runner.runs.catalogue.usage import sizes, usage_of
@@ -116,7 +125,7 @@ class _DiskView(View):
     free: int
     freeable: list[tuple[str, str, int]]
     """Heading, explanation and bytes."""
-    rows: list[tuple[dict[str, Any], dict[str, int]]]
+    rows: list[tuple[IndexRow, dict[str, int]]]
     """Row of the catalogue, and bytes by kind, of the largest runs."""
     others: int
     """Number of runs that are not shown."""
@@ -174,7 +183,7 @@ def _view(catalogue: Catalogue, text: str, sort: str, columns: str, number: int)
     shown = columns_of(columns) if columns.strip(", ") else list(USUAL)
     is_usual = list(shown) == list(USUAL)
 
-    def work(index: Index) -> tuple[list[dict[str, Any]], int, int]:
+    def work(index: Index) -> tuple[list[IndexRow], int, int]:
         found, total = index.page(chosen, *order, limit=ROWS, offset=(number - 1) * ROWS)
         return index.with_same_as(found), total, index.count(Filter(None)) if text else total
 
@@ -223,7 +232,7 @@ def _classes(left: bool, folded: bool) -> str:
     return " ".join(name for name, holds in (("text", left), ("fold", folded)) if holds)
 
 
-def _cell(row: dict[str, Any], column: str, folded: bool) -> Cell:
+def _cell(row: IndexRow, column: str, folded: bool) -> Cell:
     text, address = as_text(row, column), ""
     if column in ("id", "name"):
         address = f"/runs/{row['id']}"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
-from typing import Annotated, Any, ClassVar, Final, NamedTuple
+from typing import Annotated, ClassVar, Final, NamedTuple
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
@@ -23,6 +23,7 @@ from runner.service.jobs.checking import SWEEP_KEYS, CheckedJob
 from runner.service.pages.rendering import Form, page, viewer_of
 from runner.service.problems import error_body
 from runner.sweep.model import SweepFile
+from runner.util.values import Json, JsonView
 
 router = APIRouter(prefix="/submit", include_in_schema=False)
 
@@ -155,17 +156,17 @@ def sweep_keys() -> list[Key]:
     return list(_keys(without_references(SweepFile.model_json_schema())["properties"]))
 
 
-def _keys(properties: Mapping[str, Any]) -> Iterator[Key]:
+def _keys(properties: JsonView) -> Iterator[Key]:
     for name, node in properties.items():
         options = [node, *node.get("anyOf", ()), *node.get("oneOf", ())]
-        inner: dict[str, Any] = {}
+        inner: Json = {}
         for option in options:
             inner |= option.get("properties", {})
         default = json.dumps(node["default"]) if "default" in node else ""
         yield Key(name, node.get("description", ""), _kind(options), default, list(_keys(inner)))
 
 
-def _kind(options: list[Mapping[str, Any]]) -> str:
+def _kind(options: list[JsonView]) -> str:
     """Return the allowed values in a few words."""
     kinds: list[str] = []
     for option in options:
@@ -178,7 +179,7 @@ def _kind(options: list[Mapping[str, Any]]) -> str:
     return " or ".join(dict.fromkeys(kinds))
 
 
-def _bounds(option: Mapping[str, Any]) -> str:
+def _bounds(option: JsonView) -> str:
     low = option.get("minimum", option.get("exclusiveMinimum"))
     high = option.get("maximum", option.get("exclusiveMaximum"))
     if high is not None and high <= _MAX_BOUND:
