@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.messages import Message
 from runner.util.arrays import Array
 
 DIGEST_BYTES: Final = 16
