@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.messages import Message
 from runner.util.arrays import Array
 
 DIGEST_BYTES: Final = 16
@@ -115,7 +116,7 @@ def packed(rows: Rows, n: int) -> dict[str, object]:
     }
 
 
-def unpacked(fields: Mapping[str, Any], dtype: np.dtype[np.void], n: int, where: str) -> Rows:
+def unpacked(fields: Message, dtype: np.dtype[np.void], n: int, where: str) -> Rows:
     """Return the steps in a message.
 
     Args:

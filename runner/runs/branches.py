@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from runner.util.values import flatten, is_whole
+from runner.util.values import Json, flatten, is_whole
 
 PATHS: Final = ("config.origin.", "branches")
 """What the paths of origins in configurations begin with."""
@@ -86,7 +86,7 @@ def parse_origin(found: object) -> Origin | None:
         return None
     if "phase" not in found:
         return _parse_training(found)
-    values: dict[str, Any] = {name: found.get(name) for name in BranchOrigin.__dataclass_fields__}
+    values: Json = {name: found.get(name) for name in BranchOrigin.__dataclass_fields__}
     are_numbers = all(is_whole(values[name], 0, _MAX_NUMBER) for name in ("episode", "t", "seed"))
     values["action_name"] = found.get("action_name", "")
     are_texts = all(

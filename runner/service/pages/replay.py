@@ -277,7 +277,7 @@ def _view(
     )
 
 
-def shown_step(part: Mapping[str, Any], t: int) -> ShownStep:
+def shown_step(part: JsonView, t: int) -> ShownStep:
     """Return a step of a part of an episode, see `fragments.episode_part`."""
     episode = part["episode"]
     at = min(t, episode["length"])
