@@ -16,6 +16,7 @@ CONFIG = "tutorial_cooperative"
 STATE = 'q[300, "north + east"] > q[300, "west + east"]'
 NEVER = "max(q[300]) > 1e6"
 PATH = "greedy_success[300]"
+VALUE = ("--state", "300", "--action", "north+south")
 
 
 def measure(quick: bool) -> list[Figure]:
@@ -23,14 +24,16 @@ def measure(quick: bool) -> list[Figure]:
     repetitions, times = (3, 2) if quick else (7, 10)
     with tempfile.TemporaryDirectory() as folder:
         run(run_command(CONFIG, folder))
-        figures = [*what_if(folder, repetitions), *when(folder, repetitions)]
+        figures = [*what_if(folder, repetitions), *when(folder, repetitions), *why(folder, repetitions)]
     with tempfile.TemporaryDirectory() as folder:
         run(run_command(CONFIG, folder, f"episodes={50_000 * times}"))
         longer = [command(folder, "when", "@latest", text, "--all") for text in (STATE, PATH, "reward > 0")]
         last = command(folder, "branch", "@latest", "--at", f"{50_000 * times - 1}:0", "--action", "all")
+        whole = command(folder, "why", "@latest", *VALUE)
     figures += explain(1 if quick else 3)
     return [
         *figures,
+        _peak(f"  why, for a run {times} times as long", [whole]),
         _peak(f"  when, for a run {times} times as long", longer),
         _peak(f"  branch, all actions, for a run {times} times as long", [last]),
     ]
@@ -81,6 +84,13 @@ def explain(repetitions: int) -> list[Figure]:
             processes.append(command(folder, *words))
     figures = [_seconds("explain, 4 settings, 20 seeds, 5,000 episodes", processes[1:], (60, 25))]
     return [*figures, _peak("  peak memory of its main process", processes)]
+
+
+def why(folder: str, repetitions: int) -> list[Figure]:
+    """Return the figures of `dualtaxi why` for a value at the end."""
+    command(folder, "why", "@latest", *VALUE)  # compiles
+    done = [command(folder, "why", "@latest", *VALUE) for _ in range(repetitions)]
+    return [_seconds("why, a value at the end", done, (2, 0.5)), _peak("  peak memory", done)]
 
 
 def command(folder: str, *words: str) -> Process:

@@ -94,24 +94,22 @@ def weights_of(
             np.zeros((episode // stretch + 1, 2)),
         )
         ledger.weights[:, cell.state * model.width[cell.learner] + cell.action] = 1 / len(tables)
-        counted, largest = 0, np.empty(0, SHARE)
+        counted, largest, shares = 0, np.empty(0, SHARE), np.empty(min(stop, STEPS_AT_ONCE), SHARE)
         for start in reversed(range(0, stop, STEPS_AT_ONCE)):
             updates = np.empty(min(STEPS_AT_ONCE, stop - start), UPDATE)
             spool.seek(start * UPDATE.itemsize)
             spool.readinto(updates.view(np.uint8).data)
-            shares = np.zeros(len(updates), SHARE)
-            shares["step"] = np.arange(start, start + len(updates))
             end = start + len(updates)
             while end > start:  # from branch to branch: each changes the rules
                 segment = learner.segment_at(end - 1)
                 first = max(segment.start, start)
-                part = slice(first - start, end - start)
-                spread(
-                    model, segment.rules, cell.learner, first, updates[part], ledger, stretch, shares[part]
+                found = spread(
+                    *(model, segment.rules, cell.learner, first, updates[first - start : end - start]),
+                    *(ledger, stretch, shares),
                 )
+                counted += found
+                largest = _largest(largest, shares[:found], limit)
                 end = first
-            counted += int(np.count_nonzero(shares["weight"]))
-            largest = _largest(largest, shares, limit)
     return Weights(
         value=float(replay.tables[cell.learner][cell.state, cell.action]),
         initial=ledger.weights,
@@ -149,7 +147,5 @@ def _updates(
 
 def _largest(known: NDArray[np.void], shares: NDArray[np.void], limit: int) -> NDArray[np.void]:
     """Return the shares that add or take most, of those that are known and further ones."""
-    sizes = np.abs(shares["contribution"])
-    least = abs(known["contribution"][-1]) if len(known) == limit else 0.0
-    both = np.concatenate([known, shares[(sizes > 0) & (sizes >= least)]])
+    both = np.concatenate([known, shares[shares["contribution"] != 0]])
     return both[np.lexsort((both["step"], -np.abs(both["contribution"])))[:limit]]

@@ -84,8 +84,10 @@ def spread(
     ledger: Ledger,
     stretch: int,
     shares: NDArray[np.void],
-) -> None:
+) -> int:
     """Spread the weights of learner i's values over the updates of a block, from the last to the first.
+
+    Return how many of the steps' rewards have a weight.
 
     Args:
         model: the environment.
@@ -95,11 +97,12 @@ def spread(
         updates: of the steps, [N].
         ledger: as it is after these steps; it is moved to before them.
         stretch: episodes of a stretch.
-        shares: [N] of `SHARE`, 0 but for `step`; filled where a step's reward has a weight.
+        shares: [N] of `SHARE`, filled with the steps whose rewards have a weight, the last ones first.
     """
     algorithm = len(rules.algorithm)
     width = model.width[i]
     joint_actions, outcomes = len(model.own_action), model.cumulative.shape[1]
+    filled = 0
     for k in range(len(updates) - 1, -1, -1):
         update = updates[k]
         pair = np.int64(update.outcome) // outcomes
@@ -120,7 +123,9 @@ def spread(
             rate = schedule_value(rules.step_size, episode, step)
 
         # The reward.
-        share = shares[k]
+        share = shares[filled]
+        filled += 1
+        share.step = step
         share.weight = weight * rate
         share.distance = distance / weight
         share.contribution = share.weight * model.rewards[model.outcome_class[update.outcome], i]
@@ -144,3 +149,4 @@ def spread(
             greedy = passed * (1.0 - epsilon)
         ledger.weights[other, next_row + update.bootstrapped] += greedy * weight
         ledger.distances[other, next_row + update.bootstrapped] += greedy * (distance + weight)
+    return filled

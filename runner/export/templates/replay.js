@@ -263,7 +263,7 @@ class Replay {
         const bar = Replay.make("span"), fill = Replay.make("i");
         fill.style.width = `${high > low ? 4 + 96 * (value - low) / (high - low) : 4}%`;
         bar.append(fill);
-        item.append(Replay.make("span", (action === taken ? "\u25b8 " : "") + names[action]), bar, Replay.make("b", Replay.number(value)));
+        item.append(Replay.make("span", (action === taken ? "\u25b8 " : "") + names[action]), bar, this.explained(value, action, learner));
         bars.append(item);
       }
       box.append(title, bars);
@@ -275,6 +275,18 @@ class Replay {
       parts.push(Replay.make("p", `Next action: ${next.join(", ")}`));
     }
     this.find(".choice").replaceChildren(...parts);
+  }
+
+  // A Q-value before the step at the slider; on a server's page a link to where it comes from.
+  explained(value, action, learner) {
+    const number = Replay.make("b", Replay.number(value)), { why } = this.root.dataset;
+    if (!why) return number;
+    const { agents, choices } = this.episode, link = Replay.make("a");
+    const query = new URLSearchParams({ action, ...(choices.length > 1 ? { agent: agents[learner] } : {}) });
+    link.href = `${why}:${this.k}&${query}`;
+    link.title = "Why is it this value?";
+    link.append(number);
+    return link;
   }
 
   key(event) {

@@ -39,9 +39,11 @@ def spread(learner, updates, i, state, action, block):
     )
     found.weights[:, state * learner.model.width[i] + action] = 1 / tables
     shares = np.zeros(len(updates), ledger.SHARE)
+    part = np.zeros(block, ledger.SHARE)
     for first in reversed(range(0, len(updates), block)):
-        part = slice(first, first + block)
-        ledger.spread(learner.model, learner.rules, i, first, updates[part], found, 1, shares[part])
+        own = updates[first : first + block]
+        filled = ledger.spread(learner.model, learner.rules, i, first, own, found, 1, part)
+        shares[part["step"][:filled]] = part[:filled]
     return shares, found
 
 
