@@ -60,7 +60,7 @@ def when(folder: str, repetitions: int) -> list[Figure]:
     command(folder, "when", "@latest", PATH)  # compiles
     questions = {
         "when, first time": ((1, 0.3), [STATE]),
-        "when, first time, never found": ((1, 0.3), [NEVER]),
+        "when, searched to the end, never found": ((2, 0.5), [NEVER]),
         "when, every time": ((2, 0.5), [STATE, "--all"]),
         "when, every time, of a greedy path": ((2, 0.5), [PATH, "--all"]),
     }

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import runner
 from runner.cli import cli
+from runner.debugging.when import when_in
 from runner.errors import RecordingError, RunnerError
 from runner.recording import schema
+from runner.recording.reader import open_recording
+from runner.replay.tables import tables_at
 from tests.runner.altering import altered, without_chunk
 from tests.runner.loops.making import make, play
 from tests.runner.recording.making import LAKE, TAXIS, make_run
@@ -227,9 +231,6 @@ def test_steps_that_the_environment_cannot_have_are_refused(cooperative, tmp_pat
         steps["state"][100] = 10**6
         return steps
 
-    from runner.debugging.when import when_in
-    from runner.recording.reader import open_recording
-
     path = altered(cooperative.recording, tmp_path / "bad.mcap", schema.TRAIN_STEP, change)
     with open_recording(path) as recording, pytest.raises(RecordingError, match="found state 1000000"):
         when_in(recording, "max(q[0]) > 1e6")
@@ -287,3 +288,18 @@ def test_many_intervals_are_counted_and_the_first_listed(cooperative, monkeypatc
     assert found.intervals == everything.intervals[:5]
     assert (found.count, found.steps) == (everything.count, everything.steps)
     assert everything.count == everything.steps > 100
+
+
+def test_a_branch_has_its_own_epsilon_and_values_from_its_step_on(tmp_path):
+    settings = {"epsilon": 0.9, "step_size": 1.0}
+    parent = make_run(tmp_path, TAXIS | SHORT)
+    branch = make_run(
+        tmp_path, TAXIS | SHORT, branches=[{"run": parent.run_id, "step": 700, "settings": settings}]
+    )
+    assert runner.when(parent, "epsilon == 0.9").first is None
+    assert runner.when(branch, "epsilon == 0.9").first.step == 700
+    with open_recording(branch.recording) as recording:
+        last = tables_at(recording, recording.count(schema.TRAIN_STEP))[0]
+        state, action = map(int, np.unravel_index(last.argmax(), last.shape))
+    found = runner.when(branch, f"q.taxi_1[{state}, {action}] >= {last.max()}", first=600, every=True)
+    assert found.last.values[0].after == last.max()
