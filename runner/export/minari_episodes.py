@@ -13,11 +13,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.environments.gym_types import Value
 from runner.errors import RecordingError
 from runner.export.contents import Ranges
 from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.reader import Recording
+from runner.recording.spaces import Description
 
 MAX_EPISODE_BYTES: Final = 1 << 30
 """The limit of one episode, which Minari needs in memory."""
@@ -29,9 +31,9 @@ Steps = NDArray[np.void] | list[Message]
 class Episode:
     """The T steps of an episode that ended; observations and actions are nested as their spaces."""
 
-    observations: Any
+    observations: Value
     """T + 1 of them."""
-    actions: Any
+    actions: Value
     rewards: NDArray[np.float64]
     """[T, agents]."""
     terminated: NDArray[np.bool_]
@@ -99,11 +101,11 @@ class _Resets:
         self._environments = recording.environments
         self._remaining = recording.resets(phase)
         self._next = next(self._remaining, None)
-        self._read: dict[tuple[int, int], tuple[int | None, Any]] = {}
+        self._read: dict[tuple[int, int], tuple[int | None, Value]] = {}
         """By environment and episode."""
-        self._last: dict[int, Any] = {}
+        self._last: dict[int, Value] = {}
 
-    def before(self, environment: int, steps: Steps) -> tuple[int | None, Any]:
+    def before(self, environment: int, steps: Steps) -> tuple[int | None, Value]:
         """Return seed and observation of the reset before steps, or None and the last observation."""
         while self._next is not None and int(self._next["step"]) <= int(steps[0]["step"]):
             reset = self._next
@@ -114,13 +116,13 @@ class _Resets:
         key = environment, int(steps[0]["episode"])
         return self._read.pop(key, (None, self._last.get(environment)))
 
-    def keep_last(self, environment: int, step: Any) -> None:
+    def keep_last(self, environment: int, step: np.void | Message) -> None:
         """Keep the last observation of an environment, since an episode may continue after its end."""
         if self._has_observations:
             self._last[environment] = _copy(step["next_observation"])
 
 
-def _copy(value: Any) -> Any:
+def _copy(value: Value) -> Value:
     """Return a value that does not keep its block in memory."""
     return value.copy() if isinstance(value, np.ndarray | np.void) else value
 
@@ -182,7 +184,7 @@ def _discrete_episode(recording: Recording, steps: Any, seed: int | None) -> Epi
     return Episode(states + observed["start"], actions + acted["start"], seed=seed, **_outcomes(steps))
 
 
-def _episode(recording: Recording, steps: Any, first: Any, seed: int | None) -> Episode:
+def _episode(recording: Recording, steps: Steps, first: Value, seed: int | None) -> Episode:
     """Return an episode of its steps and the observation of its reset."""
     after, actions = _column(steps, "next_observation"), _column(steps, "action")
     observed, acted = (recording.spaces[name] for name in ("observation", "action"))
@@ -194,18 +196,18 @@ def _episode(recording: Recording, steps: Any, first: Any, seed: int | None) -> 
     return Episode(observations, taken, seed=seed, **_outcomes(steps))
 
 
-def _outcomes(steps: Any) -> dict[str, Any]:
+def _outcomes(steps: Steps) -> dict[str, Any]:
     names = ("rewards", "terminated", "truncated", "acted")
     return {name: np.array(_column(steps, name)) for name in names}
 
 
-def _column(steps: Any, name: str) -> Any:
+def _column(steps: Steps, name: str) -> Value:
     if isinstance(steps, list):
         return [step[name] for step in steps]
-    return steps[name] if name in steps.dtype.names else np.ones(len(steps), np.uint32)
+    return steps[name] if name in (steps.dtype.names or ()) else np.ones(len(steps), np.uint32)
 
 
-def _split(description: Mapping[str, Any], values: NDArray[Any]) -> Any:
+def _split(description: Description, values: NDArray[Any]) -> Value:
     """Return records as dictionaries and tuples of arrays."""
     if description["type"] == "Dict":
         return {name: _split(part, values[name]) for name, part in description["spaces"].items()}
@@ -214,7 +216,7 @@ def _split(description: Mapping[str, Any], values: NDArray[Any]) -> Any:
     return np.ascontiguousarray(values)
 
 
-def _collected(description: Mapping[str, Any], values: Sequence[Any]) -> Any:
+def _collected(description: Description, values: Sequence[Value]) -> Value:
     """Return single values as dictionaries and tuples of arrays and lists of texts."""
     if description["type"] == "Dict":
         parts = description["spaces"].items()

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.drawing.raster import Pixels
+from runner.environments.gym_types import Value
 from runner.environments.naming import spoken
 from runner.recording.reader import Recording
 from runner.recording.spaces import Leaf, leaves_of
@@ -83,7 +84,7 @@ def value_in_words(value: object, limit: int = FEW) -> str:
     return f"{array.item():.3g}" if array.dtype.kind == "f" else f"{array.item()}"
 
 
-def action_in_words(recording: Recording, phase: str, agent: str = "") -> Callable[[Any], str]:
+def action_in_words(recording: Recording, phase: str, agent: str = "") -> Callable[[Value], str]:
     """Return how to put an action of a step's record in words: `left`, or its value where it has no name.
 
     Args:
@@ -100,7 +101,7 @@ def action_in_words(recording: Recording, phase: str, agent: str = "") -> Callab
     recorded_from = 0 if recording.kind == "step" else least
     names = [spoken(name) for name in recording.action_names(phase, agent)]
 
-    def in_words(action: Any) -> str:
+    def in_words(action: Value) -> str:
         if not names and recording.kind != "step":
             return value_in_words(action)
         index = int(action) - recorded_from
@@ -117,7 +118,7 @@ def plain_value(value: object) -> object:
     return tuple(parts.values()) if list(parts) == [str(i) for i in range(len(parts))] else parts
 
 
-def _part(value: Any, leaf: Leaf) -> Any:
+def _part(value: Value, leaf: Leaf) -> Value:
     for key in leaf.path:
         value = value[int(key) if isinstance(value, tuple) else key]
     return value

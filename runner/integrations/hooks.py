@@ -11,7 +11,7 @@ import functools
 import os
 import sys
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import FrameType, MethodType
 from typing import Any, Final, Protocol
 
@@ -57,7 +57,7 @@ class WatchedEnvironment:
     The script keeps its own object, whose `step` and `reset` call the twin; the twin calls what they were.
     """
 
-    def __init__(self, env: Any, recorded: Recorded[Any]) -> None:
+    def __init__(self, env: object, recorded: Recorded[Any]) -> None:
         self._env = env
         self._recorded: Any = recorded
         self.is_inside = False
@@ -65,7 +65,13 @@ class WatchedEnvironment:
         _watched[id(env)] = self
         object.__setattr__(env, "step", MethodType(_step, env))
 
-    def call(self, name: str, original: Callable[..., Any], arguments: Any, named: Mapping[str, Any]) -> Any:
+    def call(
+        self,
+        name: str,
+        original: Callable[..., object],
+        arguments: Sequence[object],
+        named: Mapping[str, object],
+    ) -> object:
         """Call `step` or `reset` of the twin, or the environment's own if the twin is being called."""
         if self.is_inside:
             return original(*arguments, **named)
@@ -90,7 +96,7 @@ _hooked: weakref.WeakSet[object] = weakref.WeakSet()
 """The classes whose `reset` looks for a run that waits."""
 
 
-def _step(env: Any, *arguments: Any, **named: Any) -> Any:
+def _step(env: Any, *arguments: object, **named: object) -> object:
     """Take a step in an environment that is recorded; in a copy of it, which is not, just take it."""
     original = MethodType(type(env).step, env)
     watched = _watched.get(id(env))
@@ -102,7 +108,9 @@ def _step(env: Any, *arguments: Any, **named: Any) -> Any:
 _step.__name__ = "step"  # by which a pickled environment finds its own
 
 
-def _reset(env: Any, original: Callable[..., Any], arguments: Any, named: Mapping[str, Any]) -> Any:
+def _reset(
+    env: object, original: Callable[..., object], arguments: Sequence[object], named: Mapping[str, object]
+) -> object:
     """Reset an environment; begin to record it if a run waits for one."""
     watched = _watched.get(id(env))
     if watched is None and not any(each.is_inside for each in _watched.values()):
@@ -162,7 +170,7 @@ def hook_environments() -> None:
 
 
 def _hook_subclasses(base: Any) -> None:
-    def hook_subclass(cls: Any, /, **named: Any) -> None:
+    def hook_subclass(cls: Any, /, **named: object) -> None:
         super(base, cls).__init_subclass__(**named)
         _hook(cls)
 

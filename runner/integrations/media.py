@@ -141,7 +141,7 @@ def _pixels(array: NDArray[Any], layout: str) -> NDArray[np.uint8]:
 class Image:
     """A picture: an array [height, width] or [height, width, channels], Pillow's, Matplotlib's, or a file."""
 
-    def __init__(self, data_or_path: Any, *_: Any, caption: str | None = None, **__: Any) -> None:
+    def __init__(self, data_or_path: Any, *_: object, caption: str | None = None, **__: object) -> None:
         layout = "CHW" if hasattr(data_or_path, "detach") and np.ndim(data_or_path) == 3 else "HWC"
         self.picture, self.caption = picture_of(data_or_path, layout), caption
 
@@ -173,7 +173,7 @@ class Histogram:
 class Table:
     """Rows, recorded as a text."""
 
-    def __init__(self, columns: Sequence[Any] | None = None, data: Any = None, **_: Any) -> None:
+    def __init__(self, columns: Sequence[object] | None = None, data: Any = None, **_: object) -> None:
         self.columns = list(columns or ())
         self.data = [list(row) for row in (() if data is None else data)]
 

@@ -38,7 +38,7 @@ from runner.loops.vector import (
 from runner.recording.maker import EnvironmentMaker
 from runner.runs.run import Run
 from runner.util.jsonable import as_json, as_mapping
-from runner.util.values import is_whole
+from runner.util.values import Json, is_whole
 
 require_tested("ray", "rllib", ("2.60", "2.60"))
 
@@ -93,7 +93,7 @@ class Recording:
         seed: int | None = None,
         config: object = None,
         info: Sequence[str] = (),
-        make: str | Callable[[], Any] | None = None,
+        make: str | Callable[[], object] | None = None,
         checkpoint_every: int = 0,
         **packing: Unpack[PackingOptions],
     ) -> None:
@@ -137,7 +137,7 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
 
     # --- in the process of the algorithm --------------------------------------------------------------
 
-    def on_algorithm_init(self, *, algorithm: Algorithm, **_: Any) -> None:
+    def on_algorithm_init(self, *, algorithm: Algorithm, **_: object) -> None:
         """Begin the run, and have all env runners join it."""
         self._run = self._begin(algorithm)
         for group in _groups(algorithm):
@@ -180,7 +180,7 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
         )
         return _Run(Loop(described, options, maker, ROWS[described.kind]))
 
-    def _joining(self, is_evaluation: bool) -> Callable[[Any], None]:
+    def _joining(self, is_evaluation: bool) -> Callable[[object], None]:
         """Return what has an env runner record its environments; it is sent to the process of each."""
         assert self._run is not None
         phase = "eval" if is_evaluation else "train"
@@ -189,7 +189,7 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
         )
 
     def on_env_runners_recreated(
-        self, *, env_runner_group: Any, env_runner_indices: list[int], is_evaluation: bool, **_: Any
+        self, *, env_runner_group: Any, env_runner_indices: list[int], is_evaluation: bool, **_: object
     ) -> None:
         """Have env runners join that take the place of others which failed."""
         if self._run is not None:
@@ -203,7 +203,7 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
             steps = algorithm.metrics.peek(("env_runners", _STEPS), default=0)
             group.foreach_env_runner(partial(_evaluate_at, int(steps)))
 
-    def on_train_result(self, *, algorithm: Algorithm, result: Mapping[str, Any], **_: Any) -> None:
+    def on_train_result(self, *, algorithm: Algorithm, result: Json, **_: object) -> None:
         """Log the result of an iteration, after the steps that it was sampled from."""
         if self._run is None:
             return
@@ -253,7 +253,7 @@ def _groups(algorithm: Algorithm) -> Iterator[Any]:
     yield from (group for group in groups if group is not None)
 
 
-def _inner(env_runner: Any) -> tuple[Any, Any]:
+def _inner(env_runner: object) -> tuple[Any, Any]:
     """Return the wrapper of RLlib around the vector of an env runner, and the vector; None without one.
 
     Raises:
@@ -271,7 +271,7 @@ def _inner(env_runner: Any) -> tuple[Any, Any]:
     return wrapper, wrapper.env
 
 
-def _described(make: str, env_runner: Any) -> tuple[Described, EnvironmentMaker] | None:
+def _described(make: str, env_runner: object) -> tuple[Described, EnvironmentMaker] | None:
     """Return the description of an env runner's environments; None without any."""
     _, envs = _inner(env_runner)
     if envs is None:
@@ -299,7 +299,7 @@ def _join(join: _Join, env_runner: Any) -> None:
     env_runner._recorded_join = join
 
 
-def _recorded(env_runner: Any) -> RecordedVector | None:
+def _recorded(env_runner: object) -> RecordedVector | None:
     envs = getattr(getattr(env_runner, "env", None), "env", None)
     return envs if isinstance(envs, RecordedVector) else None
 
@@ -310,7 +310,7 @@ def _evaluate_at(steps: int, env_runner: object) -> None:
         recorded.at_step(steps)
 
 
-def _leave(env_runner: Any) -> None:
+def _leave(env_runner: object) -> None:
     """End the shard of an env runner; called in its process."""
     if (recorded := _recorded(env_runner)) is not None:
         recorded._loop.close()

@@ -83,7 +83,7 @@ class Recording(BaseCallback):  # type: ignore[misc]
         frames_every: int = 0,
         frame_format: str = "png",
         frames_of: int | Sequence[int] | None = None,
-        make: str | Callable[[], Any] | None = None,
+        make: str | Callable[[], object] | None = None,
         checkpoint_every: int = 0,
         on_error: Literal["raise", "warn"] = "raise",
         **packing: Unpack[PackingOptions],

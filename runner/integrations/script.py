@@ -13,7 +13,7 @@ import atexit
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, Final
 
 from gymnasium.spaces import Discrete
@@ -33,7 +33,7 @@ from runner.loops.vector import record_vector
 from runner.recording.labels import MAX_NOTE, is_tag
 from runner.recording.maker import EnvironmentMaker
 from runner.runs.run import Run, label, new_run_id, recordings_folder
-from runner.util.values import is_whole
+from runner.util.values import Json, JsonView, is_whole
 
 STEP_NAME: Final = "global_step"
 """The name under which the script's own step is recorded, before the values that it gave with it."""
@@ -96,7 +96,7 @@ class ScriptRun:
         self,
         recordings: str | os.PathLike[str] | None = None,
         name: str | None = None,
-        settings: Mapping[str, Any] | None = None,
+        settings: JsonView | None = None,
         tags: tuple[str, ...] = (),
         note: str = "",
         has_environment: bool = True,
@@ -108,7 +108,7 @@ class ScriptRun:
             hint = nearest(unknown[0], {*OPTIONS, "monitor_gym", "recordings"})
             raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {expected}.{hint}")
         self._options = options
-        self.settings: dict[str, Any] = dict(settings or {})
+        self.settings: Json = dict(settings or {})
         self.name, self.takes_writers = name, takes_writers
         self.closed = self.has_writer = False
         self.log_last: Callable[[], None] = lambda: None
@@ -139,7 +139,7 @@ class ScriptRun:
 
     # --- what is logged -----------------------------------------------------------------------------------
 
-    def log(self, name: str, value: Any, step: int | None = None) -> None:
+    def log(self, name: str, value: object, step: int | None = None) -> None:
         """Log a number or a text, with the script's own step."""
         if name not in self._names:
             if not isinstance(name, str):

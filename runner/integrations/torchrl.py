@@ -16,6 +16,7 @@ from typing import Any, Unpack
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
 
 from runner.errors import ConfigError
 from runner.integrations.libraries import require_tested
@@ -146,13 +147,13 @@ def _record_batch(rec: RecordedBatches, data: Any, carrier: Any, keys: Sequence[
     """Record the steps of a batch, [*environments, time]."""
     number = int(np.prod(env.batch_size, dtype=np.int64))
 
-    def by_time(values: Any) -> Any:
+    def by_time(values: object) -> NDArray[Any]:
         """Return a tensor [*environments, time, ...] as a copy [time, environments, ...]."""
         array = np.array(as_array(values))
         array = array.reshape(number, -1, *array.shape[len(env.batch_size) + 1 :])
         return np.ascontiguousarray(array.swapaxes(0, 1))
 
-    def flag(key: str, default: Any) -> Any:
+    def flag(key: str, default: NDArray[Any]) -> NDArray[Any]:
         return by_time(after[key])[..., 0] if key in after.keys() else default  # noqa: SIM118 - no mapping
 
     after = data["next"]
@@ -185,7 +186,7 @@ def _record_batch(rec: RecordedBatches, data: Any, carrier: Any, keys: Sequence[
     )
 
 
-def _text(key: Any) -> str:
+def _text(key: str | Sequence[str]) -> str:
     return key if isinstance(key, str) else "/".join(key)
 
 

@@ -51,7 +51,7 @@ _IGNORED: Final = frozenset(
 class Settings:
     """Settings of wandb itself, which change nothing here."""
 
-    def __init__(self, *_: Any, **__: Any) -> None: ...
+    def __init__(self, *_: object, **__: object) -> None: ...
 
 
 # --- a run --------------------------------------------------------------------------------------------------
@@ -105,7 +105,9 @@ class Tracked:
         folder.mkdir(parents=True, exist_ok=True)
         return str(folder.absolute())
 
-    def log(self, data: Mapping[str, Any], step: Any = None, commit: bool | None = None, **_: Any) -> None:
+    def log(
+        self, data: Mapping[str, object], step: object = None, commit: bool | None = None, **_: object
+    ) -> None:
         """Log numbers, texts, pictures, films, histograms and arrays by name; nested names are joined by `/`.
 
         Args:
@@ -175,7 +177,7 @@ class Tracked:
         self.script.log(name, number, step)
         self.summary.seen(name, number)
 
-    def configure(self, settings: Mapping[str, Any]) -> None:
+    def configure(self, settings: Mapping[str, object]) -> None:
         """Take settings; those that come after the recording began are logged as text."""
         settings = {str(key): value for key, value in settings.items()}
         as_text = [
@@ -301,7 +303,7 @@ def init(
     return run
 
 
-def log(data: Mapping[str, Any], step: Any = None, commit: bool | None = None, **more: Any) -> None:
+def log(data: Mapping[str, object], step: object = None, commit: bool | None = None, **more: Any) -> None:
     """Log values into the open run."""
     _open_run("log").log(data, step, commit, **more)
 

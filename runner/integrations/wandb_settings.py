@@ -8,19 +8,20 @@ from typing import Any
 from runner.errors import RunnerError
 from runner.integrations.script import ScriptRun
 from runner.loops.options import settings_in
+from runner.util.values import Json
 
 
 class Config(MutableMapping[str, Any]):
     """The settings of a run: `config["lr"]`, `config.lr`, `config.update({...})`."""
 
     _script: ScriptRun
-    _configure: Callable[[Mapping[str, Any]], None]
+    _configure: Callable[[Mapping[str, object]], None]
 
-    def __init__(self, script: ScriptRun, configure: Callable[[Mapping[str, Any]], None]) -> None:
+    def __init__(self, script: ScriptRun, configure: Callable[[Mapping[str, object]], None]) -> None:
         object.__setattr__(self, "_script", script)
         object.__setattr__(self, "_configure", configure)
 
-    def update(self, *settings: Any, **more: Any) -> None:
+    def update(self, *settings: Any, **more: object) -> None:
         """Take the settings of a mapping, dataclass or namespace."""
         more.pop("allow_val_change", None)
         for each in settings:
@@ -31,7 +32,7 @@ class Config(MutableMapping[str, Any]):
         """Take the settings that are not there yet."""
         self._configure({key: value for key, value in settings_in(settings).items() if key not in self})
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Json:
         """Return the settings."""
         return dict(self._script.settings)
 
@@ -59,18 +60,18 @@ class Config(MutableMapping[str, Any]):
     __setattr__ = __setitem__
 
 
-class Summary(dict[str, Any]):
+class Summary(Json):
     """The last value logged under each name, and what the script puts there, which is logged at the end."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.own: dict[str, Any] = {}
+        self.own: Json = {}
 
     def __setitem__(self, key: str, value: object) -> None:
         super().__setitem__(key, value)
         self.own[key] = value
 
-    def update(self, values: Any = (), **more: Any) -> None:  # type: ignore[override]
+    def update(self, values: Any = (), **more: object) -> None:  # type: ignore[override]
         """Put several values there."""
         for key, value in {**dict(values), **more}.items():
             self[key] = value

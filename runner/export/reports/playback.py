@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,7 +119,7 @@ def _highest(values: NDArray[np.float64], taken: list[int]) -> dict[str, object]
     """Return the highest Q-values of each step, [action, value] pairs, and the action taken."""
     rows: dict[str, int] = {}
     which: list[int] = []
-    packed: list[list[list[Any]]] = []
+    packed: list[list[list[float | int | str | None]]] = []
     for row, action in zip(values, taken, strict=True):
         best = np.argsort(-row, kind="stable")[:MAX_VALUES].tolist()
         shown = best if action in best else [*best[:-1], action]

@@ -90,7 +90,7 @@ class Sender:
 class Column(NamedTuple):
     """An Arrow array with the interface of Rerun's `ComponentColumn`, which would copy it."""
 
-    descriptor: Any
+    descriptor: rr.ComponentDescriptor
     array: pa.Array
 
     def component_descriptor(self) -> object:

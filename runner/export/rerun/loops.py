@@ -27,7 +27,7 @@ from runner.export.rerun.steps import StepWriter
 from runner.export.values import FEW
 from runner.recording import schema
 from runner.replay.steps import check_steps
-from runner.util.arrays import Array
+from runner.util.arrays import Array, MaskedArray
 
 MAX_BARS: Final = 16
 """Extras of more numbers are drawn as bars."""
@@ -247,7 +247,7 @@ class LoopExporter:
         self,
         phase: str,
         member: Member,
-        extras: Mapping[str, np.ma.MaskedArray[Any, Any]],
+        extras: Mapping[str, MaskedArray],
         log_times: Array,
         times: list[rr.TimeColumn],
     ) -> None:
@@ -342,13 +342,13 @@ class LoopExporter:
             axis_x=whole_axis(self._last),
         )
 
-    def _log(self, log_time: int, entity: str, archetype: Any) -> None:
+    def _log(self, log_time: int, entity: str, archetype: rr.AsComponents) -> None:
         step = log_time // schema.STEP_NANOSECONDS
         self._last = max(self._last, step)
         self._stream.set_time("step", sequence=step)
         self._stream.log(f"{self._root}/{entity}", archetype)
 
-    def _times(self, log_time: NDArray[Any], episode: NDArray[Any]) -> list[rr.TimeColumn]:
+    def _times(self, log_time: Array, episode: Array) -> list[rr.TimeColumn]:
         steps = log_time.astype(np.int64) // schema.STEP_NANOSECONDS
         self._last = max(self._last, int(steps.max(initial=0)))
         return [

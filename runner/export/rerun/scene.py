@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,7 +148,7 @@ class Scene:
         return str(self.description["things"][thing]["label"])
 
     def arrows(
-        self, state: NDArray[Any], action: NDArray[Any], next_state: NDArray[Any]
+        self, state: NDArray[np.integer], action: NDArray[np.integer], next_state: NDArray[np.integer]
     ) -> NDArray[np.float32]:
         """Return the vector of each mover's move, [n, movers, 2]: short where it led nowhere."""
         points = self.mover_points

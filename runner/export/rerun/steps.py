@@ -176,7 +176,7 @@ class _Grid(Sender):
         status = np.stack((x, y), axis=1).astype(np.float32)
         return np.concatenate((points, np.broadcast_to(status, (len(points), *status.shape))), axis=1)
 
-    def _trails(self, state: NDArray[np.int64], t: NDArray[Any]) -> NDArray[np.float32]:
+    def _trails(self, state: NDArray[np.int64], t: NDArray[np.integer]) -> NDArray[np.float32]:
         """Return each mover's path over the last steps of the episode, [n, movers, TRAIL_STEPS + 1, 2]."""
         before = np.repeat(state[:1], TRAIL_STEPS) if self._before is None else self._before
         states = np.concatenate((before, state))
