@@ -46,11 +46,11 @@ class Factor:
 
     def _values(self, side: str) -> str:
         values = {change.path: getattr(change, side) for change in self.changes}
-        if values.keys() == {"tables", "rewards"}:
-            learners = (values["tables"], values["rewards"])
-            modes = [mode for mode, means in LEARNERS.items() if means == learners]
-            return modes[0] if modes else " and ".join(learners)
-        return ", ".join(_text(value) for value in values.values())
+        learners = (values.get("tables"), values.get("rewards"))
+        modes = [mode for mode, means in LEARNERS.items() if means == learners]
+        if modes:
+            del values["tables"], values["rewards"]
+        return ", ".join([*modes, *(_text(value) for value in values.values())])
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def _grouped(mixing: Mixing) -> Mixing:
         i, j = _conflict(mixing, wrong)
         one, other = (mixing.factors[k] for k in sorted((i, j)))
         changes = one.changes + other.changes
-        name = " + ".join(change.path for change in changes)
+        name = f"{one.name} + {other.name}"
         merged = Factor("mode" if name == "tables + rewards" else name, changes)
         reason = str(_problem(mixing, wrong)).splitlines()[-1]
         notes.append(f"{one.name} and {other.name} only go together, and count as one setting ({reason})")

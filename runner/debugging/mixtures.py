@@ -252,7 +252,7 @@ class Mixtures:
                 left -= len(result.readings)
                 self.trained += len(result.readings)
                 self._seconds[task.mixture] = result.seconds
-                self._keep(task, result.readings)
+                self._keep(task, result)
         self._report(self.trained, self.trained)
 
     def _tasks(self, mixtures: Sequence[int], seeds: Sequence[int]) -> Iterator[Measurement]:
@@ -264,21 +264,22 @@ class Mixtures:
             for seed in seeds:
                 known = self._kept.get(self._identity(config, seed))
                 if known is not None:
-                    self._found[mixture, seed] = known
+                    self._found[mixture, seed], before = known
+                    self._seconds.setdefault(mixture, before)
                 elif (mixture, seed) not in self._found:
                     missing.append(seed)
             for start in range(0, len(missing), batch):
                 some = tuple(missing[start : start + batch])
                 yield Measurement(mixture, config.to_mapping(), some, str(self._recordings))
 
-    def _keep(self, task: Measurement, found: Mapping[int, Readings]) -> None:
+    def _keep(self, task: Measurement, measured: Measured) -> None:
         """Append readings to the file: a line each, with the identity of the job."""
         config = from_mapping(task.config)
         lines = []
-        for seed, read in found.items():
+        for seed, read in measured.readings.items():
             self._found[task.mixture, seed] = read
-            line = {"job": self._identity(config, seed), "mixture": task.mixture, "seed": seed}
-            lines.append(json.dumps(line | {"readings": read}) + "\n")
+            line = {"job": self._identity(config, seed), "seconds": measured.seconds, "readings": read}
+            lines.append(json.dumps(line) + "\n")
         with storage_errors(self._path), self._path.open("a", encoding="utf-8") as file:
             file.writelines(lines)
 
@@ -294,14 +295,14 @@ class Mixtures:
         return RunnerError(f"the mixture with these settings of B: {names}: {reason}")
 
 
-def _kept(path: Path) -> Iterator[tuple[str, Readings]]:
-    """Yield the readings in a file by the identity of their job; a line that is cut off is left out."""
+def _kept(path: Path) -> Iterator[tuple[str, tuple[Readings, float]]]:
+    """Yield by the identity of a job its readings and seconds in a file, without damaged lines."""
     try:
         with path.open("rb") as file:
             while file.tell() < MAX_BYTES and (line := file.readline(MAX_LINE)):
                 try:
                     values = json.loads(line)
-                    yield str(values["job"]), _checked(values["readings"])
+                    yield str(values["job"]), (_checked(values["readings"]), float(values["seconds"]))
                 except (ValueError, KeyError, TypeError, RecursionError):
                     continue
     except OSError:

@@ -211,6 +211,7 @@ def test_the_command_plans_answers_and_prints_json(tmp_path):
     plan = json.loads(typed("--dry-run", "--json").stdout)
     assert (plan["mixtures"], plan["seeds"], plan["known"]) == (4, 2, 4)
     assert plan["seconds"] > 0
+    assert json.loads(typed("--dry-run", "--json").stdout) == plan  # the time is known from before
     whole = typed()
     assert "8 runs: 4 mixtures of 2 settings, 2 seeds each, 4 of them known" in whole.stderr
     assert "epsilon alone makes 100 % of it" in whole.stdout
