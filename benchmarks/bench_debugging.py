@@ -24,19 +24,38 @@ def measure(quick: bool) -> list[Figure]:
     repetitions, times = (3, 2) if quick else (7, 10)
     with tempfile.TemporaryDirectory() as folder:
         run(run_command(CONFIG, folder))
-        figures = [*what_if(folder, repetitions), *when(folder, repetitions), *why(folder, repetitions)]
+        figures = [*training(folder, repetitions), *what_if(folder, repetitions)]
+        figures += [*when(folder, repetitions), *why(folder, repetitions)]
     with tempfile.TemporaryDirectory() as folder:
         run(run_command(CONFIG, folder, f"episodes={50_000 * times}"))
         longer = [command(folder, "when", "@latest", text, "--all") for text in (STATE, PATH, "reward > 0")]
-        last = command(folder, "branch", "@latest", "--at", f"{50_000 * times - 1}:0", "--action", "all")
+        at = f"{50_000 * times - 1}:0"
+        last = command(folder, "branch", "@latest", "--at", at, "--action", "all")
         whole = command(folder, "why", "@latest", *VALUE)
+        trained = command(folder, "branch", "@latest", "--at", at, "--set", "epsilon=0.3")
     figures += explain(1 if quick else 3)
     return [
         *figures,
         _peak(f"  why, for a run {times} times as long", [whole]),
         _peak(f"  when, for a run {times} times as long", longer),
         _peak(f"  branch, all actions, for a run {times} times as long", [last]),
+        _peak(f"  training branch, for a run {times} times as long", [trained]),
     ]
+
+
+def training(folder: str, repetitions: int) -> list[Figure]:
+    """Return the figures of a branch of training that ends soon after its step.
+
+    The command trains and records all steps before it, so that its whole time is that until it goes on.
+    """
+    parent = next(Path(folder).glob("*/recording.mcap")).parent
+    words = ("branch", str(parent), "--at", "4000000", "--set", "epsilon=0.3")
+    end = ("--episodes", "46258")  # the step is in episode 46,257
+    with tempfile.TemporaryDirectory() as other:
+        command(other, *words, *end)  # compiles
+        done = [command(other, *words, *end) for _ in range(repetitions)]
+    what = "training branch at step 4 M, until it goes on"
+    return [_seconds(what, done, (1, 0.3)), _peak("  peak memory", done)]
 
 
 def what_if(folder: str, repetitions: int) -> list[Figure]:

@@ -47,7 +47,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "table": ("tables", "Print an environment's transition table with names."),
     },
     "Debug": {
-        "branch": ("branch", "Take another action at a recorded step, and play on."),
+        "branch": ("branch", "Change a recorded step, and see where that leads."),
         "when": ("when", "Find the training steps after which something holds, such as a Q-value."),
         "why": ("why", "Show the rewards and initial values that a Q-value is the sum of."),
         "explain": ("explain", "Find which settings make the difference between two runs."),

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import re
+import shutil
 import sys
 
 import numpy as np
@@ -14,6 +15,7 @@ from submitted import ICY
 
 import runner
 from runner.environments.naming import deeds_in_words, states_in_words
+from runner.execution.branching import branch_training
 from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import reader
 from runner.recording.reader import open_recording
@@ -366,6 +368,26 @@ def test_no_recording_is_read_by_the_event_loop(client, monkeypatch, address):
     monkeypatch.setattr("runner.service.pages.replay.open_recording", opened)
     assert client.get(address).status_code == 200
     assert read_by_loop == []
+
+
+def test_pages_link_a_run_with_its_branches(client, recordings):
+    parent = find_run("first", recordings)
+    branch = branch_training(
+        parent, at="2:1", overrides=["epsilon=0.5"], name="curious", recordings=recordings
+    )
+    own = branch.run.run_id
+    until(lambda page: "branches-title" in page, lambda: page_of(client, f"/runs/{parent.run_id}"))
+    assert f'<a href="/runs/{own}">curious</a>' in page_of(client, f"/runs/{parent.run_id}")
+    page = page_of(client, f"/runs/{own}")
+    assert f'<a href="/runs/{parent.run_id}">first</a>' in page
+    assert '<strong aria-current="true">curious</strong>' in page
+    assert str(branch.origin) in page
+    for run_id, name in ((parent.run_id, own), (own, f"of {parent.run_id}")):
+        page = page_of(client, f"/runs/{run_id}/replay/train/2")
+        assert f"Branch {name} {branch.origin}" in page
+        assert f'href="/compare/replay?run={parent.run_id}&amp;run={own}&amp;at=2%3A1"' in page
+    shutil.rmtree(parent.folder)
+    until(lambda page: "a run that was removed" in page, lambda: page_of(client, f"/runs/{own}"))
 
 
 def test_some_of_the_runs_are_counted_in_the_plural(client):
