@@ -15,8 +15,8 @@ from runner.analysis.evaluations import (
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.clock import Clock, read_clock
+from runner.recording.maker import Shard
 from runner.recording.messages import Message
-from runner.recording.metadata import Shard
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import Summary
 from runner.runs.checkpoints import Checkpoint, read_checkpoints

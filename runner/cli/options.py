@@ -201,9 +201,7 @@ NUMBERS: Final = Parsed(
     "numbers", "numbers such as 1000,49000", lambda text: tuple(map(_number, text.split(",")))
 )
 PICTURE_SIZE: Final = Parsed(
-    "WxH",
-    "WIDTHxHEIGHT up to 8192x8192, such as 1600x900",
-    lambda text: "{}x{}".format(*_pair(text, 8192)),
+    "WxH", "WIDTHxHEIGHT up to 8192x8192, such as 1600x900", lambda text: "{}x{}".format(*_pair(text, 8192))
 )
 GRID: Final = Parsed("RxC", "ROWSxCOLUMNS up to 8x8, such as 3x3", lambda text: _pair(text, 8))
 TARGET: Final = Parsed("METRIC=LEVEL", "METRIC=LEVEL such as success_percent=80", _target)

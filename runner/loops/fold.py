@@ -20,7 +20,7 @@ from runner.loops.options import PACKING
 from runner.loops.outcomes import Outcomes
 from runner.loops.shard_sources import PHASES, Source
 from runner.recording import schema
-from runner.recording.maker import EnvironmentMaker
+from runner.recording.maker import SHARD_MAKER, EnvironmentMaker, Shard
 from runner.recording.messages import (
     Message,
     decode,
@@ -31,7 +31,7 @@ from runner.recording.messages import (
     frame_place,
     log_level,
 )
-from runner.recording.metadata import SHARD_MAKER, Shard, sizes_of, write_result
+from runner.recording.metadata import sizes_of, write_result
 from runner.recording.recorder import Recorder
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import create_recording

@@ -265,13 +265,7 @@ class EpisodeCounter:
         self._carried = np.zeros(1 + (len(mdp.event_names) if mdp else 0), np.int64)
         """Those of the episode in progress, before the first row."""
 
-    def count(
-        self,
-        rewards: NDArray[np.float64],
-        state: Ints,
-        action: Ints,
-        next_state: Ints,
-    ) -> None:
+    def count(self, rewards: NDArray[np.float64], state: Ints, action: Ints, next_state: Ints) -> None:
         """Count the events of rows."""
         if self._mdp is not None:
             bits = np.zeros((len(rewards) + 1, len(self._carried)), np.int64)

@@ -312,9 +312,5 @@ class VariableRows(Rows):
         """Do nothing: the messages are complete."""
 
 
-ROWS: Final[dict[str, type[Rows]]] = {
-    "step": DiscreteRows,
-    "transition": ArrayRows,
-    "variable": VariableRows,
-}
+ROWS: Final[dict[str, type[Rows]]] = {"step": DiscreteRows, "transition": ArrayRows, "variable": VariableRows}
 """The rows of one environment by the kind of recording."""

@@ -340,12 +340,7 @@ class VectorRows:
         self._put_resets(which, observation, seeds, states, episode, first + rows[order] * self._n)
 
     def _put_ends(
-        self,
-        last: Ints,
-        length: Array,
-        returns: Array,
-        terminated: Flags,
-        truncated: Flags,
+        self, last: Ints, length: Array, returns: Array, terminated: Flags, truncated: Flags
     ) -> None:
         """Record the ends of episodes, in the order in which they ended; `last` are their last steps."""
         columns = {

@@ -13,16 +13,20 @@ from runner.environments.naming import action_names, actions_in_words
 from runner.errors import RecordingError, RunnerError
 from runner.recording import schema
 from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD, Code, parse_code
-from runner.recording.maker import MAKER_RECORD, EnvironmentMaker, parse_maker
-from runner.recording.metadata import (
+from runner.recording.maker import (
+    MAKER_RECORD,
     SHARD_MAKER,
+    EnvironmentMaker,
     Shard,
+    parse_maker,
+    parse_shards,
+)
+from runner.recording.metadata import (
     environment_description,
     environment_of,
     json_object,
     kind_of,
     lost_ranges,
-    parse_shards,
     spaces_of,
     unpacked_provenance,
 )

@@ -22,7 +22,6 @@ from runner.service import login, pages
 from runner.service.api import comparing, debugging, files, jobs, reading, replay, runs, uploads
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CatalogueOf, SettingsOf
-from runner.service.fragments import load_sweep_libraries
 from runner.service.guard import Guard
 from runner.service.jobs.queue import JobQueue
 from runner.service.logs import LOG, AccessLog
@@ -31,6 +30,7 @@ from runner.service.problems import add_error_handlers, error_docs
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ResponseCache
 from runner.service.settings import Settings
+from runner.service.sweep_fragments import load_sweep_libraries
 from runner.service.tokens import Sessions, Tokens
 from runner.service.upload import Upload
 from runner.service.uploads import Uploads

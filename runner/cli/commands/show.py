@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from runner.analysis.summary import RecordedExtras, RunDetails
-    from runner.recording.metadata import Shard
+    from runner.recording.maker import Shard
     from runner.recording.reader import Recording
     from runner.recording.run_file import Summary
     from runner.runs.branches import Origin

@@ -19,7 +19,7 @@ from runner.debugging.explanation_files import explanations_in
 from runner.errors import RunnerError, RunNotFound
 from runner.export.reports.rendering import View
 from runner.runs.catalogue.filters import parse
-from runner.service import fragments
+from runner.service import sweep_fragments
 from runner.service.addresses import link
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf, SweepProcesses
@@ -34,9 +34,9 @@ router = APIRouter(prefix="/sweeps", include_in_schema=False)
 Name = Annotated[str, InPath(max_length=100)]
 Part = Literal["results", "importance", "pictures"]
 PARTS: Final = {
-    "results": fragments.sweep_results,
-    "importance": fragments.sweep_importance,
-    "pictures": fragments.sweep_pictures,
+    "results": sweep_fragments.sweep_results,
+    "importance": sweep_fragments.sweep_importance,
+    "pictures": sweep_fragments.sweep_pictures,
 }
 """Parts of the page of a sweep in the order in which they are computed, the fastest first."""
 
