@@ -11,14 +11,14 @@ determines that. So the sum is exact: it is the value, but for the rounding of b
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.step_reference import StepRef
 from runner.archive.places import at_hand
+from runner.debugging.q_value import EpisodesPart, Part, RewardPart, StepPart, Why
 from runner.debugging.weights import Cell, Weights, weights_of
 from runner.drawing import svg
 from runner.drawing.svg_moves import Move, moves_map
@@ -41,10 +41,6 @@ from runner.recording.reader import Recording, open_recording
 from runner.replay.steps import check_steps, last_step
 from runner.runs.run import Run
 
-EXPLANATION: Final = (
-    "This is a decomposition along the path that training took, not a counterfactual: `dualtaxi branch` "
-    "shows what would have happened after another action or with other settings."
-)
 POLICY_NOTE: Final = (
     "WoLF-PHC acts by a policy, which is no such sum: its moves have a fixed size. This is the Q-value that "
     "tells the policy where to move."
@@ -54,107 +50,6 @@ MAX_LIMIT: Final = 1000
 """The most steps of an answer."""
 MAX_KINDS: Final = 100
 """Kinds of rewards, the rest of which are counted together."""
-
-
-@dataclass(frozen=True)
-class Part:
-    """A part of a Q-value."""
-
-    weight: float
-    """The sum of the weights of its rewards or initial values."""
-    contribution: float
-    """What it adds to the Q-value: each reward or initial value, times its weight."""
-
-
-@dataclass(frozen=True)
-class RewardPart(Part):
-    """What rewards of one kind add to a Q-value."""
-
-    reward: float | None
-    """None for all kinds that are not named."""
-    events: str
-    """What happened in these steps; may be empty."""
-
-
-@dataclass(frozen=True)
-class EpisodesPart(Part):
-    """What the rewards of a stretch of episodes add to a Q-value."""
-
-    start: int
-    stop: int
-    """The episode after the last one."""
-
-
-@dataclass(frozen=True)
-class StepPart(Part):
-    """What the reward of one step adds to a Q-value."""
-
-    at: str
-    """The step as a reference, `EPISODE:T`."""
-    step: int
-    """Its number in training."""
-    episode: int
-    state: int
-    state_in_words: str
-    action: int
-    """The joint action."""
-    action_in_words: str
-    next_state: int
-    reward: float
-    """The learner's own."""
-    events: str
-    explored: str
-    """Which learners explored; may be empty."""
-    distance: float
-    """Steps from the state of the Q-value to this one, on average over the ways by which the reward came."""
-
-
-@dataclass(frozen=True)
-class Why:
-    """A Q-value as a sum."""
-
-    run_id: str
-    agent: str
-    """The learner whose table it is in."""
-    state: int
-    state_in_words: str
-    action: int
-    action_in_words: str
-    step: int
-    """Training steps that the table has learned from."""
-    value: float
-    """The Q-value in the table."""
-    total: float
-    """The sum of all contributions."""
-    counted: int
-    """Number of steps whose rewards have a weight."""
-    rewarded: Part
-    """All rewards."""
-    initial: Part
-    """The initial values."""
-    rewards: tuple[RewardPart, ...]
-    """The parts by kind of reward, those that add or take most first."""
-    episodes: tuple[EpisodesPart, ...]
-    """The parts by stretches of equally many episodes, in order."""
-    steps: tuple[StepPart, ...]
-    """The steps that add or take most, these first."""
-    moves: tuple[Move, ...]
-    """Where the things that the learner moves went, by weight; empty without a scene."""
-    note: str
-    """What the sum does not explain of the run's algorithm; may be empty."""
-    picture: str = field(repr=False)
-    """The moves on the grid, as SVG; empty without a scene."""
-
-    def as_json(self) -> dict[str, Any]:
-        """Return all fields but the picture as JSON can hold them."""
-        fields = asdict(self) | {"moves": [move._asdict() for move in self.moves]}
-        del fields["picture"]
-        return fields
-
-    def _repr_html_(self) -> str:
-        from runner.debugging.why_page import why_frame
-
-        return why_frame(self)
 
 
 def why(

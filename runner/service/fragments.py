@@ -24,9 +24,9 @@ from runner.analysis.histograms import histograms
 from runner.analysis.series import read_series
 from runner.analysis.step_reference import StepRef
 from runner.analysis.summary import random_policy_sentence
+from runner.debugging.q_value import why_body
 from runner.debugging.what_if import branch_playback, what_if_in
 from runner.debugging.why import why_in
-from runner.debugging.why_page import why_body
 from runner.drawing import svg
 from runner.environments.naming import joint_action
 from runner.errors import RecordingError

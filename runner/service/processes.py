@@ -33,7 +33,7 @@ PRELOADED: Final = (
     "runner.analysis.series",
     "runner.debugging.what_if",
     "runner.debugging.when",
-    "runner.debugging.why_page",
+    "runner.debugging.why",
     "runner.environments.loading",
     "runner.execution.estimate",
     "runner.execution.initial_tables",

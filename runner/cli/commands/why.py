@@ -60,8 +60,8 @@ def why_command(
       dualtaxi why rivals --state 300 --action pickup --agent taxi_2 --at 2000:0
       dualtaxi why k3v9m2xq --at eval:3000:7:5 --limit 30
     """
+    from runner.debugging.q_value import facts_of, sections_of
     from runner.debugging.why import why
-    from runner.debugging.why_text import facts_of, sections_of
 
     run = find_recorded(run_name, recordings)
     with compilation_notice(), steps_line("reading") as report:

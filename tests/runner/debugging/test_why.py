@@ -6,8 +6,10 @@ import json
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import runner
+from runner.cli import cli
 from runner.debugging import weights
 from runner.errors import ConfigError, RecordingError, RunnerError
 from runner.recording import schema
@@ -223,3 +225,19 @@ def test_a_damaged_recording_is_reported(tmp_path):
     run.recording.write_bytes(data)
     with pytest.raises(RecordingError, match="repair"):
         runner.why(run, state=5, action=0)
+
+
+def test_the_command_prints_what_python_returns(cooperative):
+    recordings = ["--recordings", str(cooperative.folder.parent)]
+    (step,), _ = last_steps(cooperative, 1)
+    words = ["why", cooperative.run_id, "--state", str(step["state"]), "--action", str(step["action"])]
+    answer = CliRunner().invoke(cli, [*words, *recordings, "--json"], catch_exceptions=False)
+    assert answer.exit_code == 0
+    found = runner.why(cooperative, state=int(step["state"]), action=int(step["action"]))
+    assert json.loads(answer.stdout) == json.loads(json.dumps(found.as_json()))
+    text = CliRunner().invoke(cli, [*words, *recordings, "--limit", "2"], catch_exceptions=False).stdout
+    assert f"{found.value:.9g} after {found.step:,} training steps" in text
+    assert found.steps[1].at in text
+    assert "not a counterfactual" in text
+    wrong = CliRunner().invoke(cli, ["why", cooperative.run_id, "--state", "5000", *recordings])
+    assert wrong.exit_code == 2

@@ -1,0 +1,240 @@
+"""A Q-value as the sum of what it was made of: for Python, as text, and as HTML for pages and notebooks."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from html import escape
+from typing import Any, Final
+
+from runner.analysis.sections import Grid, Section
+from runner.analysis.step_reference import StepRef
+from runner.drawing.svg_moves import Move
+from runner.environments.naming import spoken
+from runner.errors import MissingExtra
+from runner.export.reports.rendering import page_style, partials
+
+EXPLANATION: Final = (
+    "This is a decomposition along the path that training took, not a counterfactual: `dualtaxi branch` "
+    "shows what would have happened after another action or with other settings."
+)
+MAX_ROWS: Final = 12
+"""Kinds of rewards that are shown."""
+HEIGHT: Final = 760
+"""Height of a notebook's frame in pixels."""
+KEY: Final = (
+    "An arrow is as wide as the weight of all steps that made this move; a ring stands for staying in the "
+    "cell, as after a move into a wall, or a pickup. Things are drawn where they are in the value's state."
+)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a Q-value."""
+
+    weight: float
+    """The sum of the weights of its rewards or initial values."""
+    contribution: float
+    """What it adds to the Q-value: each reward or initial value, times its weight."""
+
+
+@dataclass(frozen=True)
+class RewardPart(Part):
+    """What rewards of one kind add to a Q-value."""
+
+    reward: float | None
+    """None for all kinds that are not named."""
+    events: str
+    """What happened in these steps; may be empty."""
+
+
+@dataclass(frozen=True)
+class EpisodesPart(Part):
+    """What the rewards of a stretch of episodes add to a Q-value."""
+
+    start: int
+    stop: int
+    """The episode after the last one."""
+
+
+@dataclass(frozen=True)
+class StepPart(Part):
+    """What the reward of one step adds to a Q-value."""
+
+    at: str
+    """The step as a reference, `EPISODE:T`."""
+    step: int
+    """Its number in training."""
+    episode: int
+    state: int
+    state_in_words: str
+    action: int
+    """The joint action."""
+    action_in_words: str
+    next_state: int
+    reward: float
+    """The learner's own."""
+    events: str
+    explored: str
+    """Which learners explored; may be empty."""
+    distance: float
+    """Steps from the state of the Q-value to this one, on average over the ways by which the reward came."""
+
+
+@dataclass(frozen=True)
+class Why:
+    """A Q-value as a sum."""
+
+    run_id: str
+    agent: str
+    """The learner whose table it is in."""
+    state: int
+    state_in_words: str
+    action: int
+    action_in_words: str
+    step: int
+    """Training steps that the table has learned from."""
+    value: float
+    """The Q-value in the table."""
+    total: float
+    """The sum of all contributions."""
+    counted: int
+    """Number of steps whose rewards have a weight."""
+    rewarded: Part
+    """All rewards."""
+    initial: Part
+    """The initial values."""
+    rewards: tuple[RewardPart, ...]
+    """The parts by kind of reward, those that add or take most first."""
+    episodes: tuple[EpisodesPart, ...]
+    """The parts by stretches of equally many episodes, in order."""
+    steps: tuple[StepPart, ...]
+    """The steps that add or take most, these first."""
+    moves: tuple[Move, ...]
+    """Where the things that the learner moves went, by weight; empty without a scene."""
+    note: str
+    """What the sum does not explain of the run's algorithm; may be empty."""
+    picture: str = field(repr=False)
+    """The moves on the grid, as SVG; empty without a scene."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all fields but the picture as JSON can hold them."""
+        fields = asdict(self) | {"moves": [move._asdict() for move in self.moves]}
+        del fields["picture"]
+        return fields
+
+    def _repr_html_(self) -> str:
+        return why_frame(self)
+
+
+def facts_of(found: Why) -> dict[str, str]:
+    """Return the run, the state, the action and the value as text, by name."""
+    return {
+        "run": found.run_id,
+        "state": f"{found.state}: {found.state_in_words}",
+        "action": f"{found.action}: {found.action_in_words}, of {spoken(found.agent)}",
+        "value": f"{found.value:.9g} after {found.step:,} training steps",
+    }
+
+
+def sections_of(found: Why) -> list[Section]:
+    """Return all parts of the sum; the section of steps is the last one."""
+    whole = found.rewarded.weight + found.initial.weight
+
+    def cells(part: Part) -> tuple[str, str, str]:
+        share = 100 * part.weight / whole if whole else 0.0
+        return f"{part.contribution:+.4g}", f"{part.weight:.4g}", f"{share:.3g} %"
+
+    columns = ("adds", "weight", "of all weight")
+    sums = [
+        (f"rewards of {found.counted:,} of {found.step:,} steps", *cells(found.rewarded)),
+        ("initial values", *cells(found.initial)),
+        ("sum", f"{found.total:.9g}", f"{whole:.4g}", ""),
+    ]
+    rest = found.rewards[MAX_ROWS:]
+    rewards = [
+        ("other rewards" if part.reward is None else f"{part.reward:+g}", part.events or "none", *cells(part))
+        for part in found.rewards[:MAX_ROWS]
+    ]
+    if rest:
+        others = Part(sum(part.weight for part in rest), sum(part.contribution for part in rest))
+        rewards.append((f"{len(rest)} other kinds", "", *cells(others)))
+    off = f"It differs from the table's value by {abs(found.total - found.value):.1g}, by rounding."
+    return [
+        Section(
+            "The sum", [off, EXPLANATION, *([found.note] if found.note else [])], [Grid(("", *columns), sums)]
+        ),
+        Section("By reward", [], [Grid(("reward", "events", *columns), rewards)]),
+        Section(
+            "By episode",
+            [],
+            [
+                Grid(
+                    ("episodes", *columns),
+                    [(_episodes(part), *cells(part)) for part in found.episodes],
+                )
+            ],
+        ),
+        Section(
+            "The steps that add or take most",
+            [] if found.steps else ["No reward adds to the value or takes from it."],
+            [
+                Grid(
+                    ("step", "state", "action", "reward", *columns, "steps away"),
+                    [_step(part, cells(part)) for part in found.steps],
+                )
+            ]
+            if found.steps
+            else [],
+        ),
+    ]
+
+
+def _episodes(part: EpisodesPart) -> str:
+    return f"{part.start:,}" if part.stop == part.start + 1 else f"{part.start:,} to {part.stop - 1:,}"
+
+
+def _step(part: StepPart, cells: tuple[str, str, str]) -> tuple[str, ...]:
+    action = f"{part.action_in_words} ({part.explored})" if part.explored else part.action_in_words
+    reward = f"{part.reward:+g}, {part.events}" if part.events else f"{part.reward:+g}"
+    return part.at, f"{part.state}: {part.state_in_words}", action, reward, *cells, f"{part.distance:.1f}"
+
+
+def why_body(found: Why, linked: bool) -> str:
+    """Return the part of a page that shows a Q-value as a sum.
+
+    Args:
+        found: the sum.
+        linked: link each step to its replay on a server.
+
+    Raises:
+        MissingExtra: Jinja2 is not installed.
+    """
+    parts = partials()
+    *sections, steps = sections_of(found)
+    steps_at = [StepRef.parse(step.at) for step in found.steps]
+    links = [at.replay_address(found.run_id) for at in steps_at] if linked else []
+    picture = ""
+    if found.picture:
+        picture = f'<figure class="moves">{found.picture}<figcaption>{escape(KEY)}</figcaption></figure>'
+    first, *others = [parts.section(f"why-{k}", body.title, body) for k, body in enumerate(sections)]
+    listed = "".join(str(parts.grid(grid, steps.title, "list", links)) for grid in steps.grids)
+    return (
+        f'{parts.pairs("The value", facts_of(found))}<div class="why">{picture}<div>{first}</div></div>'
+        f'<section id="why-steps"><h2>{escape(steps.title)}</h2>'
+        f"{parts.paragraphs(steps.sentences)}{listed}</section>"
+        f"{''.join(map(str, others))}"
+    )
+
+
+def why_frame(found: Why) -> str:
+    """Return a Q-value as a sum in a frame of its own; the value alone if packages are missing."""
+    try:
+        page = f"<style>{page_style()}</style><main>{why_body(found, linked=False)}</main>"
+    except MissingExtra as error:
+        facts = "; ".join(f"{name} {text}" for name, text in facts_of(found).items())
+        return f"<p>{escape(facts)}</p><p>{escape(str(error))}</p>"
+    title = f"Why the value of action {found.action_in_words} in state {found.state} is {found.value:.4g}"
+    return (
+        f'<iframe title="{escape(title)}" srcdoc="{escape(page)}" width="100%" height="{HEIGHT}" '
+        'style="border: 1px solid #8888; border-radius: 6px" sandbox></iframe>'
+    )
