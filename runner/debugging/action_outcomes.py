@@ -26,7 +26,7 @@ ENDS: Final = {
     "stopped": "not over",
 }
 """How an episode ends, by the keys of `ENDINGS`, in the words of a table."""
-_CELL: Final = (96, 44)
+_CELL: Final = (116, 44)
 """Width and height of a cell of the matrix."""
 _HEAD: Final = (96, 60)
 """Width and height of its headings."""
