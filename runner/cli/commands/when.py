@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from runner.cli import Command
-from runner.cli.options import json_option, recordings_option, run_argument
+from runner.cli.options import all_option, json_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, print_sections
 from runner.cli.progress import steps_line
 from runner.cli.runs import command_for, compilation_notice, find_recorded
@@ -16,7 +16,7 @@ from runner.cli.runs import command_for, compilation_notice, find_recorded
 @click.command("when", cls=Command)
 @run_argument
 @click.argument("expression", metavar="EXPRESSION")
-@click.option("--all", "every", is_flag=True, help="List every interval in which it holds.")
+@all_option
 @click.option("--from", "first", metavar="STEP", help="The first training step: its number, or EPISODE:T.")
 @click.option("--to", "last", metavar="STEP", help="The last training step, as for --from.")
 @recordings_option
@@ -24,13 +24,15 @@ from runner.cli.runs import command_for, compilation_notice, find_recorded
 def when_command(
     run_name: str,
     expression: str,
-    every: bool,
+    everything: bool,
     first: str | None,
     last: str | None,
     recordings: Path | None,
     as_json: bool,
 ) -> None:
     r"""Find the first training step of RUN after which EXPRESSION holds, exactly: every step is replayed.
+
+    With --all, every interval in which it holds.
 
     \b
     q[S, A], max(q[S])   a Q-value; the highest in a state, or the lowest: min(q[S])
@@ -54,7 +56,7 @@ def when_command(
 
     run = find_recorded(run_name, recordings)
     with compilation_notice(), steps_line("searched") as report:
-        found = when(run, expression, every=every, first=first, last=last, report=report)
+        found = when(run, expression, every=everything, first=first, last=last, report=report)
     if as_json:
         print_json(found.as_json())
         return

@@ -84,6 +84,7 @@ WORDS = {
     "compare": "@latest other@latest",
     "verify": "@latest",
     "table": "--env FrozenLake-v1",
+    "when": "@latest step>=1",
     "label": "@latest --tag good",
     "rm": "@latest --dry-run",
     "prune": "--keep-last 0 --dry-run",
@@ -238,6 +239,7 @@ OF_THE_COMMAND = (
     "port",
     "ray",
     "seed",
+    "to",
 )
 """Options that mean the same thing, in words that fit the command."""
 
