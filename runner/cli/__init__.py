@@ -152,8 +152,8 @@ def error_as_json(message: str, exit_code: int, problems: Sequence[ConfigProblem
 
 
 def _with_examples(text: str | None) -> str | None:
-    """Return a help text with Click's mark for preformatted text before its examples."""
-    return text and re.sub(r"\n\n(?=Examples?:\n)", "\n\n\b\n", inspect.cleandoc(text))
+    """Return a help text with Click's mark for preformatted text before its examples and other lists."""
+    return text and re.sub(r"\n\n(?=[A-Z][a-z ]*:\n)", "\n\n\b\n", inspect.cleandoc(text))
 
 
 class Command(click.Command):

@@ -30,17 +30,17 @@ def when_command(
     recordings: Path | None,
     as_json: bool,
 ) -> None:
-    r"""Find the first training step of RUN after which EXPRESSION holds, exactly: every step is replayed.
+    """Find the first training step of RUN after which EXPRESSION holds, exactly: every step is replayed.
 
     With --all, every interval in which it holds.
 
-    \b
-    q[S, A], max(q[S])   a Q-value; the highest in a state, or the lowest: min(q[S])
-    greedy[S]            the greedy action, compared with a name or a number
-    greedy_success[S]    whether the greedy path from S succeeds within the step limit
-    visits[S]            how often a step began in S; visits[S, A] with action A
-    step, episode        numbers of the training step and of its episode
-    reward, epsilon      of the training step
+    In an expression:
+      q[S, A], max(q[S])   a Q-value; the highest in a state, or the lowest: min(q[S])
+      greedy[S]            the greedy action, compared with a name or a number
+      greedy_success[S]    whether the greedy path from S succeeds within the step limit
+      visits[S]            how often a step began in S; visits[S, A] with action A
+      step, episode        numbers of the training step and of its episode
+      reward, epsilon      of the training step
 
     S and A are numbers or names, as `dualtaxi table` prints them. There are and, or, not, comparisons, also
     chained, + - * / // %, max(), min() and abs(). Where each agent has a table of its own, q.taxi_1[S, A] and

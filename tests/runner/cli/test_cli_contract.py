@@ -84,7 +84,7 @@ WORDS = {
     "compare": "@latest other@latest",
     "verify": "@latest",
     "table": "--env FrozenLake-v1",
-    "when": "@latest step>=1",
+    "when": "{run} step>=1",
     "label": "@latest --tag good",
     "rm": "@latest --dry-run",
     "prune": "--keep-last 0 --dry-run",
@@ -212,7 +212,7 @@ def takes_runs(command):
 
 @pytest.mark.parametrize("path", [path for path in EVERY if takes_runs(EVERY[path])], ids=" ".join)
 def test_an_unknown_run_has_the_documented_exit_code(place, path):
-    words = ["nosuchrun"] * (2 if path == ("diff",) else 1)
+    words = ["nosuchrun"] * (2 if path in (("diff",), ("when",)) else 1)
     done = place.command(*path, *words)
     assert done.exit_code == ExitCode.USAGE, done.output
     assert "no run 'nosuchrun'" in done.stderr
