@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from runner.config import ConfigError, ExperimentConfig, RunTable, from_mapping, load
 from runner.config.job import Job, jobs_of
@@ -216,7 +216,7 @@ def interruptible(second: Handler = None) -> Iterator[Interrupt]:
         return
     before = {number: signal.getsignal(number) for number in _SIGNALS}
 
-    def first(_number: int, _frame: Any) -> None:
+    def first(_number: int, _frame: object) -> None:
         interrupt.came = True
         restore(second)
 

@@ -36,7 +36,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pyarrow as pa
@@ -192,7 +192,7 @@ class Column:
 
     name: str
     type: pa.DataType
-    read: Callable[[Records], Any]
+    read: Callable[[Records], object]
     """Returns the column, [n], of records."""
     write: Callable[[Records, pa.Array], None] | None = None
     """Sets the records' field; None if other columns determine it."""

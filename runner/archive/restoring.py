@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pyarrow as pa
 from blake3 import blake3
+from numpy.typing import NDArray
 
 from runner.archive import layout
 from runner.archive.columns import in_layouts, of_phase, record_bytes, records_of
@@ -196,7 +197,9 @@ class _Restorer:
         if topic.message is schema.IMAGE or self._archive.is_job:
             self._batches.flush()
 
-    def _send(self, topic: Topic, records: memoryview, times: Any, offsets: Any) -> None:
+    def _send(
+        self, topic: Topic, records: memoryview, times: NDArray[np.uint64], offsets: NDArray[np.uint64]
+    ) -> None:
         self._pipeline.raise_failure()
         self._counts[topic.name] += len(times)
         if topic.name in ("/train/step", "/eval/step"):

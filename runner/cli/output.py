@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import click
 
@@ -27,7 +27,7 @@ UNBOUNDED: Final = 1000
 """Width without a terminal."""
 
 
-def print_json(value: Any, indent: int | None = 1) -> None:
+def print_json(value: object, indent: int | None = 1) -> None:
     """Print a value as JSON on stdout; None for `indent` makes it one line. NaN and infinity become null."""
     click.echo(json.dumps(finite(value), indent=indent, allow_nan=False))
 

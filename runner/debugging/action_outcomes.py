@@ -15,7 +15,7 @@ from runner.drawing.palette import ink_on, ramp_colour
 from runner.environments.mdp import Mdp
 from runner.environments.naming import numbered_actions, spoken
 from runner.util.humanize import number
-from runner.util.values import finite
+from runner.util.values import Json, finite
 
 ENDS: Final = {
     "success": "success",
@@ -90,7 +90,7 @@ class WhatIf:
     mdp: Mdp = field(repr=False)
     """The environment; not a part of the JSON."""
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> Json:
         """Return all fields but the environment as JSON can hold them."""
         plain = {
             name: value for name, value in vars(self).items() if name not in ("recorded", "actions", "mdp")

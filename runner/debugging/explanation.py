@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from html import escape
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 from runner.analysis.compare.statistics import FEW_SEEDS, Estimate
 from runner.analysis.sections import Grid, Section, markdown
@@ -15,6 +15,7 @@ from runner.export.plots.curves import Plot
 from runner.export.plots.mixtures import Column, bars_chart, mixtures_chart
 from runner.export.reports.rendering import partials
 from runner.util.humanize import counted, duration
+from runner.util.values import Json
 
 ENOUGH: Final = 0.9
 """The part of the difference from which some settings count as making it."""
@@ -123,7 +124,7 @@ class Explanation:
         """Return a value as a part of the difference."""
         return value / self.difference.value if self.difference.value else float("nan")
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> Json:
         """Return the result as plain values; NaN where there is no interval."""
         return asdict(self)
 

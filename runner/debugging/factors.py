@@ -8,13 +8,14 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Final
+from typing import Final
 
 from runner.analysis.diff.settings import Change
 from runner.config import ConfigError, ExperimentConfig, from_mapping
 from runner.config.model import LEARNERS, SECTION_OF
 from runner.errors import EnvironmentNotUsable, RunnerError
 from runner.util.humanize import listed
+from runner.util.values import Json, JsonView
 
 MAX_ALL: Final = 8
 """With more settings than this, not all mixtures are run."""
@@ -131,7 +132,7 @@ def mix(a: ExperimentConfig, b: ExperimentConfig, at: int | None = None, exact: 
     return mixing
 
 
-def _changes(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> Iterator[Change]:
+def _changes(a: JsonView, b: JsonView, prefix: str = "") -> Iterator[Change]:
     """Yield the settings that differ; sections in which values can be mixed one by one are entered."""
     for key in dict.fromkeys([*a, *b]):
         path, left, right = f"{prefix}{key}", a.get(key), b.get(key)
@@ -148,7 +149,7 @@ def _changes(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> It
             yield Change(path, left, right)
 
 
-def _mixed(a: dict[str, Any], b: Mapping[str, Any], paths: Sequence[str]) -> dict[str, Any]:
+def _mixed(a: Json, b: JsonView, paths: Sequence[str]) -> Json:
     """Return the values of A with those of B at some paths; a key that B does not have is removed."""
     mixed = copy.deepcopy(a)
     for path in paths:

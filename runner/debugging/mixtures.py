@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import numpy as np
 from blake3 import blake3
@@ -35,7 +35,7 @@ from runner.recording.blocks import blank_records, topic_sizes
 from runner.sweep.local import Workers
 from runner.sweep.objective import readings
 from runner.util.files import storage_errors
-from runner.util.values import finite
+from runner.util.values import Json, finite
 from runner.util.version import __version__
 
 VALUES: Final = "values.jsonl"
@@ -67,7 +67,7 @@ class Measurement:
     """A task: train a configuration with some seeds to its end, and evaluate there."""
 
     mixture: int
-    config: dict[str, Any]
+    config: Json
     seeds: tuple[int, ...]
     recordings: str
 

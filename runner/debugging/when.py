@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.util.humanize import UNKNOWN, counted
+from runner.util.values import Json
 
 MAX_INTERVALS: Final = 10_000
 """The most intervals of a result; further ones are counted."""
@@ -100,7 +101,7 @@ class When:
         """The first step after which the expression holds; None if there is none."""
         return self.intervals[0].start if self.intervals else None
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> Json:
         """Return the result as JSON can hold it; each moment with its step reference as `at`."""
         found = asdict(self)
         for moment in (found["last"], *(each[k] for each in found["intervals"] for k in ("start", "end"))):

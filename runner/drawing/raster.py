@@ -12,7 +12,7 @@ import importlib.util
 import math
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,7 +135,7 @@ def render_svg(picture: str, width: int, height: int) -> Image.Image:
     import resvg_py
     from PIL import Image
 
-    files: list[Any] = [str(path) for path in _fonts()]
+    files: list[str] = [str(path) for path in _fonts()]
     png = resvg_py.svg_to_bytes(
         svg_string=picture,
         width=width,

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,7 @@ from runner.runs.code import CodeCollector
 from runner.runs.provenance import provenance
 from runner.runs.redaction import LineRedactor
 from runner.runs.run import Run
+from runner.util.arrays import Records
 
 REPORT_SECONDS: Final = 0.1
 
@@ -323,7 +324,7 @@ class Session:
         self._report(progress)
 
 
-def evaluation_metrics(learner: Learner, evaluation: int, trials: Any) -> Message:
+def evaluation_metrics(learner: Learner, evaluation: int, trials: Records) -> Message:
     """Return the metrics of an evaluation from its episode records, and of training at that moment."""
     known = bool(learner.mdp.success_events)
     successes = int(trials["success"].sum())

@@ -8,13 +8,14 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from runner.analysis.diff import RunDiff, diff
 from runner.analysis.diff.sections import sections
 from runner.analysis.diff.settings import changes_in
+from runner.environments.gym_types import Env
 from runner.errors import ConfigError
 from runner.export.reports.diff import render_diff
 from runner.loops.env import record
@@ -73,7 +74,7 @@ def _in_words(difference: RunDiff) -> str:
     return "\n".join(lines)
 
 
-def record_environment(make: Callable[[], Any], episodes: int, max_steps: int, recordings: Path) -> Run:
+def record_environment(make: Callable[[], Env], episodes: int, max_steps: int, recordings: Path) -> Run:
     """Record episodes of random actions in an environment, each with its number as seed.
 
     Args:
@@ -93,7 +94,7 @@ def record_environment(make: Callable[[], Any], episodes: int, max_steps: int, r
     return env.run
 
 
-def compare_environment(golden: Path, make: Callable[[], Any], tolerance: float) -> str:
+def compare_environment(golden: Path, make: Callable[[], Env], tolerance: float) -> str:
     """Return where an environment first differs from a golden run of it, and why; empty if it does not.
 
     Raises:

@@ -8,7 +8,7 @@ import signal
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from filelock import FileLock
 from pydantic import BaseModel, ConfigDict, Field
@@ -74,7 +74,7 @@ class Upload(UploadStatus):
         """Whether its result is final."""
         return self.state in ("stored", "refused")
 
-    def replace(self, **changes: Any) -> Upload:
+    def replace(self, **changes: object) -> Upload:
         """Return the upload with other values of some fields, and without its problem."""
         new: Json = {"problem": "", "changed": time.time()} | changes
         return replace(self, **new)

@@ -8,6 +8,8 @@ import os
 import signal
 from collections.abc import Callable
 from multiprocessing import connection
+from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Event
 from typing import Any, Final, Generic, Protocol, Self, TypeVar
 
 CLOSE_SECONDS: Final = 30.0
@@ -105,7 +107,7 @@ class LocalWorkers(Generic[T, R]):
 class _Worker(Generic[R]):
     """A process and the pipe to it."""
 
-    def __init__(self, context: Any, stopping: Any) -> None:
+    def __init__(self, context: Any, stopping: Event) -> None:
         self.pipe, theirs = context.Pipe()
         self._process = context.Process(
             target=serve, args=(theirs, stopping), name="sweep-worker", daemon=True
@@ -139,7 +141,7 @@ class _Worker(Generic[R]):
             self._process.join()
 
 
-def serve(pipe: Any, stopping: Any) -> None:
+def serve(pipe: Connection, stopping: Event) -> None:
     """Run the tasks that come through a pipe until it is closed; the main function of a worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of a terminal
     parent = os.getppid()

@@ -48,7 +48,7 @@ class Search:
         self.trials = file.trials or file.grid_points
         """The number of trials of the whole search."""
 
-    def ask(self, count: int) -> list[dict[str, Any]]:
+    def ask(self, count: int) -> list[dict[str, object]]:
         """Return the values of the next trials, by path; fewer at the end of the search."""
         suggested = []
         for number in range(len(self._asked_trials), min(len(self._asked_trials) + count, self.trials)):

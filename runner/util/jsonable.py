@@ -17,7 +17,7 @@ MAX_VALUES: Final = 4_000_000
 _MAX_REPR: Final = 10_000
 
 
-def as_json(value: Any) -> Any:
+def as_json(value: object) -> Any:
     """Return a value as JSON can hold it; what it cannot hold as its `repr`.
 
     Arrays become lists, dataclasses and namespaces mappings, paths text; NaN and infinities become text.
@@ -29,7 +29,7 @@ def as_json(value: Any) -> Any:
     return _Conversion().of(value)
 
 
-def as_mapping(value: Any) -> Mapping[Any, Any] | None:
+def as_mapping(value: object) -> Mapping[Any, Any] | None:
     """Return the fields of a mapping, dataclass, namespace or Pydantic model; None for anything else."""
     if isinstance(value, Mapping):
         return value

@@ -17,7 +17,8 @@ import threading
 import time
 import traceback
 import types
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final, ParamSpec, Self, TypeVar
 
@@ -47,7 +48,7 @@ _pipe_to_parent: Any = None
 _starting: Final = threading.Lock()
 
 
-def report_progress(value: Any) -> None:
+def report_progress(value: object) -> None:
     """Pass a value to the caller's `on_progress`; for functions that are called in a child process."""
     _pipe_to_parent.send(("progress", value))
 
@@ -91,7 +92,10 @@ class ChildProcess:
     """
 
     def __init__(
-        self, memory_bytes: int, context: Any = None, on_progress: Callable[[Any], None] = lambda _: None
+        self,
+        memory_bytes: int,
+        context: Any = None,
+        on_progress: Callable[[Any], None] = lambda _: None,
     ) -> None:
         self._memory_bytes = memory_bytes
         self._on_progress = on_progress
@@ -198,7 +202,7 @@ class ChildProcess:
         self._pipe.close()
 
 
-def _serve(pipe: Any, memory_bytes: int) -> None:
+def _serve(pipe: Connection, memory_bytes: int) -> None:
     """Call functions that come through a pipe, and send what they return, until it is closed."""
     global _pipe_to_parent  # noqa: PLW0603 - one pipe for the whole process
     _pipe_to_parent = pipe
@@ -210,7 +214,9 @@ def _serve(pipe: Any, memory_bytes: int) -> None:
             pipe.send(_outcome(function, args, keywords))
 
 
-def _outcome(function: Callable[..., Any], args: Any, keywords: Any) -> tuple[str, Any]:
+def _outcome(
+    function: Callable[..., Any], args: Sequence[object], keywords: Mapping[str, object]
+) -> tuple[str, object]:
     try:
         return "done", function(*args, **keywords)
     except Exception as error:

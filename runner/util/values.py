@@ -105,7 +105,7 @@ def is_too_deep(value: object, depth: int = 0) -> bool:
     return False
 
 
-def finite(value: Any) -> Any:
+def finite(value: object) -> Any:
     """Return a value as JSON can hold it: NaN and infinities become None."""
     if isinstance(value, Mapping):
         return {str(key): finite(item) for key, item in value.items()}
@@ -116,7 +116,7 @@ def finite(value: Any) -> Any:
     return value
 
 
-def without_surrogates(value: Any, source: str | bytes) -> Any:
+def without_surrogates(value: object, source: str | bytes) -> Any:
     r"""Return a parsed JSON value with texts that can be encoded in UTF-8.
 
     An escape such as `\ud800` gives half a character, which cannot be written to a page, file or terminal; it

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from runner.analysis.evaluations import evaluations_of
 from runner.analysis.step_reference import StepRef
+from runner.environments.gym_types import Value
 from runner.recording import schema
 from runner.recording.actions import kept_dtype
 from runner.recording.blocks import HEADER_BYTES
@@ -56,8 +57,8 @@ class Divergence:
     field: str
     """Field of the step; `step` where one run ends first; `reset.observation` of the reset before it;
     `digest` where only actions are recorded: observations or rewards of the episode differ by then."""
-    a: Any
-    b: Any
+    a: Value
+    b: Value
     a_step: np.void | None = None
     """The whole step in A; None if A has none there."""
     b_step: np.void | None = None
@@ -213,7 +214,7 @@ def _divergence(
     )
 
 
-def _differing_part(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:
+def _differing_part(name: str, a: Value, b: Value) -> tuple[str, Value, Value]:
     """Return the first part of a value that differs: of a Dict its entry, of many numbers one of them."""
     for entry in a.dtype.names or ():
         if a[entry].tobytes() != b[entry].tobytes():

@@ -24,8 +24,8 @@ class Change:
     """A value by its path, in both runs; None where one has none."""
 
     path: str
-    a: Any
-    b: Any
+    a: object
+    b: object
 
 
 @dataclass(frozen=True)

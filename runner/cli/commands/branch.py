@@ -139,7 +139,7 @@ def branch_command(
         _print_episode(run, found, as_json)
 
 
-def _action(actions: tuple[str, ...], run: Run) -> Any:
+def _action(actions: tuple[str, ...], run: Run) -> object:
     """Return the action that the options give: of one agent or all, or of some by their names."""
     pairs = [text.partition("=") for text in actions]
     if actions and all(equals for _, equals, _ in pairs) and (run.can_train_again or len(actions) > 1):

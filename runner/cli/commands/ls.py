@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import click
 
@@ -217,13 +217,13 @@ def _csv_lines(rows: Iterable[Row], columns: Sequence[str]) -> Iterator[str]:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
 
-    def line(cells: Iterable[Any]) -> str:
+    def line(cells: Iterable[object]) -> str:
         text.seek(0)
         text.truncate()
         writer.writerow(cells)
         return text.getvalue()
 
-    def cell(value: Any) -> Any:
+    def cell(value: object) -> object:
         return (
             " ".join(value)
             if isinstance(value, list)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from http import HTTPStatus
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Path, Query, Response
-from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from runner.analysis.axes import AXES, EPISODES
@@ -19,6 +18,7 @@ from runner.service.computed import too_many
 from runner.service.dependencies import ComputationOf, OpenRecording, ProcessesOf, RecordedRun, SettingsOf
 from runner.service.errors import Refused
 from runner.service.problems import error_docs, media_docs
+from runner.util.arrays import Array
 
 router = APIRouter(
     prefix="/runs/{run}",
@@ -167,7 +167,7 @@ class Columns(BaseModel):
     start: int
     total: int
     """The number of all records."""
-    columns: dict[str, list[Any]]
+    columns: dict[str, list[object]]
 
 
 @router.get("/metrics", response_model=Curves, responses=BUSY, summary="The curves of a run's metrics.")
@@ -306,7 +306,7 @@ async def when(
     every: Annotated[bool, Query(alias="all", description="Find every interval.")] = False,
     first: Annotated[StepText, Query(alias="from")] = None,
     last: Annotated[StepText, Query(alias="to")] = None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return what `dualtaxi when --json` prints; of a run that was trained here."""
     return _json(await compute(computed.when, expression, every, first, last))  # type: ignore[return-value]
 
@@ -319,7 +319,7 @@ async def why(
     agent: AgentName = None,
     at: StepName = None,
     limit: Annotated[int, Query(ge=1, le=MAX_LIMIT, description="Number of steps.")] = LIMIT,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return where a Q-value comes from, as `dualtaxi why --json` prints it; of a run trained here."""
     return _json(await compute(computed.why, state, action, agent, at, limit))  # type: ignore[return-value]
 
@@ -369,7 +369,7 @@ def _json(body: bytes) -> Response:
     return Response(body, media_type="application/json")
 
 
-def _columns(recording: Recording, columns: dict[str, NDArray[Any]], start: int, total: int) -> Response:
+def _columns(recording: Recording, columns: dict[str, Array], start: int, total: int) -> Response:
     lists = {name: values.tolist() for name, values in columns.items()}
     page = {"run_id": recording.run_id, "start": start, "total": total, "columns": lists}
     return _json(computed.as_json(page))

@@ -9,6 +9,7 @@ import time
 from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from multiprocessing import connection
+from multiprocessing.process import BaseProcess
 from typing import Any, Final
 
 from runner.client.jobs import JobProgress, LogEvent, RunEvent
@@ -36,7 +37,7 @@ RETRY_SECONDS: Final = 5.0
 class _Worker:
     number: int
     """The number of its job."""
-    process: Any
+    process: BaseProcess
     pipe: Any
     slots: int = 1
     """How many processes it may use."""
