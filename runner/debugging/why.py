@@ -40,7 +40,6 @@ from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.replay.steps import check_steps, last_step
 from runner.runs.run import Run
-from runner.util.values import Json
 
 POLICY_NOTE: Final = (
     "WoLF-PHC acts by a policy, which is no such sum: its moves have a fixed size. This is the Q-value that "
