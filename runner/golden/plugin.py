@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from runner.environments.gym_types import Env
+
 if TYPE_CHECKING:
     from runner.runs.run import Run
 
@@ -103,7 +105,7 @@ class Golden:
 
     def same_environment(
         self,
-        make: Callable[[], object],
+        make: Callable[[], Env],
         episodes: int = 10,
         max_steps: int = 1_000,
         tolerance: float = 0.0,
