@@ -85,6 +85,7 @@ WORDS = {
     "verify": "@latest",
     "table": "--env FrozenLake-v1",
     "when": "{run} step>=1",
+    "why": "{run} --at 0:1 --agent taxi_1",
     "label": "@latest --tag good",
     "rm": "@latest --dry-run",
     "prune": "--keep-last 0 --dry-run",
