@@ -12,9 +12,3 @@ AnyVectorEnv = VectorEnv[Any, Any, Any]
 StepResult = tuple[Any, Any, bool, bool, dict[str, Any]]
 VectorStepResult = tuple[Any, Any, Any, Any, dict[str, Any]]
 ResetResult = tuple[Any, dict[str, Any]]
-
-Value = Any
-"""An observation or action: whatever its space holds."""
-ByAgent = dict[Any, Any]
-"""Values of a PettingZoo game by agent."""
-GameStepResult = tuple[ByAgent, ByAgent, ByAgent, ByAgent, ByAgent]

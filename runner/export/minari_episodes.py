@@ -13,13 +13,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.environments.gym_types import Value
 from runner.errors import RecordingError
 from runner.export.contents import Ranges
 from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.reader import Recording
-from runner.recording.spaces import Description
+from runner.recording.spaces import Description, Value
 
 MAX_EPISODE_BYTES: Final = 1 << 30
 """The limit of one episode, which Minari needs in memory."""

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.drawing.raster import Pixels
-from runner.environments.gym_types import Value
 from runner.environments.naming import spoken
 from runner.recording.reader import Recording
-from runner.recording.spaces import Leaf, leaves_of
+from runner.recording.spaces import Leaf, Value, leaves_of
 
 MAX_NUMBERS: Final = 64
 """Leaves of more numbers are not shown number by number."""

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from runner.environments.gym_types import Env
-
 if TYPE_CHECKING:
+    from runner.environments.gym_types import Env
     from runner.runs.run import Run
 
 FOLDER = "golden"

@@ -22,13 +22,13 @@ from typing import Any, Final
 
 from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.analysis.step_reference import StepRef
-from runner.environments.gym_types import Value
 from runner.errors import CannotRedo, ConfigError, RunnerError
 from runner.loops.actions import Names, action_in_words, action_names, parsed_action
 from runner.loops.env import record
 from runner.loops.parallel import record_parallel
 from runner.loops.policies import Policy, from_policy, policy_named
 from runner.recording.reader import Recording, open_recording
+from runner.recording.spaces import Value
 from runner.replay.engine import BLOCK_SECONDS, Replay, Report
 from runner.replay.environment import stream_from_child
 from runner.replay.episodes import episode_at

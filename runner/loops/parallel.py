@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from numbers import Integral
 from typing import Any, Unpack
 
-from runner.environments.gym_types import ByAgent, GameStepResult
 from runner.environments.mdp import MAX_AGENTS
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, kind_of
@@ -20,7 +19,7 @@ from runner.loops.single_rows import AgentRows
 from runner.loops.values import check_phase
 from runner.loops.vector import by_field, require_fixed
 from runner.replay.stepping import game_spaces
-from runner.replay.turns import Turns, is_in_turns
+from runner.replay.turns import ByAgent, GameStepResult, Turns, is_in_turns
 
 
 class RecordedParallel(RecordedAlone[AgentRows]):

@@ -36,6 +36,8 @@ _LENGTH: Final = struct.Struct("<I")
 
 Description = Mapping[str, Any]
 """A space as JSON."""
+Value = Any
+"""An observation or action: whatever its space holds."""
 
 
 @dataclass(frozen=True)

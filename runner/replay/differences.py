@@ -9,9 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.environments.gym_types import Value
 from runner.errors import shortened
-from runner.recording.spaces import Description, decode
+from runner.recording.spaces import Description, Value, decode
 from runner.util.arrays import Array
 from runner.util.jsonable import as_json
 

@@ -12,7 +12,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.environments.gym_types import Value
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.actions import kept_dtype
@@ -20,6 +19,7 @@ from runner.recording.loop_blocks import aligned
 from runner.recording.reader import Recording
 from runner.recording.reset_states import ResetState
 from runner.recording.schema import STEP_NANOSECONDS
+from runner.recording.spaces import Value
 
 _ROWS: Final = 1024
 """Steps of varying size in a piece."""

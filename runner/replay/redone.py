@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.environments.gym_types import Value
+from runner.recording.spaces import Value
 from runner.replay.differences import Difference
 from runner.util.arrays import Array
 

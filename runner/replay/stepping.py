@@ -13,14 +13,14 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from runner.environments.gym_types import Space, Value
+from runner.environments.gym_types import Space
 from runner.errors import CannotRedo, shortened
 from runner.recording.gym_json import value_of
 from runner.recording.gym_spaces import describe_space
 from runner.recording.gym_values import Put, filler, filler_by_agent, leaves_by_agent, leaves_of, value_bytes
 from runner.recording.reader import Recording
 from runner.recording.reset_states import ResetState
-from runner.recording.spaces import decode
+from runner.recording.spaces import Value, decode
 from runner.recording.spaces import leaves_of as recorded_leaves
 from runner.replay.recorded import RecordedReset
 from runner.replay.redone import Frame, Values

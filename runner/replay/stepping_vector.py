@@ -9,11 +9,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from runner.environments.gym_types import AnyVectorEnv, Space, Value
+from runner.environments.gym_types import AnyVectorEnv, Space
 from runner.errors import CannotRedo
 from runner.recording import schema
 from runner.recording.gym_values import filler, leaves_of, put_chosen
 from runner.recording.reader import Recording
+from runner.recording.spaces import Value
 from runner.replay.recorded import RecordedReset
 from runner.replay.redone import Frame
 from runner.replay.stepping import Results, Stepper

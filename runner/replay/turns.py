@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from runner.environments.gym_types import ByAgent, GameStepResult
+ByAgent = dict[Any, Any]
+"""Values of a game by agent."""
+GameStepResult = tuple[ByAgent, ByAgent, ByAgent, ByAgent, ByAgent]
 
 
 def is_in_turns(env: object) -> bool:

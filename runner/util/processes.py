@@ -18,7 +18,6 @@ import time
 import traceback
 import types
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final, ParamSpec, Self, TypeVar
 
@@ -202,7 +201,7 @@ class ChildProcess:
         self._pipe.close()
 
 
-def _serve(pipe: Connection, memory_bytes: int) -> None:
+def _serve(pipe: Any, memory_bytes: int) -> None:
     """Call functions that come through a pipe, and send what they return, until it is closed."""
     global _pipe_to_parent  # noqa: PLW0603 - one pipe for the whole process
     _pipe_to_parent = pipe

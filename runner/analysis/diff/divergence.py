@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from runner.analysis.evaluations import evaluations_of
 from runner.analysis.step_reference import StepRef
-from runner.environments.gym_types import Value
 from runner.recording import schema
 from runner.recording.actions import kept_dtype
 from runner.recording.blocks import HEADER_BYTES
 from runner.recording.messages import decode
 from runner.recording.reader import Recording
+from runner.recording.spaces import Value
 from runner.replay.steps import episode_blocks
 from runner.runs.branches import BranchOrigin
 from runner.util.arrays import Array

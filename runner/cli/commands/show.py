@@ -15,8 +15,8 @@ from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import console, draw, facts, patch_text, print_json, printable, say, title
 from runner.cli.progress import stage_line
 from runner.cli.runs import command_for, find, restored
-from runner.recording.messages import Message
 from runner.util.humanize import UNKNOWN, age, counted, duration, number, size
+from runner.util.values import JsonView
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -218,7 +218,7 @@ def _extras(extras: Mapping[str, RecordedExtras]) -> dict[str, str]:
     return rows
 
 
-def _optimality(recording: Recording, measures: Message) -> dict[str, str]:
+def _optimality(recording: Recording, measures: JsonView) -> dict[str, str]:
     """Return the last exact measures, next to the optimum."""
     from runner.environments.naming import states_in_words
 
