@@ -46,7 +46,7 @@ POLICY_NOTE: Final = (
     "tells the policy where to move."
 )
 LIMIT: Final = 10
-MAX_LIMIT: Final = 1000
+MAX_LIMIT: Final = 100_000
 """The most steps of an answer."""
 MAX_KINDS: Final = 100
 """Kinds of rewards, the rest of which are counted together."""
@@ -72,7 +72,7 @@ def why(
         agent: the learner; required where there are several.
         at: the step before which the value is explained: `EPISODE:T` of training, or `eval:N:TRIAL:T`; by
             default after all of training.
-        limit: the most steps to name, up to 1,000.
+        limit: the most steps to list, up to 100,000; 0 for that many.
         report: called with the number of steps read so far.
 
     Raises:
@@ -107,8 +107,8 @@ def why_in(
             f"{recording.path}: has no Q-values, as its algorithm is `random`, which learns nothing; choose "
             "a run of another algorithm."
         )
-    if not 1 <= limit <= MAX_LIMIT:
-        raise ConfigError(f"limit: found {limit}, expected 1 to {MAX_LIMIT:,}.")
+    if not 0 <= limit <= MAX_LIMIT:
+        raise ConfigError(f"limit: found {limit}, expected 0 to {MAX_LIMIT:,}.")
     mdp = recording.mdp
     learner = _learner(recording, agent)
     is_joint = len(recording.agents) < len(mdp.agents)
@@ -124,7 +124,7 @@ def why_in(
         joint_action(mdp, action) if is_joint else own_action(mdp, learner, action),
     )
     stop = last_step(recording) if at is None else _steps_before(recording, at)
-    weights = weights_of(recording, cell, stop, limit, report)
+    weights = weights_of(recording, cell, stop, limit or MAX_LIMIT, report)
     rewarded = Part(*(float(total) for total in weights.episodes.sum(axis=0)))
     initial = Part(float(weights.initial.sum()), float((weights.initial * weights.initial_values).sum()))
     moves = tuple(_moves(mdp, weights.outcomes, "" if is_joint else mdp.agents[learner]))

@@ -46,7 +46,8 @@ if TYPE_CHECKING:
     "actions",
     multiple=True,
     metavar="VALUE",
-    help="The action there; of one of several agents AGENT=VALUE, may be repeated.  [default: as recorded]",
+    help="The action: a number, a name or all; of one agent of several AGENT=VALUE, may be repeated.  "
+    "[default: as recorded]",
 )
 @set_option
 @click.option(

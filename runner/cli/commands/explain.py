@@ -41,7 +41,7 @@ class _Planned(Exception):
 @click.option(
     "--metric",
     metavar="METRIC",
-    help="A metric of evaluations.  [default: success_percent, or mean_return]",
+    help="A metric; of evaluations.  [default: success_percent, or mean_return]",
 )
 @click.option(
     "--at",

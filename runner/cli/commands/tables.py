@@ -39,7 +39,9 @@ ROWS_AT_ONCE = 50_000
 @run_argument
 @click.option("--step", type=INDEX, metavar="N", help="After N training steps.  [default: the last]")
 @click.option("--episode", type=INDEX, metavar="N", help="After N training episodes.")
-@click.option("--state", type=INDEX, metavar="S", help="The values of one state, with their history.")
+@click.option(
+    "--state", metavar="S", help="The state: a number or a name; shows its values and their history."
+)
 @click.option(
     "-o",
     "--output",
@@ -54,7 +56,7 @@ def qtable_command(
     run_name: str,
     step: int | None,
     episode: int | None,
-    state: int | None,
+    state: str | None,
     output: Path | None,
     force: bool,
     recordings: Path | None,
@@ -76,6 +78,7 @@ def qtable_command(
     import numpy as np
 
     from runner.analysis.qtable import describe_tables, one_array, replay_at
+    from runner.environments.naming import state_of
     from runner.recording.reader import open_recording
 
     if output is not None:
@@ -87,7 +90,8 @@ def qtable_command(
         stage_line("replaying recorded steps"),
     ):
         replay = replay_at(recording, step, episode)
-        values = describe_tables(recording, replay, state)
+        number_of_state = None if state is None else state_of(recording.mdp, state)
+        values = describe_tables(recording, replay, number_of_state)
         array = one_array(replay.tables)
     if output is not None:
 

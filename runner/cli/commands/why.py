@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli import Command
-from runner.cli.options import STEP, json_option, recordings_option, run_argument
+from runner.cli.options import STEP, json_option, limit_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, print_sections
 from runner.cli.progress import steps_line
 from runner.cli.runs import command_for, compilation_notice, find_recorded
@@ -19,23 +19,16 @@ if TYPE_CHECKING:
 
 @click.command("why", cls=Command)
 @run_argument
-@click.option("--state", metavar="S", help="The state, by number or name.  [default: that of --at]")
-@click.option("--action", metavar="A", help="The action, by number or name.  [default: that of --at]")
+@click.option("--state", metavar="S", help="The state: a number or a name.  [default: that of --at]")
+@click.option("--action", metavar="A", help="The action: a number or a name.  [default: that of --at]")
 @click.option("--agent", metavar="NAME", help="Whose Q-table, where each agent has its own.")
 @click.option(
     "--at",
     type=STEP,
     metavar="STEP",
-    help="Explain the value before this step: EPISODE:T, or eval:N:TRIAL:T.  [default: after all training]",
+    help="The step: EPISODE:T, or eval:N:TRIAL:T; the value before it is shown.  [default: the last]",
 )
-@click.option(
-    "--limit",
-    type=click.IntRange(1, 1000),
-    default=10,
-    show_default=True,
-    metavar="N",
-    help="Number of steps to list.",
-)
+@limit_option(10)
 @recordings_option
 @json_option
 def why_command(

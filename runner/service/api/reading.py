@@ -318,7 +318,7 @@ async def why(
     action: ActionName = None,
     agent: AgentName = None,
     at: StepName = None,
-    limit: Annotated[int, Query(ge=1, le=MAX_LIMIT, description="Number of steps.")] = LIMIT,
+    limit: Annotated[int, Query(ge=0, le=MAX_LIMIT, description="Most steps, 0 for all.")] = LIMIT,
 ) -> dict[str, object]:
     """Return where a Q-value comes from, as `dualtaxi why --json` prints it; of a run trained here."""
     return _json(await compute(computed.why, state, action, agent, at, limit))  # type: ignore[return-value]

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import click
 import gymnasium
 import pytest
+import yaml
 from click.testing import CliRunner
 
 import runner
@@ -86,6 +87,7 @@ WORDS = {
     "table": "--env FrozenLake-v1",
     "when": "{run} step>=1",
     "why": "{run} --at 0:1 --agent taxi_1",
+    "explain": "{tiny} {patient} --seeds 2",
     "label": "@latest --tag good",
     "rm": "@latest --dry-run",
     "prune": "--keep-last 0 --dry-run",
@@ -130,6 +132,8 @@ def place(tmp_path_factory, recorded_run, command_in):
         loop.reset(seed=0)
         while not any(loop.step(0)[2:4]):
             pass
+    patient = folder / "patient.yaml"
+    patient.write_text(yaml.safe_dump(yaml.safe_load(tiny.read_text()) | {"discount": 0.99}))
     sweep = folder / "small.yaml"
     sweep.write_text("base: tiny.yaml\nstrategy: grid\nseeds: [0]\nparameters: {discount: [0.5, 0.9]}\n")
     done = command("sweep", "run", sweep, "--workers", 1)
@@ -138,6 +142,7 @@ def place(tmp_path_factory, recorded_run, command_in):
         folder=folder,
         command=command,
         tiny=tiny,
+        patient=patient,
         sweep=sweep,
         recording=recorded_run.recording,
         run=recorded_run.run_id,
@@ -213,7 +218,7 @@ def takes_runs(command):
 
 @pytest.mark.parametrize("path", [path for path in EVERY if takes_runs(EVERY[path])], ids=" ".join)
 def test_an_unknown_run_has_the_documented_exit_code(place, path):
-    words = ["nosuchrun"] * (2 if path in (("diff",), ("when",)) else 1)
+    words = ["nosuchrun"] * (2 if path in (("diff",), ("when",), ("explain",)) else 1)
     done = place.command(*path, *words)
     assert done.exit_code == ExitCode.USAGE, done.output
     assert "no run 'nosuchrun'" in done.stderr
@@ -229,6 +234,7 @@ def test_exit_codes_are_explained_by_help():
 
 OF_THE_COMMAND = (
     "accept-changes",
+    "at",
     "dry-run",
     "episode",
     "episodes",

@@ -328,7 +328,7 @@ def test_qtable_of_a_state(recorded, recorded_run):
     [
         (("--step", 10**9), "expected at least 1000000000"),
         (("--episode", 31), "found 30 training episodes"),
-        (("--state", 10**7), "state: found 10000000"),
+        (("--state", 10**7), "found '10000000', expected a state"),
         (("--step", 1, "--episode", 1), "choose one"),
         (("--step", -1), "-1"),
         (("-o", "/dev/null/table.npy"), "/dev/null is a file, expected a folder"),

@@ -176,7 +176,7 @@ def test_a_notebook_shows_it_in_a_frame(tmp_path):
         ({"at": "300:0"}, "no training episode 300"),
         ({"at": "eval:7:0:0"}, "evaluation"),
         ({"at": "soon"}, "EPISODE:T"),
-        ({"at": STEP, "limit": 0}, "1 to 1,000"),
+        ({"at": STEP, "limit": -1}, "0 to 100,000"),
     ],
 )
 def test_bad_input(arguments, expected, cooperative):
