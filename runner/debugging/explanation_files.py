@@ -2,6 +2,7 @@
 
 recordings/.explain/A-B-1f2e3d4c/values.jsonl           the readings of every run, a line each
 recordings/.explain/A-B-1f2e3d4c/success_percent.json   the explanation of a metric
+recordings/.explain/runs/                               the short runs that show first steps
 """
 
 from __future__ import annotations

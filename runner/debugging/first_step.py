@@ -23,7 +23,7 @@ from runner.recording import schema
 from runner.recording.labels import Labels
 from runner.recording.reader import Recording, open_recording
 from runner.runs.listing import list_runs
-from runner.runs.run import Run, new_run, unless_empty
+from runner.runs.run import UNLISTED, Run, new_run, unless_empty
 
 _EPISODES: Final = (100, 1000, 10_000)
 """Training episodes in which the step is looked for, one after the other."""
@@ -32,7 +32,8 @@ _EPISODES: Final = (100, 1000, 10_000)
 def first_step(mixing: Mixing, number: int, seed: int, recordings: Path, name: str) -> FirstStep:
     """Record A with and without one setting of B, until they differ; return where they do.
 
-    If they do not, all settings of B with and without this one are recorded.
+    If they do not, all settings of B with and without this one are recorded. The runs are not listed among
+    those of the recordings folder: they are found by their ids.
 
     Args:
         mixing: the two configurations.
@@ -44,9 +45,9 @@ def first_step(mixing: Mixing, number: int, seed: int, recordings: Path, name: s
     Raises:
         StorageError: the recordings folder cannot be written.
     """
-    bit, setting = 1 << number, mixing.factors[number].name
+    bit, setting, folder = 1 << number, mixing.factors[number].name, recordings / UNLISTED
     tag = f"explain={name}"
-    made = {identity_of(run.file.config, run.seed): run for run in list_runs(recordings) if tag in run.tags}
+    made = {identity_of(run.file.config, run.seed): run for run in list_runs(folder) if tag in run.tags}
     pairs = [(0, bit, f"Changing {setting} alone in A")]
     if mixing.everything != bit:
         others = f"Changing {setting} when all other settings are as in B"
@@ -61,7 +62,7 @@ def first_step(mixing: Mixing, number: int, seed: int, recordings: Path, name: s
                 run = made.get(job.identity)
                 if run is None or run.status != "finished":
                     title = re.sub(r"[^A-Za-z0-9_.]+", "-", f"{word}-{setting}")[:100]
-                    run = _record(job, recordings, title, tag)
+                    run = _record(job, folder, title, tag)
                 runs.append(run)
             found = _found(runs[0], runs[1], setting, what)
             if found.sentences:
@@ -75,9 +76,9 @@ def first_step(mixing: Mixing, number: int, seed: int, recordings: Path, name: s
     return FirstStep(setting, "", "", None, None, None, (sentence,))
 
 
-def _record(job: Job, recordings: Path, title: str, tag: str) -> Run:
-    """Record a job with every step, as a run with a tag."""
-    run = new_run(recordings, job.config.to_mapping(), job.seed, title, labels=Labels(tags=(tag,)))
+def _record(job: Job, folder: Path, title: str, tag: str) -> Run:
+    """Record a job with every step in a folder of runs, as a run with a tag."""
+    run = new_run(folder, job.config.to_mapping(), job.seed, title, labels=Labels(tags=(tag,)))
     with unless_empty(run):
         return run_job(job, run)
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from runner.errors import RunNotFound, nearest
 from runner.recording.run_file import RUN_ID, run_title
 from runner.runs.listing import run_at, run_in
-from runner.runs.run import Run, recordings_folder
+from runner.runs.run import UNLISTED, Run, recordings_folder
 from runner.util.values import RUN_NAME_PATTERN
 
 if TYPE_CHECKING:
@@ -102,11 +102,14 @@ def find_run(
 
 
 def run_of_id(run_id: str, recordings: Path) -> Run | None:
-    """Return the run in the folder with this name and id; None if there is none, or it is not an id."""
+    """Return the run in the folder with this name and id, also an unlisted one.
+
+    None if there is none, or it is not an id.
+    """
     if not RUN_ID.fullmatch(run_id) or not run_id.strip("."):
         return None
-    run = run_in(recordings / run_id)
-    return run if run and run.run_id == run_id else None
+    found = (run_in(folder / run_id) for folder in (recordings, recordings / UNLISTED))
+    return next((run for run in found if run and run.run_id == run_id), None)
 
 
 def find_runs(name: str, recordings: Path, report: Report = lambda _: None) -> list[Run]:

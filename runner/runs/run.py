@@ -41,6 +41,8 @@ STOP_FILE: Final = "stop"
 """Its presence requests that the loop stops."""
 SHARDS_FOLDER: Final = "shards"
 """The folder, in that of a run, of what processes that joined it record until the run is over."""
+UNLISTED: Final = Path(".explain", "runs")
+"""The folder, in that of recordings, of runs that are found by their ids alone: those of explanations."""
 MADE_BY: Final = ("host", "git", "dualtaxi")
 """The provenance in `run.json`; the recording has all of it."""
 RECORDINGS_VARIABLE: Final = "DUALTAXI_RECORDINGS"

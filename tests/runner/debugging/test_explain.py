@@ -15,6 +15,7 @@ from runner.debugging.explanation_files import explanations_in, read_explanation
 from runner.debugging.factors import mix
 from runner.errors import RunnerError
 from runner.runs.listing import list_runs
+from runner.runs.run import UNLISTED
 
 LAKE = {
     "env": {"id": "FrozenLake-v1", "kwargs": {"is_slippery": False}},
@@ -94,12 +95,12 @@ def test_what_was_trained_is_kept(tmp_path):
     again = explained(LAKE, b, tmp_path, seeds=5)
     assert (again.trained, again.runs) == (8, 40)
     assert explained(LAKE, b, tmp_path, seeds=5, metric="mean_length").trained == 0
-    runs = len(list_runs(tmp_path))
-    assert runs == 2
+    assert len(list_runs(tmp_path / UNLISTED)) == 2
     values = tmp_path / ".explain" / name.split("/")[0] / "values.jsonl"
     values.write_text("{\n" + values.read_text()[:-30])  # a damaged line, and one that was cut off
     assert explained(LAKE, b, tmp_path, seeds=5).trained == 1
-    assert len(list_runs(tmp_path)) == runs
+    assert len(list_runs(tmp_path / UNLISTED)) == 2
+    assert list_runs(tmp_path) == []
 
 
 def test_above_eight_settings_a_minimal_set_is_found(tmp_path):
@@ -226,6 +227,7 @@ def test_a_run_is_explained_by_its_configuration_and_seed(tmp_path):
     run = runner.run(LAKE | PLANTED, seed=7, recordings=tmp_path)
     found = explained(run, LAKE | PLANTED | {"step_size": 0.5}, tmp_path, seeds=2)
     assert (found.a.run_id, found.seeds) == (run.run_id, (7, 8))
+    assert runner.find_run("@latest", tmp_path).run_id == run.run_id
     assert found.mixtures[0].values[0] == run.summary.last_evaluation.values["success_percent"]
     assert any("same seeds" in note for note in found.notes)
     assert "<svg" in found._repr_html_()
