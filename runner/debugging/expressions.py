@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import ast
 import functools
-import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -272,7 +271,7 @@ class Parser:
             raise self.error(node, "found text, expected it next to an action: greedy[...] == TEXT.")
         if not isinstance(value, int | float):
             raise self.error(node, f"found {self.text_of(node)}, expected a number.")
-        if not math.isfinite(value) or abs(value) > MAX_NUMBER:
+        if not abs(value) <= MAX_NUMBER:
             raise self.error(node, "found a number that is too large.")
         return _fixed(value)
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from runner.config import from_mapping
 from runner.debugging.expressions import Array, Columns, Parser, Term
 from runner.environments.naming import action_names, actions_in_words, states_in_words
-from runner.errors import RunnerError, nearest
+from runner.errors import RecordingError, RunnerError, nearest
 from runner.learning.learner import rules_of
 from runner.learning.watching import Changes, Watch, explorations
 from runner.recording import schema
@@ -180,7 +180,7 @@ class JobColumns:
 
     Raises:
         RunnerError: the quantities are too many.
-        RecordingError: the tables before `start` are not known.
+        RecordingError: the tables or the visits before `start` are not known.
     """
 
     def __init__(self, recording: Recording, quantities: list[Quantity], start: int) -> None:
@@ -203,9 +203,8 @@ class JobColumns:
         self._by_episode = bool(names & {"episode", "epsilon"})
         self._watch = self._new_watch()
         self._visits = {each: 0 for each in quantities if each.name == "visits"}
-        for block in recording.blocks(schema.TRAIN_STEP, 0, start) if self._visits and start else ():
-            for each in self._visits:
-                self._visits[each] += int(np.count_nonzero(self._visited(each, block)))
+        if self._visits:
+            self._count_visits(recording, start)
         self._replay = TableReplay(recording, start) if names & set(_INDEXED[:3]) else None
         self._last = self._first()
 
@@ -335,6 +334,16 @@ class JobColumns:
             columns |= self._table_values(self._replay.begin_watch(self._watch))
         return columns
 
+    def _count_visits(self, recording: Recording, stop: int) -> None:
+        expected = 0
+        for block in recording.blocks(schema.TRAIN_STEP, 0, stop) if stop else ():
+            first = int(block["step"][0])
+            check_lost(recording, expected, first)
+            expected = first + len(block)
+            for each in self._visits:
+                self._visits[each] += int(np.count_nonzero(self._visited(each, block)))
+        check_lost(recording, expected, stop)
+
     def _visited(self, quantity: Quantity, steps: NDArray[np.void]) -> NDArray[np.bool_]:
         mask = steps["state"] == quantity.state
         if quantity.action < 0:
@@ -344,3 +353,17 @@ class JobColumns:
             own = self._mdp.own_actions[:, quantity.learner]
             actions = own[np.minimum(actions, len(own) - 1)]
         return np.asarray(mask & (actions == quantity.action))
+
+
+def check_lost(recording: Recording, expected: int, found: int) -> None:
+    """Refuse training steps of which some were lost before the step that was found.
+
+    Raises:
+        RecordingError: another step was expected.
+    """
+    if found != expected:
+        raise RecordingError(
+            f"{recording.path}: training steps {expected:,} to {found - 1:,} were lost, so what holds after "
+            "them is unknown; search up to the step before, or from one after the next Q-table, without "
+            "visits."
+        )

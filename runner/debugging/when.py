@@ -21,8 +21,8 @@ from runner.analysis.sections import Grid, Section, html
 from runner.analysis.step_reference import StepRef
 from runner.archive.places import at_hand
 from runner.debugging.expressions import Array, Columns, Expression, Parser, Term
-from runner.debugging.quantities import JobColumns, JobVocabulary
-from runner.errors import RecordingError, RunnerError
+from runner.debugging.quantities import JobColumns, JobVocabulary, check_lost
+from runner.errors import RunnerError
 from runner.export.contents import require_steps
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
@@ -206,7 +206,7 @@ def _search(
     holds, expected = False, start
     for block in recording.blocks(schema.TRAIN_STEP, start, stop):
         first = int(block["step"][0])
-        _check_lost(recording, expected, first)
+        check_lost(recording, expected, first)
         expected = first + len(block)
         for places, values in columns.take(block, 0 if first == start else -1):
             held = _values(expression.condition, values).copy()
@@ -225,7 +225,7 @@ def _search(
             if not every:
                 return _Found(moments, 1, 0, moments[0])
         report(expected - start)
-    _check_lost(recording, expected, stop)
+    check_lost(recording, expected, stop)
     parts = [(term, _values(term, columns.last)) for term in expression.terms]
     return _Found(moments, count, steps + stop * holds, _moment(block[-1], parts, 0, 0))
 
@@ -253,14 +253,6 @@ def _scalar(term: Term, value: np.float64 | np.bool_, is_known: bool) -> Scalar:
     if term.names:
         return term.names[int(value)]
     return int(value) if term.is_whole else float(value)
-
-
-def _check_lost(recording: Recording, expected: int, found: int) -> None:
-    if found != expected:
-        raise RecordingError(
-            f"{recording.path}: training steps {expected:,} to {found - 1:,} were lost, so what holds after "
-            "them is unknown; search up to the step before, or from one after the next Q-table."
-        )
 
 
 def _step_number(recording: Recording, at: int | str | StepRef | None, steps: int, default: int) -> int:

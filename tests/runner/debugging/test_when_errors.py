@@ -80,6 +80,7 @@ def competitive(tmp_path_factory):
         ("visist[1] > 1", "visist", "Did you mean 'visits'?"),
         ("step > 1e999", "1e999", "too large"),
         ("step > 99999999999999999999", "99999999999999999999", "too large"),
+        (f"step > {'9' * 400}", "9" * 400, "too large"),
         ("step > 1j", "1j", "expected a number"),
         ("step > b'1'", "b'1'", "expected a number"),
         ("step > None", "None", "expected a number"),
@@ -223,6 +224,9 @@ def test_what_was_lost_is_not_guessed(tmp_path):
         with pytest.raises(RecordingError, match="training steps 256 to 511 were lost"):
             runner.when(run, expression)
         assert runner.when(run, "step >= 0 and not " + expression, last=255).first.step == 0
+    with pytest.raises(RecordingError, match="training steps 256 to 511 were lost"):
+        runner.when(run, "visits[0] >= 0", first=600)
+    assert runner.when(run, "step >= 600", first=600).first.step == 600
 
 
 def test_steps_that_the_environment_cannot_have_are_refused(cooperative, tmp_path):
