@@ -10,7 +10,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -79,13 +78,13 @@ def weights_of(
     learner, model = replay.learner, replay.learner.model
     tables = ("q_1", "q_2") if "q_2" in replay.kinds else ("q",)
     initial_values = np.stack([replay.held[cell.learner][name].reshape(-1) for name in tables])
-    with tempfile.TemporaryFile() as spool:
+    advice = "set TMPDIR to a folder with more space"
+    with storage_errors("a temporary file", advice), tempfile.TemporaryFile() as spool:
         episode = 0
-        with storage_errors(Path(tempfile.gettempdir()), "set TMPDIR to a folder with more space"):
-            for updates in _updates(recording, replay, cell.learner, stop):
-                spool.write(updates.view(np.uint8).data)
-                episode = int(updates["episode"][-1])
-                report(replay.step)
+        for updates in _updates(recording, replay, cell.learner, stop):
+            spool.write(updates.view(np.uint8).data)
+            episode = int(updates["episode"][-1])
+            report(replay.step)
         stretch = episode // STRETCHES + 1
         ledger = Ledger(
             np.zeros_like(initial_values),

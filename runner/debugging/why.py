@@ -240,8 +240,8 @@ def _steps(recording: Recording, largest: NDArray[np.void], learner: int) -> Ite
     mdp = recording.mdp
     states, actions = states_in_words(mdp), actions_in_words(mdp)
     records = {}
-    for step in sorted(largest["step"].tolist()):  # each chunk is read once
-        (records[step],) = next(recording.blocks(schema.TRAIN_STEP, step, step + 1))
+    for step in sorted(largest["step"].tolist()):  # each chunk is read once, and not kept
+        records[step] = next(recording.blocks(schema.TRAIN_STEP, step, step + 1))[0].copy()
     for share in largest:
         record = records[int(share["step"])]
         state, action = int(record["state"]), int(record["action"])

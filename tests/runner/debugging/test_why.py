@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from click.testing import CliRunner
 import runner
 from runner.cli import cli
 from runner.debugging import weights
-from runner.errors import ConfigError, RecordingError, RunnerError
+from runner.errors import ConfigError, RecordingError, RunnerError, StorageError
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
@@ -225,6 +226,12 @@ def test_a_damaged_recording_is_reported(tmp_path):
     run.recording.write_bytes(data)
     with pytest.raises(RecordingError, match="repair"):
         runner.why(run, state=5, action=0)
+
+
+def test_a_folder_of_temporary_files_that_cannot_be_written_is_named(cooperative, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
+    with pytest.raises(StorageError, match=r"temporary file.*TMPDIR"):
+        runner.why(cooperative, state=0, action=0)
 
 
 def test_the_command_prints_what_python_returns(cooperative):
