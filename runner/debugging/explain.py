@@ -70,12 +70,12 @@ class Plan:
     @property
     def seconds(self) -> float:
         """The estimated time of the runs that are not known, at least."""
-        return (self.mixtures * self.seeds - self.known) * self.run_seconds / self.workers
+        return max(0, self.mixtures * self.seeds - self.known) * self.run_seconds / self.workers
 
     @property
     def most_seconds(self) -> float:
         """The same, at most."""
-        return (self.most_mixtures * self.seeds - self.known) * self.run_seconds / self.workers
+        return max(0, self.most_mixtures * self.seeds - self.known) * self.run_seconds / self.workers
 
 
 def explain(

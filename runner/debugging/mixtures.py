@@ -8,13 +8,14 @@ identity of its job, and never measured again.
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from blake3 import blake3
@@ -302,8 +303,8 @@ def _kept(path: Path) -> Iterator[tuple[str, tuple[Readings, float]]]:
             while file.tell() < MAX_BYTES and (line := file.readline(MAX_LINE)):
                 try:
                     values = json.loads(line)
-                    yield str(values["job"]), (_checked(values["readings"]), float(values["seconds"]))
-                except (ValueError, KeyError, TypeError, RecursionError):
+                    yield str(values["job"]), (_checked(values["readings"]), _finite(values["seconds"]))
+                except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
                     continue
     except OSError:
         return
@@ -314,7 +315,15 @@ def _checked(values: object) -> Readings:
 
     Raises:
         TypeError: they are none.
+        ValueError: one is not finite.
+        OverflowError: one is too large.
     """
     if not isinstance(values, dict):
         raise TypeError(values)
-    return {str(name): None if value is None else float(value) for name, value in values.items()}
+    return {str(name): None if value is None else _finite(value) for name, value in values.items()}
+
+
+def _finite(value: Any) -> float:
+    if not math.isfinite(number := float(value)):
+        raise ValueError(value)
+    return number

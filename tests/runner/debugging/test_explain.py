@@ -97,7 +97,11 @@ def test_what_was_trained_is_kept(tmp_path):
     assert explained(LAKE, b, tmp_path, seeds=5, metric="mean_length").trained == 0
     assert len(list_runs(tmp_path / UNLISTED)) == 2
     values = tmp_path / ".explain" / name.split("/")[0] / "values.jsonl"
-    values.write_text("{\n" + values.read_text()[:-30])  # a damaged line, and one that was cut off
+    first, _, others = values.read_text().partition("\n")
+    wrong = [first.replace('"seconds": ', f'"seconds": {digits}') for digits in ("9" * 400, 'NaN, "x": ')]
+    values.write_text(
+        "\n".join(["{", *wrong, first, others[:-30]])
+    )  # damaged lines, and one that was cut off
     assert explained(LAKE, b, tmp_path, seeds=5).trained == 1
     assert len(list_runs(tmp_path / UNLISTED)) == 2
     assert list_runs(tmp_path) == []
