@@ -1,8 +1,10 @@
 """Which settings make the difference between two runs or configurations: mixtures of them are trained.
 
-explanation = runner.explain("tutorial_cooperative", "tutorial_text_cooperative", at=5000)
-for setting in explanation.settings:
-print(setting.name, setting.share)
+    explanation = runner.explain("tutorial_cooperative", "tutorial_text_cooperative", at=5000)
+    for setting in explanation.settings:
+        print(setting.name, setting.share)
+
+A mixture has some settings of the one and the others of the other.
 """
 
 from __future__ import annotations

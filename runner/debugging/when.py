@@ -259,7 +259,7 @@ def _step_number(recording: Recording, at: int | str | StepRef | None, steps: in
     """Return the number of a training step."""
     if at is None:
         return default
-    if isinstance(at, str) and not at.isdecimal():
+    if isinstance(at, str) and not (at.isdecimal() and len(at) < 20):
         at = StepRef.parse(at)
     if isinstance(at, StepRef):
         if at.after is not None:

@@ -169,6 +169,7 @@ def test_a_condition_counts_as_0_or_1_and_a_division_by_zero_is_no_error(coopera
         ("0:5000", None, "found step 5000 of training episode 0"),
         ("eval:3000:1", None, "expected a step of training"),
         ("-1", None, "EPISODE:T"),
+        ("1" * 5000, None, "EPISODE:T"),
         ("3:x", None, "EPISODE:T"),
         (20, 10, "expected them in order"),
     ],
