@@ -48,6 +48,17 @@ _COMPARISONS: Final[dict[type[ast.cmpop], np.ufunc]] = {
     ast.Eq: np.equal,
     ast.NotEq: np.not_equal,
 }
+_REFUSED: Final[dict[type[ast.operator], str]] = {
+    ast.Pow: "**",
+    ast.MatMult: "@",
+    ast.LShift: "<<",
+    ast.RShift: ">>",
+    ast.BitAnd: "& (write `and`)",
+    ast.BitOr: "| (write `or`)",
+    ast.BitXor: "^",
+}
+_HINTS: Final = {"=": "equality is ==", "&": "write `and`", "|": "write `or`", "!": "write `not`, or !="}
+"""What to write in place of a sign that is no syntax."""
 _EXPECTED: Final = "expected comparisons, and, or, not, + - * / // %, max(), min() and abs()"
 
 
@@ -55,11 +66,11 @@ _EXPECTED: Final = "expected comparisons, and, or, not, + - * / // %, max(), min
 class Term:
     """A part of an expression, which has a value at each moment."""
 
-    kind: Literal["number", "condition", "row"]
-    """A row is several numbers, of which max() and min() are taken."""
+    kind: Literal["number", "condition", "row", "action"]
+    """A row is several numbers, of which max() and min() are taken; an action is only equal, or not."""
     evaluate: Callable[[Columns], Array]
     names: Sequence[str] = ()
-    """The names of its numbers, if they are actions."""
+    """The names of its values, if they are actions."""
     is_whole: bool = False
     """Whether its values are whole numbers."""
     text: str = ""
@@ -131,8 +142,8 @@ class Parser:
                 tree = ast.parse(self.text, mode="eval").body
         except SyntaxError as error:
             at = min(max((error.offset or 1) - 1, 0), len(self.text) - 1)
-            hint = " (equality is ==)" if self.text[at] == "=" else ""
-            raise self._error(at, at + 1, f"{error.msg}{hint}") from None
+            hint = _HINTS.get(self.text[at])
+            raise self._error(at, at + 1, f"{error.msg} ({hint})" if hint else error.msg) from None
         except (MemoryError, RecursionError, ValueError):
             raise RunnerError("expression: is nested too deeply.") from None
         nodes = sum(1 for _ in ast.walk(tree))
@@ -157,7 +168,8 @@ class Parser:
     def _condition(self, node: ast.expr) -> Term:
         term = self._term(node)
         if term.kind != "condition":
-            raise self.error(node, "found a number, expected a condition, such as a comparison with > or ==.")
+            found = "an action" if term.kind == "action" else "a number"
+            raise self.error(node, f"found {found}, expected a condition, such as a comparison with > or ==.")
         return term
 
     def _number(self, node: ast.expr) -> Term:
@@ -166,6 +178,10 @@ class Parser:
         if term.kind == "row":
             raise self.error(
                 node, "found the values of all actions, expected one, or max() or min() of them."
+            )
+        if term.kind == "action":
+            raise self.error(
+                node, "found an action, expected a number; an action is compared, with == or !=, to its name."
             )
         return term
 
@@ -204,33 +220,39 @@ class Parser:
             negated = self._condition(node.operand).evaluate
             return Term("condition", lambda columns: np.logical_not(negated(columns)))
         if isinstance(node.op, ast.Invert):
-            raise self.error(node, f"found ~, {_EXPECTED}.")
+            raise self.error(node, f"found ~ (write `not`), {_EXPECTED}.")
         sign = -1.0 if isinstance(node.op, ast.USub) else 1.0
         value = self._number(node.operand).evaluate
         return Term("number", lambda columns: sign * value(columns))
 
     def _binary(self, node: ast.BinOp) -> Term:
         operation = _ARITHMETIC.get(type(node.op))
-        left, right = self._number(node.left).evaluate, self._number(node.right).evaluate
         if operation is None:
-            raise self.error(node, f"found an operator that is none of these: {_EXPECTED}.")
+            raise self.error(node, f"found the operator {_REFUSED[type(node.op)]}, {_EXPECTED}.")
+        left, right = self._number(node.left).evaluate, self._number(node.right).evaluate
         return Term("number", lambda columns: operation(left(columns) * 1.0, right(columns) * 1.0))
 
     def _comparison(self, node: ast.Compare) -> Term:
         nodes = [node.left, *node.comparators]
-        terms = [None if _is_text(each) else self._number(each) for each in nodes]
-        for k, each in enumerate(nodes):
-            if isinstance(each, ast.Constant) and isinstance(each.value, str):
-                neighbours = [term for term in terms[max(k - 1, 0) : k + 2] if term is not None]
-                names = next((term.names for term in neighbours if term.names), None)
-                if names is None:
-                    raise self.error(each, "found text, expected it next to an action, such as greedy[300].")
-                terms[k] = _fixed(self.number_of(each, names, "action"))
-        values = [term.evaluate for term in terms if term is not None]
+        terms = [None if _is_text(each) else self._term(each) for each in nodes]
+        actions = [term if term is not None and term.kind == "action" else None for term in terms]
+        values = []
+        for k, (each, term) in enumerate(zip(nodes, terms, strict=True)):
+            near = next((other for other in actions[max(k - 1, 0) : k + 2] if other is not None), None)
+            if near is None:
+                values.append(self._number(each).evaluate)
+            elif term is None or actions[k] is None:
+                values.append(_fixed(self.number_of(each, near.names, "action")).evaluate)
+            elif term.names != near.names:
+                raise self.error(node, "found a joint action and one agent's, which are not comparable.")
+            else:
+                values.append(term.evaluate)
         compare = []
-        for operator in node.ops:
+        for k, operator in enumerate(node.ops):
             if type(operator) not in _COMPARISONS:
                 raise self.error(node, "found `in` or `is`, expected one of < <= > >= == !=.")
+            if any(actions[k : k + 2]) and not isinstance(operator, ast.Eq | ast.NotEq):
+                raise self.error(node, "found an order of actions, expected == or !=.")
             compare.append(_COMPARISONS[type(operator)])
 
         def evaluate(columns: Columns) -> Array:
@@ -288,15 +310,17 @@ class Parser:
         Raises:
             RunnerError: there is none, or several have this name.
         """
-        value = node.value if isinstance(node, ast.Constant) else None
+        constant = node.operand if isinstance(node, ast.UnaryOp) else node
+        value = constant.value if isinstance(constant, ast.Constant) else None
         if isinstance(value, int) and not isinstance(value, bool):
-            if value >= len(names):
-                raise self.error(node, f"found {what} {value}, expected one of 0 to {len(names) - 1}.")
+            if constant is not node or value >= len(names):
+                given = self.text_of(node)
+                raise self.error(node, f"found {what} {given}, expected one of 0 to {len(names) - 1}.")
             return value
-        if not isinstance(value, str):
+        if constant is not node or not isinstance(value, str):
             raise self.error(
                 node,
-                f"found {self.text_of(node)}, expected a number or a name of {_article(what)} {what}.",
+                f"found {self.text_of(node)}, expected a whole number or a name of {_article(what)} {what}.",
             )
         wanted = _plain(value)
         found = [k for k, name in enumerate(names) if _plain(name) == wanted]
@@ -304,10 +328,12 @@ class Parser:
             return found[0]
         if found:
             raise self.error(node, f"found a name of {len(found)} {what}s, expected a number.")
+        parts = names[0].count(" + ") + 1
+        hint = nearest(value, names) or nearest(" + ".join([value] * parts), names)
         raise self.error(
             node,
             f"found {what} {value[:60]!r}, expected one of {len(names):,}, by number or by name, such as "
-            f"{names[0]!r}.{nearest(value, names)}",
+            f"{names[0]!r}.{hint}",
         )
 
 

@@ -157,16 +157,18 @@ class JobVocabulary:
 
     def _term(self, quantity: Quantity) -> Term:
         self.quantities[quantity] = None
-        kind: Literal["number", "condition", "row"] = "number"
+        kind: Literal["number", "condition", "row", "action"] = "number"
         if quantity.name == "greedy_success":
             kind = "condition"
+        elif quantity.name == "greedy":
+            kind = "action"
         elif quantity.name == "q" and quantity.action < 0:
             kind = "row"
         return Term(
             kind,
             lambda columns: columns[quantity],
-            self._actions(quantity.learner) if quantity.name == "greedy" else (),
-            quantity.name in ("greedy", "visits", "step", "episode"),
+            self._actions(quantity.learner) if kind == "action" else (),
+            quantity.name in ("visits", "step", "episode"),
         )
 
 

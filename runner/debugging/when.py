@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.sections import Grid, Section, html
-from runner.analysis.step_reference import StepRef
+from runner.analysis.step_reference import StepRef, parse_step
 from runner.archive.places import at_hand
 from runner.debugging.expressions import Array, Columns, Expression, Parser, Term
 from runner.debugging.quantities import JobColumns, JobVocabulary, check_lost
@@ -259,8 +259,8 @@ def _step_number(recording: Recording, at: int | str | StepRef | None, steps: in
     """Return the number of a training step."""
     if at is None:
         return default
-    if isinstance(at, str) and not (at.isdecimal() and len(at) < 20):
-        at = StepRef.parse(at)
+    if isinstance(at, str):
+        at = parse_step(at)
     if isinstance(at, StepRef):
         if at.after is not None:
             raise RunnerError(f"found {at}, expected a step of training: its number, or EPISODE:T.")

@@ -170,7 +170,6 @@ def expressions(draw: Any, history: History) -> str:
             "min",
             "visits",
             "own visits",
-            "greedy",
             "step",
             "episode",
             "epsilon",
@@ -185,7 +184,6 @@ def expressions(draw: Any, history: History) -> str:
             "min": f"min(q{of}[{state}])",
             "visits": f"visits[{state}]",
             "own visits": f"visits{of}[{state}, {action}]",
-            "greedy": draw(st.sampled_from([f"greedy[{state}]", f"greedy{of}[{state}]"])),
             "reward": f"reward{of}",
         }
         if kind == "two":
@@ -193,13 +191,19 @@ def expressions(draw: Any, history: History) -> str:
         return made.get(kind, kind)
 
     def condition(depth: int) -> str:
-        kind = draw(st.integers(0, 5 if depth else 2))
+        kind = draw(st.integers(0, 6 if depth else 2))
         if kind <= 1:
             constant = draw(st.sampled_from(["0", "-1", "-2.5", "3", "0.25", "10", "400"]))
             sign = draw(st.sampled_from(["<", "<=", ">", ">=", "==", "!="]))
             return f"{number(1)} {sign} {draw(st.sampled_from([constant, number(1)]))}"
         if kind == 2:
             return f"greedy_success[{draw(st.sampled_from(history.states))}]"
+        if kind == 6:
+            own = draw(st.sampled_from(["", *(f".{each}" for each in history.learners if several)]))
+            first, second = (f"greedy{own}[{draw(st.sampled_from(history.states))}]" for _ in range(2))
+            action = str(draw(st.integers(0, history.twin.widths[0] - 1)))
+            sign = draw(st.sampled_from(["==", "!="]))
+            return f"{first} {sign} {draw(st.sampled_from([action, second]))}"
         if kind == 3:
             return f"not ({condition(depth - 1)})"
         return f"({condition(depth - 1)} {draw(st.sampled_from(['and', 'or']))} {condition(depth - 1)})"
