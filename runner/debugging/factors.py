@@ -14,6 +14,7 @@ from runner.analysis.diff.settings import Change
 from runner.config import ConfigError, ExperimentConfig, from_mapping
 from runner.config.model import LEARNERS, SECTION_OF
 from runner.errors import EnvironmentNotUsable, RunnerError
+from runner.runs.branches import training_branches
 from runner.util.humanize import listed
 from runner.util.values import Json, JsonView
 
@@ -51,7 +52,8 @@ class Factor:
         modes = [mode for mode, means in LEARNERS.items() if means == learners]
         if modes:
             del values["tables"], values["rewards"]
-        return ", ".join([*modes, *(_text(value) for value in values.values())])
+        texts = (_branches(value) if path == "branches" else _text(value) for path, value in values.items())
+        return ", ".join([*modes, *texts])
 
 
 @dataclass(frozen=True)
@@ -232,6 +234,15 @@ def _environment_problem(env_id: str, kwargs: str, rewards: str) -> RunnerError 
     except (ConfigError, EnvironmentNotUsable) as error:
         return error
     return None
+
+
+def _branches(value: object) -> str:
+    """Return branches of training in a few words: `epsilon 0.5 from step 100,000`."""
+    texts = (
+        f"{branch.changes} {'from' if branch.settings else 'at'} step {branch.step:,}"
+        for branch in training_branches({"branches": value})
+    )
+    return "; ".join(texts) or "none"
 
 
 def _text(value: object) -> str:

@@ -57,9 +57,14 @@ class TrainingOrigin:
 
     def __str__(self) -> str:
         """Describe the branch: `at training step 4,000,000: taxi 1 north, epsilon 0.1`."""
+        return f"at training step {self.step:,}: {self.changes}"
+
+    @property
+    def changes(self) -> str:
+        """What was changed: `taxi 1 north, epsilon 0.1`."""
         changes = [f"{agent.replace('_', ' ')} {action}" for agent, action in self.actions.items()]
         changes += [f"{path} {value}" for path, value in flatten(self.settings).items()]
-        return f"at training step {self.step:,}: {', '.join(changes) or 'nothing changed'}"
+        return ", ".join(changes) or "nothing changed"
 
 
 Origin = BranchOrigin | TrainingOrigin
