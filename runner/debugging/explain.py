@@ -37,7 +37,7 @@ from runner.debugging.explanation import (
 from runner.debugging.explanation_files import FOLDER, write_explanation
 from runner.debugging.factors import MAX_ALL, Mixing, mix
 from runner.debugging.first_step import first_step
-from runner.debugging.mixtures import Measured, Measurement, Mixtures
+from runner.debugging.mixtures import Measured, Measurement, Mixtures, Readings, measure
 from runner.debugging.shapley import minimal_set, shapley_interactions, shapley_values
 from runner.errors import RunnerError, RunNotFound, nearest
 from runner.execution.initial_tables import resolve_initial_q
@@ -49,6 +49,8 @@ from runner.sweep.pool import worker_pool
 
 Source = str | os.PathLike[str] | Mapping[str, Any] | ExperimentConfig | Run
 DEFAULT_SEEDS: Final = 20
+_START_SECONDS: Final = 10.0
+"""About the time to start workers, load kernels in them, and record the two short runs of the first step."""
 _PROBES: Final = 2
 """Seeds of A and of B that are trained first, to see how long a run takes; the first one loads kernels."""
 
@@ -71,13 +73,17 @@ class Plan:
 
     @property
     def seconds(self) -> float:
-        """The estimated time of the runs that are not known, at least."""
-        return max(0, self.mixtures * self.seeds - self.known) * self.run_seconds / self.workers
+        """The estimated time of the whole, at least; 0 if all runs are known."""
+        return self._seconds(self.mixtures)
 
     @property
     def most_seconds(self) -> float:
         """The same, at most."""
-        return max(0, self.most_mixtures * self.seeds - self.known) * self.run_seconds / self.workers
+        return self._seconds(self.most_mixtures)
+
+    def _seconds(self, mixtures: int) -> float:
+        left = mixtures * self.seeds - self.known
+        return _START_SECONDS + left * self.run_seconds / self.workers if left > 0 else 0.0
 
 
 def explain(
@@ -122,9 +128,12 @@ def explain(
     pool: Workers[Measurement, Measured]
     try:
         mixtures = Mixtures(mixing, question.seeds, folder, own, report)
+        if metric is not None and not mixtures.known(mixtures.ends):
+            _check_metric(mixing, metric, folder)
         with worker_pool(workers, ray, 2**MAX_ALL) as pool:
-            mixtures.measure((0, mixing.everything), pool, _PROBES)
-            game = _Game(question, mixtures, pool, _metric_of(mixtures, metric))
+            mixtures.measure(mixtures.ends, pool, _PROBES)
+            sides = [mixtures.readings(side)[0] for side in mixtures.ends]
+            game = _Game(question, mixtures, pool, _metric_of(sides, metric))
             planned(game.plan())
             players = game.players()
         strongest = None
@@ -221,13 +230,34 @@ def _resolved(source: Source, recordings: Path) -> tuple[Side, ExperimentConfig,
     return Side(source.name, source.run_id), resolve_initial_q(config, recordings), source.seed
 
 
-def _metric_of(mixtures: Mixtures, metric: str | None) -> str:
+def _check_metric(mixing: Mixing, metric: str, folder: Path) -> None:
+    """Check that evaluations of A and of B have a metric, by an episode of each.
+
+    Rewards are not checked: `training.reward.VALUE` depends on what was received.
+
+    Raises:
+        RunnerError: there is no such metric.
+    """
+    if metric.startswith("training.reward"):
+        return
+    sides = []
+    for number in (0, mixing.everything):
+        values = mixing.config(number).to_mapping()
+        short = from_mapping(values | {"episodes": 1, "evaluation": values["evaluation"] | {"trials": 1}})
+        sides.append(dict.fromkeys(measure(short, 0, folder) or (), 0.0))
+    _metric_of(sides, metric)
+
+
+def _metric_of(sides: Sequence[Readings], metric: str | None) -> str:
     """Return the metric: the one that was chosen, the success rate, or the mean return.
+
+    Args:
+        sides: the readings of A and of B.
+        metric: the chosen one.
 
     Raises:
         RunnerError: there is no such metric in evaluations of A and of B.
     """
-    sides = [mixtures.readings(side)[0] for side in mixtures.ends]
     shared = {name for name in sides[0] if all(side.get(name) is not None for side in sides)}
     candidates = [metric] if metric is not None else ["success_percent", "mean_return"]
     found = next((name for name in candidates if name in shared), None)

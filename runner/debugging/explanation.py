@@ -187,13 +187,14 @@ def _settings_section(explanation: Explanation) -> Section:
     for setting in explanation.settings:
         cells = [setting.name, setting.a, setting.b]
         if has_shares and setting.share is not None:
-            part = _percent(explanation.part(setting.share.value)) if is_clear else ""
-            own = (setting.share, setting.alone, setting.last)
-            cells += [signed(own[0]), part, *(number(one.value, True) if one else "" for one in own[1:])]
+            part = [_percent(explanation.part(setting.share.value))] if is_clear else []
+            others = (setting.alone, setting.last)
+            cells += [signed(setting.share), *part]
+            cells += [number(one.value, True) if one else "" for one in others]
         elif has_shares:
             cells += ["not needed", "", "", ""]
         rows.append(tuple(cells))
-    headings = ("setting", "A", "B")
+    headings: tuple[str, ...] = ("setting", "A", "B")
     if not has_shares:
         return Section("Settings", [], [Grid(headings, rows)])
     text = (
@@ -205,7 +206,8 @@ def _settings_section(explanation: Explanation) -> Section:
             "Delta debugging found settings that make the difference and of which none can be left out. "
             f"{text.replace('the difference', 'what they make together')}"
         )
-    return Section("Shares", [text], [Grid((*headings, "share", "of all", "alone", "last"), rows)])
+    headings += ("share", "of all", "alone", "last") if is_clear else ("share", "alone", "last")
+    return Section("Shares", [text], [Grid(headings, rows)])
 
 
 def _interactions_section(explanation: Explanation, clear: Sequence[Interaction]) -> Section:
@@ -251,7 +253,7 @@ def _mixtures_section(explanation: Explanation) -> Section:
     text = f"{counted(explanation.runs, 'run')}, {len(explanation.mixtures)} mixtures of the settings"
     text += f"; {len(mixtures)} of them are listed." if len(mixtures) < len(explanation.mixtures) else "."
     if explanation.trained:
-        text += f" {counted(explanation.trained, 'run')} trained now, in {duration(explanation.seconds)}."
+        text += f" {counted(explanation.trained, 'run')} trained now; {duration(explanation.seconds)} in all."
     return Section("Mixtures", [text], [Grid((*names, explanation.metric, "95 %"), rows)])
 
 

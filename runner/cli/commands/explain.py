@@ -21,7 +21,7 @@ from runner.cli.options import (
 )
 from runner.cli.output import draw, facts, print_json, print_sections, require_one_form, say
 from runner.cli.progress import total_line
-from runner.util.humanize import duration
+from runner.util.humanize import counted, duration
 
 if TYPE_CHECKING:
     from runner.debugging.explain import Plan
@@ -139,9 +139,9 @@ def _in_words(plan: Plan) -> str:
     """Return what will be trained, and how long it takes."""
     runs, most = plan.mixtures * plan.seeds, plan.most_mixtures * plan.seeds
     known = f", {plan.known:,} of them known" if plan.known else ""
-    text = f"{runs:,} runs: {plan.mixtures:,} mixtures of {plan.settings} settings, {plan.seeds} seeds each"
+    settings, seeds = counted(plan.settings, "setting"), counted(plan.seeds, "seed")
     if most != runs:
-        text = f"from {runs:,} to {most:,} runs: delta debugging of {plan.settings} settings, each mixture "
-        text += f"with {plan.seeds} seeds"
-        return f"{text}{known}; from about {duration(plan.seconds)} to {duration(plan.most_seconds)}"
-    return f"{text}{known}; about {duration(plan.seconds)}"
+        text = f"from {runs:,} to {most:,} runs: delta debugging of {settings}, each mixture with {seeds}"
+        return f"{text}{known}; up to about {duration(plan.most_seconds)}"
+    text = f"{runs:,} runs: {plan.mixtures:,} mixtures of {settings}, {seeds} each{known}"
+    return f"{text}; about {duration(plan.seconds)}" if plan.seconds else f"{text}: nothing to train"

@@ -162,6 +162,28 @@ MANY = {
 }
 
 
+def test_a_branch_is_put_in_words():
+    changed = {"run": "k3v9m2xq", "step": 100_000, "settings": {"epsilon": 0.5}}
+    acted = {"run": "k3v9m2xq", "step": 1200, "actions": {"agent": "left"}}
+    mixing = mix(from_mapping(LAKE), from_mapping(LAKE | {"branches": [acted, changed]}))
+    (factor,) = mixing.factors
+    assert factor.b == "agent left at step 1,200; epsilon 0.5 from step 100,000"
+    assert factor.a == "none"
+
+
+def test_a_wrong_metric_is_refused_before_anything_is_trained(tmp_path):
+    with pytest.raises(RunnerError, match="expected one that evaluations of both have"):
+        explained(LAKE, LAKE | PLANTED, tmp_path, metric="nothing")
+    assert list(tmp_path.rglob("values.jsonl")) == []
+
+
+def test_without_a_clear_difference_no_parts_of_it_are_shown(tmp_path):
+    found = explained(LAKE, LAKE | {"epsilon": 0.1}, tmp_path, seeds=2, metric="success_percent")
+    (shares,) = [each for each in sections(found) if each.title == "Shares"]
+    assert shares.grids[0].headings == ("setting", "A", "B", "share", "alone", "last")
+    assert {len(row) for row in shares.grids[0].rows} == {6}
+
+
 @pytest.mark.parametrize(
     ("b", "options", "message"),
     [
@@ -218,12 +240,13 @@ def test_the_command_plans_answers_and_prints_json(tmp_path):
     assert plan["seconds"] > 0
     assert json.loads(typed("--dry-run", "--json").stdout) == plan  # the time is known from before
     whole = typed()
-    assert "8 runs: 4 mixtures of 2 settings, 2 seeds each, 4 of them known" in whole.stderr
+    assert "8 runs: 4 mixtures of 2 settings, 2 seeds each, 4 of them known; about 10 s" in whole.stderr
     assert "epsilon alone makes 100 % of it" in whole.stdout
     found = json.loads(typed("--json").stdout)
     assert found["smallest"]["settings"] == ["epsilon"]
     assert sum(setting["share"]["value"] for setting in found["settings"]) == pytest.approx(100.0)
     assert typed("--markdown").stdout.startswith("## a (A) and b (B)")
+    assert "nothing to train" in typed("--dry-run").stdout
     assert "expected one that evaluations of both have" in typed("--metric", "nothing", code=2).stderr
 
 
