@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from runner.recording.reader import Recording
 
 EXPECTED: Final = "EPISODE:T such as 120:5, or eval:N:TRIAL:T; a TRIAL or T that is left out is 0"
+EXPECTED_OF_TRAINING: Final = "EPISODE:T such as 120:5, or the number of a training step"
+_EXPECTED_ANY: Final = EXPECTED.replace(" or ", " the number of a training step, or ", 1)
 _NUMBER: Final = "([0-9]{1,15})"
 _TRAINING: Final = re.compile(f"{_NUMBER}(?::{_NUMBER})?")
 _EVALUATION: Final = re.compile(f"eval:{_NUMBER}(?::{_NUMBER})?(?::{_NUMBER})?")
@@ -36,8 +38,12 @@ class StepRef:
     """The training episodes before the evaluation; None for a training episode."""
 
     @classmethod
-    def parse(cls, text: str) -> Self:
+    def parse(cls, text: str, expected: str = EXPECTED) -> Self:
         """Return the step that a text refers to.
+
+        Args:
+            text: the reference.
+            expected: what the error says that was expected.
 
         Raises:
             RunnerError: the text is no step reference.
@@ -47,7 +53,7 @@ class StepRef:
         if match := _EVALUATION.fullmatch(text):
             after, trial, t = (int(part or 0) for part in match.groups())
             return cls(trial, t, after)
-        raise RunnerError(f"found {text[:60]!r}, expected {EXPECTED}.")
+        raise RunnerError(f"found {text[:60]!r}, expected {expected}.")
 
     def __str__(self) -> str:
         """Return the text that `parse` takes."""
@@ -80,13 +86,18 @@ class StepRef:
         return f"/runs/{run_id}/replay/{self.episode_path}?t={self.outcome.t}"
 
 
-def parse_step(text: str) -> int | StepRef:
+def parse_step(text: str, expected: str = _EXPECTED_ANY) -> int | StepRef:
     """Return the step that a text refers to; a number alone is a training step, counted over the run.
+
+    Args:
+        text: the reference.
+        expected: what the error says that was expected.
 
     Raises:
         RunnerError: the text is no step reference.
     """
-    return int(text) if text.isascii() and text.isdecimal() and len(text) < 16 else StepRef.parse(text)
+    is_number = text.isascii() and text.isdecimal() and len(text) < 16
+    return int(text) if is_number else StepRef.parse(text, expected)
 
 
 def training_steps(recording: Recording) -> int:
@@ -106,7 +117,8 @@ def training_step(recording: Recording, at: int | StepRef) -> int:
     if isinstance(at, int):
         if not 0 <= at < taken:
             raise RecordingError(
-                f"{recording.path}: found no training step {at:,}; there are {taken:,}, from 0."
+                f"{recording.path}: found no training step {at:,}; there are {taken:,}, from 0 to "
+                f"{taken - 1:,}."
             )
         return at
     if at.after is not None:

@@ -84,7 +84,8 @@ def branch(
         )
     if (policy, seed, max_steps) != ("recorded", 0, MAX_STEPS):
         raise ConfigError(
-            f"run {run.run_id} was trained here and is trained on: policy, seed and max_steps are for loops."
+            f"run {run.run_id} was trained here, and a branch of it is trained as its "
+            "configuration says: policy, seed and max_steps are for loops."
         )
     return branch_training(
         run,

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from runner.analysis.step_reference import StepRef
 from runner.debugging.action_outcomes import ActionOutcome, Outcome, WhatIf
 from runner.debugging.continuation import Continuation, Moment
-from runner.environments.mdp import events_of
-from runner.environments.naming import actions_in_words, joint_action, states_in_words
+from runner.environments.mdp import Mdp, events_of
+from runner.environments.naming import actions_in_words, agent_of, joint_action, own_action, states_in_words
 from runner.errors import RecordingError
 from runner.export.contents import ending_of, require_steps
 from runner.export.episodes import EpisodePlace, place_of
@@ -64,10 +64,11 @@ def what_if(run: Run, *, at: str | StepRef, actions: Sequence[str | int] = ()) -
     Args:
         run: a run that was trained here, with its steps.
         at: the step: `EPISODE:T` of training, or `eval:N:TRIAL:T`.
-        actions: numbers or names of joint actions, such as `north + east`; all if there are none.
+        actions: numbers or names of joint actions, such as `north + east`, or `AGENT=VALUE` each: those in
+            which these agents act so; all if there are none.
 
     Raises:
-        ConfigError: there is no such action.
+        ConfigError: there is no such action or agent.
         RecordingError: there is no such episode or step, its steps were not recorded, or it is damaged.
         RunnerError: the run was recorded from a loop.
     """
@@ -77,13 +78,22 @@ def what_if(run: Run, *, at: str | StepRef, actions: Sequence[str | int] = ()) -
 
 def what_if_in(recording: Recording, at: StepRef, actions: Sequence[str | int] = ()) -> WhatIf:
     """Return where actions lead, as `what_if` does, from an open recording."""
-    branches, mdp = _Branches(recording, at), recording.mdp
-    chosen = (
-        range(mdp.joint_actions)
-        if not actions or ALL in actions
-        else [joint_action(mdp, str(each)) for each in actions]
-    )
-    return branches.compare(dict.fromkeys(chosen))
+    return _Branches(recording, at).compare(_chosen(recording.mdp, list(map(str, actions))))
+
+
+def _chosen(mdp: Mdp, actions: list[str]) -> Iterable[int]:
+    """Return the joint actions with these numbers or names, or in which agents act as `AGENT=VALUE` says."""
+    if not actions or ALL in actions:
+        return range(mdp.joint_actions)
+    pairs = [text.partition("=") for text in actions]
+    if not all(equals for _, equals, _ in pairs):
+        return dict.fromkeys(joint_action(mdp, text) for text in actions)
+    allowed = np.ones(mdp.own_actions.shape, bool)  # [J, agents]
+    for i, own in enumerate(mdp.own_actions.T):
+        values = [own_action(mdp, i, value) for name, _, value in pairs if agent_of(mdp, name) == i]
+        allowed[:, i] = np.isin(own, values) if values else True
+    chosen: list[int] = np.flatnonzero(allowed.all(axis=1)).tolist()
+    return chosen
 
 
 def branched(recording: Recording, at: StepRef, action: str | int) -> Branched:

@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.sections import Grid, Section, html
-from runner.analysis.step_reference import StepRef, parse_step
+from runner.analysis.step_reference import EXPECTED_OF_TRAINING, StepRef, parse_step
 from runner.archive.places import at_hand
 from runner.debugging.expressions import Array, Columns, Expression, Parser, Term
 from runner.debugging.quantities import JobColumns, JobVocabulary, check_lost
@@ -260,19 +260,19 @@ def _step_number(recording: Recording, at: int | str | StepRef | None, steps: in
     if at is None:
         return default
     if isinstance(at, str):
-        at = parse_step(at)
+        at = parse_step(at, EXPECTED_OF_TRAINING)
     if isinstance(at, StepRef):
         if at.after is not None:
-            raise RunnerError(f"found {at}, expected a step of training: its number, or EPISODE:T.")
+            raise RunnerError(f"found {at}, expected a step of training: {EXPECTED_OF_TRAINING}.")
         span = recording.episode_span("train", at.episode)
         if at.t >= len(span):
             raise RunnerError(
                 f"found step {at.t} of training episode {at.episode}, expected one of 0 to {len(span) - 1}."
             )
         return span[at.t]
-    if not 0 <= int(at) < steps:
-        raise RunnerError(f"found training step {int(at):,}, expected one of 0 to {steps - 1:,}.")
-    return int(at)
+    if not 0 <= at < steps:
+        raise RunnerError(f"found training step {at:,}, expected one of 0 to {steps - 1:,}.")
+    return at
 
 
 # --- as text ----------------------------------------------------------------------------------------------

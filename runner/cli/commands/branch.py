@@ -8,6 +8,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from runner.cli import Command
 from runner.cli.options import (
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
     multiple=True,
     metavar="VALUE",
     help="The action: a number, a name or all; of one agent of several AGENT=VALUE, may be repeated.  "
-    "[default: as recorded]",
+    "[default: as recorded; of a trial of an evaluation all]",
 )
 @set_option
 @click.option(
@@ -93,7 +94,7 @@ def branch_command(
     verified, resumed, compared and branched as every run.
 
     With --action all, and of a trial of an evaluation, nothing is trained: the episode is played on from the
-    step with each joint action, or those that are named, by the tables of that moment.
+    step with each joint action, or those that are named, or have AGENT=VALUE, by the tables of that moment.
 
     Of a loop, an episode is played on from the step. Its environment is made again and brought there by the
     recorded reset and actions, compared with the recording on the way. Then the recorded actions act, until
@@ -117,14 +118,20 @@ def branch_command(
     run = find_recorded(run_name, options["recordings"])
     if at is None:
         raise click.UsageError("expected --at EPISODE:T, the step to branch at")
+    if not run.can_train_again and "all" in actions:
+        raise click.UsageError(
+            f"--action all is for runs that were trained here, and run {run.run_id} is a loop: it is played "
+            "on with one action at a time."
+        )
     if run.can_train_again and ("all" in actions or (not isinstance(at, int) and at.after is not None)):
-        from runner.analysis.step_reference import reference_to
+        from runner.analysis.step_reference import reference_to, training_step
         from runner.cli.what_if import print_what_if
         from runner.recording.reader import open_recording
 
+        _refuse_what_training_takes(ctx)
         if isinstance(at, int):
             with open_recording(run.recording) as recording:
-                at = reference_to(recording, at)
+                at = reference_to(recording, training_step(recording, at))
         print_what_if(run, at, actions, as_json)
         return
     action = _action(actions, run)
@@ -138,6 +145,19 @@ def branch_command(
         _print_training(ctx, run, found, as_json)
     else:
         _print_episode(run, found, as_json)
+
+
+def _refuse_what_training_takes(ctx: click.Context) -> None:
+    """Refuse the options of a new run where nothing is trained or recorded."""
+    names = ("overrides", "episodes", "policy", "seed", "name", "max_steps")
+    given = [name for name in names if ctx.get_parameter_source(name) is not ParameterSource.DEFAULT]
+    if given:
+        options = ["--set" if name == "overrides" else f"--{name.replace('_', '-')}" for name in given]
+        raise click.UsageError(
+            f"{' and '.join(options)}: nothing is trained or recorded where actions are compared, "
+            "with --action all or at a trial of an evaluation. Leave this out, or branch at a step of "
+            "training, with one action or none."
+        )
 
 
 def _action(actions: tuple[str, ...], run: Run) -> object:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from runner.analysis.step_reference import StepRef
+from runner.analysis.step_reference import StepRef, parse_step
 from runner.errors import RunnerError
 
 
@@ -29,3 +29,5 @@ def test_what_is_left_out_is_0(text, step):
 def test_anything_else_is_refused_with_what_is_expected(text):
     with pytest.raises(RunnerError, match="expected EPISODE:T such as 120:5, or eval:N:TRIAL:T"):
         StepRef.parse(text)
+    with pytest.raises(RunnerError, match=r"EPISODE:T .*, the number of a training step, or eval:N:TRIAL:T"):
+        parse_step(text)

@@ -287,3 +287,30 @@ def test_the_command_prints_a_table_and_json(taxis):
     assert found == json.loads(json.dumps(runner.what_if(taxis, at="eval:40:1:2").as_json()))
     one = json.loads(invoke("--action", "south+pickup", "--json"))
     assert one["actions"] == [row for row in found["actions"] if row["name"] == "south + pickup"]
+
+
+@pytest.mark.parametrize("words", [("--at", "3:1", "--action", "all"), ("--at", "eval:40:1:2")])
+@pytest.mark.parametrize(
+    "option", ["--set=epsilon=0.1", "--name=more", "--episodes=50", "--policy=random", "--seed=0"]
+)
+def test_an_option_of_a_new_run_is_refused_where_none_is_recorded(taxis, words, option):
+    result = CliRunner().invoke(cli, ["branch", str(taxis.folder), *words, option])
+    assert result.exit_code == 2
+    assert f"{option.partition('=')[0]}: nothing is trained or recorded" in result.output
+
+
+def test_an_action_of_one_agent_stands_for_the_joint_actions_that_have_it(taxis):
+    names = [row.name for row in runner.what_if(taxis, at="eval:40:1:2", actions=["taxi_1=north"]).actions]
+    assert len(names) == 6
+    assert all(name.startswith("north + ") for name in names)
+    both = runner.what_if(taxis, at="eval:40:1:2", actions=["taxi 1=1", "taxi_2=east"])
+    assert [row.name for row in both.actions] == ["north + east"]
+    with pytest.raises(ConfigError, match="expected taxi_1 or taxi_2"):
+        runner.what_if(taxis, at="eval:40:1:2", actions=["taxi_3=north"])
+
+
+def test_a_training_step_after_the_last_is_refused_by_its_number(taxis):
+    steps = taxis.summary.train_steps
+    result = CliRunner().invoke(cli, ["branch", str(taxis.folder), "--at", str(steps), "--action", "all"])
+    assert result.exit_code == 2
+    assert f"found no training step {steps:,}; there are {steps:,}, from 0 to {steps - 1:,}" in result.output

@@ -188,7 +188,7 @@ def test_a_condition_counts_as_0_or_1_and_a_division_by_zero_is_no_error(coopera
         ("eval:3000:1", None, "expected a step of training"),
         ("-1", None, "EPISODE:T"),
         ("1" * 5000, None, "EPISODE:T"),
-        ("3:x", None, "EPISODE:T"),
+        ("3:x", None, "EPISODE:T such as 120:5, or the number of a training step."),
         (20, 10, "expected them in order"),
     ],
 )

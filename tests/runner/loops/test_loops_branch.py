@@ -174,6 +174,10 @@ def test_the_command_and_what_show_lists(runs, tmp_path):
     printed = json.loads(command("branch", run.run_id, "--at", "0:3", "--action", "1", "--json"))
     assert printed["origin"]["action"] == "1"
     assert printed["parent"]["length"] == len(rows(run, 0))
+    words = ["branch", run.run_id, "--at", "0:3", "--action", "all", "--recordings", str(tmp_path)]
+    refused = CliRunner().invoke(cli, words)
+    assert refused.exit_code == 2
+    assert "one action at a time" in refused.output
     text = command("branch", run.run_id, "--at", "0:3", "--action", "0", "--policy", "constant")
     assert re.search(r"parent +\w+ .*terminated\nbranch +\w+ .*terminated", text)
     assert f"dualtaxi diff {run.run_id}" in text
