@@ -116,7 +116,7 @@ def joint_action(mdp: Mdp, text: str) -> int:
 
 def _numbered(text: str, names: list[str], what: str, listed: int = MAX_LISTED) -> int:
     """Return the number that a text is, or that it names; an error lists some names."""
-    if text.isascii() and text.isdecimal() and int(text[:12]) < len(names):
+    if text.isascii() and text.isdecimal() and len(text) <= 12 and int(text) < len(names):
         return int(text)
     wanted = " + ".join(part.strip() for part in spoken(text).split("+"))
     if wanted in names:

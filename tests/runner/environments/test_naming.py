@@ -11,9 +11,11 @@ from runner.environments.naming import (
     actions_in_words,
     agent_actions,
     event_in_words,
+    joint_action,
     spoken,
     states_in_words,
 )
+from runner.errors import ConfigError
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +41,12 @@ def test_actions_of_dualtaxi(dualtaxi):
     for action in range(36):
         parts = [names[agent][own] for agent, own in enumerate(agent_actions(dualtaxi, action))]
         assert words[action] == " + ".join(parts)
+
+
+def test_a_number_with_many_zeros_is_no_way_around_the_bound(dualtaxi):
+    assert joint_action(dualtaxi, "035") == 35
+    with pytest.raises(ConfigError, match="a number from 0 to 35"):
+        joint_action(dualtaxi, "0" * 12 + "99999")
 
 
 def test_words_can_be_indexed_by_arrays(dualtaxi):
