@@ -6,6 +6,7 @@ relies on colour alone.
 
 from __future__ import annotations
 
+import operator
 from typing import Final
 
 ORANGE: Final = "#E69F00"
@@ -119,9 +120,11 @@ def rgb(colour: str) -> tuple[int, int, int]:
 
 
 def ink_on(colour: str) -> str:
-    """Return black or white, whichever is more readable on `colour`."""
-    red, green, blue = rgb(colour)
-    return "#000000" if 0.299 * red + 0.587 * green + 0.114 * blue > 140 else WHITE
+    """Return black or white, whichever has more contrast with `colour`, as WCAG defines it."""
+    shares = (part / 255 for part in rgb(colour))
+    linear = (share / 12.92 if share <= 0.04045 else ((share + 0.055) / 1.055) ** 2.4 for share in shares)
+    luminance = sum(map(operator.mul, linear, (0.2126, 0.7152, 0.0722)))
+    return "#000000" if (luminance + 0.05) ** 2 > 0.05 * 1.05 else WHITE
 
 
 def ramp_colour(level: int) -> str:
