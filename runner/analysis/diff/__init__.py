@@ -315,7 +315,7 @@ def _values_by_path(
         "config": [
             {key: value for key, value in one.config.items() if key != "seeds"}
             | {"seed": one.seed}
-            | ({"branches": [f"{each.run} {each}" for each in branches]} if branches else {})
+            | ({"branches": ", then ".join(f"{each.run} {each}" for each in branches)} if branches else {})
             for one in (a, b)
             for branches in [training_branches(one.config)]
         ],

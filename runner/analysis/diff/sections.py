@@ -82,7 +82,7 @@ def summary(difference: RunDiff) -> str:
         more = len(named) - _MAX_SETTINGS
         listed = "; ".join([*named[:_MAX_SETTINGS], *([f"and {more} more"] if more > 0 else [])])
         sentences.append(f"Of the settings, {listed} {'differ' if len(settings) > 1 else 'differs'}.")
-    else:
+    elif not is_branch:
         other = "other " if difference.ignored else ""
         sentences.append(f"No {other}setting that determines the content differs.")
     if made := made_in_words(difference.code, difference.provenance):
