@@ -137,7 +137,7 @@ def facts_of(found: Why) -> dict[str, str]:
 
 
 def sections_of(found: Why) -> list[Section]:
-    """Return all parts of the sum; the section of steps is the last one."""
+    """Return all parts of the sum; the section of steps is the second one."""
     whole = found.rewarded.weight + found.initial.weight
 
     def cells(part: Part) -> tuple[str, str, str]:
@@ -158,21 +158,17 @@ def sections_of(found: Why) -> list[Section]:
     if rest:
         others = Part(sum(part.weight for part in rest), sum(part.contribution for part in rest))
         rewards.append((f"{len(rest)} other kinds", "", *cells(others)))
-    off = f"It differs from the table's value by {abs(found.total - found.value):.1g}, by rounding."
+    off = "It equals the table's value."
+    if found.total != found.value:
+        off = f"It differs from the table's value by {abs(found.total - found.value):.1g}, by rounding."
+    episodes = [part for part in found.episodes if part.weight or part.contribution]
+    without = len(found.episodes) - len(episodes)
+    left_out = (
+        f"{without:,} of {len(found.episodes):,} stretches of episodes have no weight and are left out."
+    )
     return [
         Section(
             "The sum", [off, EXPLANATION, *([found.note] if found.note else [])], [Grid(("", *columns), sums)]
-        ),
-        Section("By reward", [], [Grid(("reward", "events", *columns), rewards)]),
-        Section(
-            "By episode",
-            [],
-            [
-                Grid(
-                    ("episodes", *columns),
-                    [(_episodes(part), *cells(part)) for part in found.episodes],
-                )
-            ],
         ),
         Section(
             "The steps that add or take most",
@@ -185,6 +181,12 @@ def sections_of(found: Why) -> list[Section]:
             ]
             if found.steps
             else [],
+        ),
+        Section("By reward", [], [Grid(("reward", "events", *columns), rewards)]),
+        Section(
+            "By episode",
+            [left_out] if without else [],
+            [Grid(("episodes", *columns), [(_episodes(part), *cells(part)) for part in episodes])],
         ),
     ]
 
@@ -210,17 +212,17 @@ def why_body(found: Why, linked: bool) -> str:
         MissingExtra: Jinja2 is not installed.
     """
     parts = partials()
-    *sections, steps = sections_of(found)
+    whole, steps, *rest = sections_of(found)
     steps_at = [StepRef.parse(step.at) for step in found.steps]
     links = [at.replay_address(found.run_id) for at in steps_at] if linked else []
     picture = ""
     if found.picture:
         picture = f'<figure class="moves">{found.picture}<figcaption>{escape(KEY)}</figcaption></figure>'
-    first, *others = [parts.section(f"why-{k}", body.title, body) for k, body in enumerate(sections)]
+    first, *others = [parts.section(f"why-{k}", body.title, body) for k, body in enumerate([whole, *rest])]
     listed = "".join(str(parts.grid(grid, steps.title, "list", links)) for grid in steps.grids)
     return (
         f'{parts.pairs("The value", facts_of(found))}<div class="why">{picture}<div>{first}</div></div>'
-        f'<section id="why-steps"><h2>{escape(steps.title)}</h2>'
+        f'<section id="why-steps" class="words"><h2>{escape(steps.title)}</h2>'
         f"{parts.paragraphs(steps.sentences)}{listed}</section>"
         f"{''.join(map(str, others))}"
     )

@@ -141,6 +141,10 @@ class Drawing:
         marks = [self._landmark(mark) for mark in self._scene["landmarks"]]
         return "".join([paper, *cells, *marks, self.walls()])
 
+    def letters(self) -> str:
+        """Return the letters of the landmarks, for pictures with something drawn over what never moves."""
+        return "".join(map(self._letter, self._scene["landmarks"]))
+
     def walls(self) -> str:
         """Return the walls between cells."""
         lines = []
@@ -216,10 +220,17 @@ class Drawing:
         tint = "g-hazard" if kind == "hazard" else "g-tint"
         return (
             f'<rect class="{tint}" x="{x + 2}" y="{y + 2}" width="{CELL - 4}" height="{CELL - 4}" '
-            f'fill="{colour}"/><rect x="{x + 7}" y="{y + 7}" width="28" height="28" rx="5" fill="{colour}"/>'
-            f'<text class="g-letter" x="{x + 21}" y="{y + 28}" fill="{palette.ink_on(colour)}">'
-            f"{escape(mark['name'][:2])}</text>"
+            f'fill="{colour}"/>{self._letter(mark)}'
             + (f'<g transform="translate({x + 50} {y + 50})">{_GOAL}</g>' if kind == "goal" else "")
+        )
+
+    def _letter(self, mark: Landmark) -> str:
+        row, column = mark["cell"]
+        x, y = corner(self._scene, row * self._scene["columns"] + column)
+        return (
+            f'<rect x="{x + 7}" y="{y + 7}" width="28" height="28" rx="5" fill="{mark["colour"]}"/>'
+            f'<text class="g-letter" x="{x + 21}" y="{y + 28}" fill="{palette.ink_on(mark["colour"])}">'
+            f"{escape(mark['name'][:2])}</text>"
         )
 
     def _sign_in_words(self, number: int) -> str:

@@ -49,7 +49,7 @@ def moves_map(
         if width >= _FAINTEST
     ]
     things = "" if place is None else drawing.things(place)
-    content = f'{drawing.still()}<g fill-opacity=".85">{"".join(shapes)}</g>{things}'
+    content = f'{drawing.still()}<g fill-opacity=".85">{"".join(shapes)}</g>{drawing.letters()}{things}'
     return picture(drawing.width, drawing.height, title, content)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from runner.cli import Command
-from runner.cli.options import all_option, json_option, recordings_option, run_argument
+from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, print_sections
 from runner.cli.progress import steps_line
 from runner.cli.runs import command_for, compilation_notice, find_recorded
@@ -16,7 +16,12 @@ from runner.cli.runs import command_for, compilation_notice, find_recorded
 @click.command("when", cls=Command)
 @run_argument
 @click.argument("expression", metavar="EXPRESSION")
-@all_option
+@click.option(
+    "--all",
+    "everything",
+    is_flag=True,
+    help="Include everything, not only a selection: every interval in which it holds, with its end.",
+)
 @click.option("--from", "first", metavar="STEP", help="The first training step: its number, or EPISODE:T.")
 @click.option("--to", "last", metavar="STEP", help="The last training step, as for --from.")
 @recordings_option

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     "--at",
     type=STEP,
     metavar="STEP",
-    help="The step: EPISODE:T, or eval:N:TRIAL:T; the value before it is shown.  [default: the last]",
+    help="The step: EPISODE:T, or eval:N:TRIAL:T; T defaults to 0, so 120 is the start of episode 120. The "
+    "value before the step is shown.  [default: the last]",
 )
 @limit_option(10)
 @recordings_option

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from click.testing import CliRunner
 import runner
 from runner.cli import cli
 from runner.debugging import weights
+from runner.debugging.q_value import EpisodesPart, sections_of
 from runner.errors import ConfigError, RecordingError, RunnerError, StorageError
 from runner.recording import schema
 from runner.recording.reader import open_recording
@@ -158,6 +160,18 @@ def test_a_policy_is_no_sum_and_the_answer_says_so(tmp_path):
     assert not runner.why(make_run(tmp_path, PLAIN), at=STEP).note
 
 
+def test_the_answer_says_whether_the_sum_is_the_value_and_leaves_out_episodes_without_weight(tmp_path):
+    run = make_run(tmp_path, PLAIN)
+    found = runner.why(run, at=STEP)
+    exact, *_ = sections_of(replace(found, total=found.value))
+    assert exact.sentences[0] == "It equals the table's value."
+    assert sections_of(replace(found, total=found.value + 1e-9))[0].sentences[0].startswith("It differs")
+    parts = (EpisodesPart(0.5, 2.0, 0, 10), EpisodesPart(0.0, 0.0, 10, 20), EpisodesPart(0.5, 0.0, 20, 30))
+    *_, episodes = sections_of(replace(found, episodes=parts))
+    assert [row[0] for grid in episodes.grids for row in grid.rows] == ["0 to 9", "20 to 29"]
+    assert episodes.sentences == ["1 of 3 stretches of episodes have no weight and are left out."]
+
+
 def test_a_notebook_shows_it_in_a_frame(tmp_path):
     html = runner.why(make_run(tmp_path, PLAIN), at=STEP)._repr_html_()
     assert html.startswith("<iframe")
@@ -246,5 +260,6 @@ def test_the_command_prints_what_python_returns(cooperative):
     assert f"{found.value:.9g} after {found.step:,} training steps" in text
     assert found.steps[1].at in text
     assert "not a counterfactual" in text
+    assert text.index("The steps that add or take most") < text.index("By reward")
     wrong = CliRunner().invoke(cli, ["why", cooperative.run_id, "--state", "5000", *recordings])
     assert wrong.exit_code == 2
