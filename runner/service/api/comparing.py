@@ -6,9 +6,13 @@ from http import HTTPStatus
 from typing import Annotated, Final
 
 from fastapi import APIRouter, Query, Request, Response
+from fastapi import Path as InPath
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.axes import EPISODES
+from runner.debugging.explanation import Explanation
+from runner.debugging.explanation_files import explanations_in, read_explanation
+from runner.errors import RunNotFound
 from runner.runs.run import Run
 from runner.service import computed
 from runner.service.api.reading import AxisName, Curves, FirstPosition, LastPosition, Metrics, Points
@@ -17,13 +21,15 @@ from runner.service.dependencies import (
     CacheOf,
     CatalogueOf,
     ProcessesOf,
+    SettingsOf,
     recorded_run,
     recording_state,
     timed_recording_state,
 )
 from runner.service.problems import error_docs
 from runner.service.response_cache import ALWAYS
-from runner.util.values import Json
+from runner.service.settings import Settings
+from runner.util.values import Json, finite
 
 router = APIRouter(
     tags=["comparing"],
@@ -40,6 +46,34 @@ MAX_SCORES: Final = 10_000
 """Characters of a table of scores."""
 Runs = Annotated[list[str], Query(min_length=1, max_length=MAX_RUNS, description="A run; may be repeated.")]
 Name = Annotated[str, Query(max_length=200, description="A run: its id, the beginning of it, its name, ...")]
+Part = Annotated[str, InPath(max_length=120)]
+
+
+@router.get("/explanations", summary="The names of the explanations that `dualtaxi explain` left.")
+def explanations(settings: SettingsOf) -> list[str]:
+    """Return names, each of a pair and a metric: `A-B-1f2e3d4c/success_percent`."""
+    return [name for folder in settings.recordings for name in explanations_in(folder)]
+
+
+@router.get("/explanations/{pair}/{metric}", summary="An explanation.")
+def explanation(pair: Part, metric: Part, settings: SettingsOf) -> dict[str, object]:
+    """Return what `dualtaxi explain --json` printed; null where there is no interval."""
+    values: dict[str, object] = finite(found_explanation(pair, metric, settings).as_json())
+    return values
+
+
+def found_explanation(pair: str, metric: str, settings: Settings) -> Explanation:
+    """Return an explanation in the recordings folders.
+
+    Raises:
+        RunNotFound: there is none.
+        RunnerError: its file is damaged.
+    """
+    name = f"{pair}/{metric}"
+    folder = next((folder for folder in settings.recordings if name in explanations_in(folder)), None)
+    if folder is None:
+        raise RunNotFound(f"no explanation {name!r}: the page of sweeps lists those there are.")
+    return read_explanation(name, folder)
 
 
 @router.get("/diff", summary="The differences between two runs, down to the first step that differs.")

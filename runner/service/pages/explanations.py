@@ -4,24 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 from fastapi import APIRouter, Request, Response
-from fastapi import Path as InPath
 
 from runner.analysis.sections import Section
 from runner.analysis.step_reference import StepRef
 from runner.debugging.explanation import Explanation, plots, sections
-from runner.debugging.explanation_files import explanations_in, read_explanation
-from runner.errors import RunNotFound
 from runner.export.plots.curves import Plot
 from runner.export.reports.rendering import Link, View
+from runner.service.api.comparing import Part, found_explanation
 from runner.service.dependencies import SettingsOf
 from runner.service.pages.rendering import page
 
 router = APIRouter(prefix="/sweeps/explanations", include_in_schema=False)
-
-Part = Annotated[str, InPath(max_length=120)]
 
 
 @dataclass(frozen=True)
@@ -37,11 +33,7 @@ class _ExplanationView(View):
 @router.get("/{pair}/{metric}")
 def explanation(request: Request, pair: Part, metric: Part, settings: SettingsOf) -> Response:
     """Show an explanation."""
-    name = f"{pair}/{metric}"
-    folder = next((folder for folder in settings.recordings if name in explanations_in(folder)), None)
-    if folder is None:
-        raise RunNotFound(f"no explanation {name!r}: the page of sweeps lists those there are.")
-    found = read_explanation(name, folder)
+    found = found_explanation(pair, metric, settings)
     first, *others = sections(found)
     return page(request, _ExplanationView(first.title, first.sentences, _links(found), plots(found), others))
 

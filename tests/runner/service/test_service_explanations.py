@@ -29,6 +29,8 @@ def test_an_explanation_is_listed_and_shown(client, recordings: Path):
     links = [html.unescape(link) for link in re.findall(r'href="(/runs/[^"]+/replay[^"]+)"', shown.text)]
     assert {link.split("/")[2] for link in links} == {found.first_step.run_a, found.first_step.run_b}
     assert [client.get(link).status_code for link in links] == [200, 200]
+    assert client.get("/api/v1/explanations").json() == [found.name]
+    assert client.get(f"/api/v1/explanations/{found.name}").json()["smallest"]["settings"] == ["epsilon"]
 
 
 def test_a_missing_or_damaged_explanation_is_named(client, recordings: Path):
@@ -42,3 +44,5 @@ def test_a_missing_or_damaged_explanation_is_named(client, recordings: Path):
     assert damaged.status_code < 500
     assert "no longer describes an explanation" in damaged.text
     assert client.get("/sweeps").status_code == 200
+    assert client.get("/api/v1/explanations/pair/metric").status_code == 400
+    assert client.get("/api/v1/explanations/pair/other").status_code == 404
