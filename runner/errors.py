@@ -8,6 +8,7 @@ without a traceback and exits with `exit_code`.
     ├── EnvironmentNotUsable an environment is unknown, or has no transition table
     ├── CannotRedo           a loop's environment cannot be made again here, or not drawn
     ├── RecordingError       a recording is damaged, of another program, or of an unknown version
+    │   └── NotInRecording   a recording has no such episode, evaluation, trial or step
     ├── Diverged             a recording differs from what its job produces
     ├── RunNotFound          no run, or more than one, matches a name
     ├── StorageError         a file or folder cannot be written, or the disk is full
@@ -75,6 +76,10 @@ class CannotRedo(RunnerError):
 
 class RecordingError(RunnerError):
     """A recording cannot be read: it is damaged, of another program, or of an unknown version."""
+
+
+class NotInRecording(RecordingError):
+    """A recording has no such episode, evaluation, trial or step."""
 
 
 class Diverged(RunnerError):

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.errors import RecordingError
+from runner.errors import NotInRecording
 from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.metrics import METRICS, defined_metrics, finite_mean, is_usable
@@ -127,7 +127,7 @@ class Evaluation:
         """
         trials = self.stop - self.start
         if not 0 <= number < trials:
-            raise RecordingError(
+            raise NotInRecording(
                 f"{where}: found no trial {number:,} of the evaluation after {self.after:,} episodes; "
                 f"it has {trials:,}, from 0."
             )
@@ -174,7 +174,7 @@ def evaluation_after(evaluations: Sequence[Evaluation], episodes: int, where: st
     if found:
         nearest = min(found, key=lambda after: abs(after - episodes))
         known = f"it has {len(found):,}, the nearest after {nearest:,}."
-    raise RecordingError(f"{where}: found no evaluation after {episodes:,} episodes; {known}")
+    raise NotInRecording(f"{where}: found no evaluation after {episodes:,} episodes; {known}")
 
 
 def evaluation_records(recording: Recording) -> list[EvaluationRecord]:

@@ -22,7 +22,7 @@ from runner.debugging.action_outcomes import ActionOutcome, Outcome, WhatIf
 from runner.debugging.continuation import Continuation, Moment
 from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import actions_in_words, agent_of, joint_action, own_action, states_in_words
-from runner.errors import RecordingError
+from runner.errors import NotInRecording
 from runner.export.contents import ending_of, require_steps
 from runner.export.episodes import EpisodePlace, place_of
 from runner.export.reports.episode import episode_of
@@ -116,7 +116,7 @@ def branch_playback(
     found = branched(recording, at, action)
     shown = found.steps[first : first + limit]
     if not len(shown):
-        raise RecordingError(
+        raise NotInRecording(
             f"{recording.path}: this branch of {found.place.title} has {len(found.steps):,} steps, from 0; "
             f"found no step {first:,}."
         )
@@ -163,7 +163,7 @@ class _Branches:
         recording, phase, episode, t = self._recording, self._place.phase, self._place.number, self._at.t
         span = recording.episode_span(phase, episode)
         if t >= len(span):
-            raise RecordingError(
+            raise NotInRecording(
                 f"{recording.path}: {self._place.title} has {len(span):,} steps, from 0; found no step {t:,}."
             )
         self._returns, self._succeeded, done = np.zeros(len(recording.agents)), False, 0

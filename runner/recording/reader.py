@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.errors import RecordingError
+from runner.errors import NotInRecording, RecordingError
 from runner.recording import schema
 from runner.recording.actions import kept_dtype, unpacked
 from runner.recording.extras import ExtraLayout, Extras, read_layouts
@@ -221,7 +221,7 @@ class Recording(TopicReader):
                 # A vector of one environment may have only reset it at first.
                 start += int(np.count_nonzero(first["t"] == schema.RESET_ONLY))
         if not 0 <= start < stop <= total:
-            raise RecordingError(
+            raise NotInRecording(
                 f"{self.path}: has no {phase_name} episode {episode}; there are {ended}, from 0."
             )
         return range(start, stop, stride)

@@ -127,6 +127,6 @@ def test_without_a_picture_the_page_gives_the_reason_and_the_values(loops_client
 def test_an_episode_that_is_not_there_is_refused(loops_client, address, message):
     for path in (f"/api/v1/runs/{address}", f"/api/v1/runs/{address}/pictures"):
         answer = loops_client.get(path)
-        assert answer.status_code == 409, path
+        assert answer.status_code == 404, path
         assert message in answer.json()["error"]["message"]
     assert message in page(loops_client, f"/runs/{address}", 404)
