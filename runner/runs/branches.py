@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Final
 
+from runner.util.humanize import counted
 from runner.util.values import Json, flatten, is_whole
 
 PATHS: Final = ("config.origin.", "branches")
@@ -54,6 +55,8 @@ class TrainingOrigin:
     """Agent to the action that it took at this step, where that was set."""
     settings: Mapping[str, object]
     """The settings that changed from this step on, as the configuration has them."""
+    episodes: int | None = field(default=None, compare=False)
+    """Training episodes of the run, counted from the beginning; None if they are unknown."""
 
     def __str__(self) -> str:
         """Describe the branch: `at training step 4,000,000: taxi 1 north, epsilon 0.1`."""
@@ -64,7 +67,8 @@ class TrainingOrigin:
         """What was changed: `taxi 1 north, epsilon 0.1`."""
         changes = [f"{agent.replace('_', ' ')} {action}" for agent, action in self.actions.items()]
         changes += [f"{path} {value}" for path, value in flatten(self.settings).items()]
-        return ", ".join(changes) or "nothing changed"
+        total = "" if self.episodes is None else f", {counted(self.episodes, 'episode')} in all"
+        return ", ".join(changes) or f"nothing changed{total}"
 
 
 Origin = BranchOrigin | TrainingOrigin
@@ -80,7 +84,8 @@ def training_branches(config: Mapping[str, object]) -> list[TrainingOrigin]:
 def origin_in(config: Mapping[str, object]) -> Origin | None:
     """Return what the run with this configuration was branched from; None if it is no branch."""
     if branches := training_branches(config):
-        return branches[-1]
+        episodes = config.get("episodes")
+        return replace(branches[-1], episodes=episodes if is_whole(episodes, 0, _MAX_NUMBER) else None)
     settings = config.get("config")
     return parse_origin(settings.get("origin")) if isinstance(settings, Mapping) else None
 
@@ -109,7 +114,14 @@ def _parse_training(found: Mapping[str, object]) -> TrainingOrigin | None:
         return None
     if not (isinstance(actions, Mapping) and isinstance(settings, Mapping)):
         return None
-    return TrainingOrigin(run, step, {str(agent): str(action) for agent, action in actions.items()}, settings)
+    episodes = found.get("episodes")  # in an index, not in a configuration
+    return TrainingOrigin(
+        run,
+        step,
+        {str(agent): str(action) for agent, action in actions.items()},
+        settings,
+        episodes if is_whole(episodes, 0, _MAX_NUMBER) else None,
+    )
 
 
 @dataclass(frozen=True)

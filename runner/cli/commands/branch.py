@@ -25,7 +25,7 @@ from runner.cli.output import draw, facts, print_json, say, table
 from runner.cli.progress import steps_line
 from runner.cli.runs import command_for, compilation_notice, find_recorded, run_as_json, run_facts
 from runner.errors import ExitCode
-from runner.util.humanize import number
+from runner.util.humanize import counted, number
 
 if TYPE_CHECKING:
     from runner.analysis.step_reference import StepRef
@@ -182,6 +182,11 @@ def _print_training(ctx: click.Context, parent: Run, branch: TrainingBranch, as_
             rows["success"] = (
                 f"{number(success[1])} % in the last evaluation, {number(success[0])} % in the parent"
             )
+        more = run.file.config["episodes"] - parent.file.config["episodes"]
+        if more:
+            total = counted(run.file.config["episodes"], "episode")
+            compared = "more" if more > 0 else "fewer"
+            rows["trained"] = f"for {total} in all, {abs(more):,} {compared} than the parent"
         draw(facts(rows | {"next": command_for(parent, "diff", run.run_id)}))
     if run.status == "interrupted":
         say(f"Interrupted: what was recorded is kept; `{command_for(run, 'resume')}` trains the rest.")

@@ -377,3 +377,22 @@ def test_what_cannot_be_branched_leaves_no_run(parent, tmp_path, error, message,
     with pytest.raises(error, match=message):
         branch_training(parent, recordings=tmp_path, **options)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_branch_that_only_goes_on_says_for_how_long(parent, tmp_path):
+    branch = branch_training(
+        parent, at=parent.summary.train_steps, episodes=14, recordings=tmp_path, name="more"
+    )
+    assert str(branch.origin).endswith("nothing changed, 14 episodes in all")
+    (found,) = look([tmp_path], lambda index: index.branches(parent.run_id)).values()
+    assert str(found) == str(branch.origin)
+
+
+def test_the_summary_of_a_difference_names_the_branch_alone(parent, tmp_path):
+    own = branch_training(parent, at=middle_of(parent), overrides=["epsilon=0.9"], recordings=tmp_path).run
+    with open_recording(own.recording) as a, open_recording(parent.recording) as b:
+        found = diff(a, b)
+    assert "A is a branch of B" in summary(found)
+    assert "No setting" not in summary(found)
+    (change,) = found.config
+    assert change.a.startswith(f"{parent.run_id} at training step ")

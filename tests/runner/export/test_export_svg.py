@@ -127,3 +127,17 @@ def test_only_a_snapshot_near_half_of_the_episodes_is_called_the_middle(pictured
     for every, title in ((10, "in the middle: 20 episodes"), (15, "during learning: 15 episodes")):
         with open_recording(pictured("lake", snapshots={"every": every}).recording) as opened:
             assert [stage.title for stage in stages_of(opened)][1] == title
+
+
+def test_text_on_every_colour_of_values_can_be_read():
+    def luminance(colour):
+        linear = [
+            part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4
+            for part in (channel / 255 for channel in palette.rgb(colour))
+        ]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    for level in range(palette.LEVELS):
+        colour = palette.ramp_colour(level)
+        dark, light = sorted(luminance(each) for each in (colour, palette.ink_on(colour)))
+        assert (light + 0.05) / (dark + 0.05) >= 4.5
