@@ -59,6 +59,11 @@ def read_explanation(name: str, recordings: Path) -> Explanation:
         reason = str(error).splitlines()[0]
         raise RunnerError(f"{path}: no longer describes an explanation ({reason}).") from error
     numbers = [explanation.difference.value, *(value for one in explanation.mixtures for value in one.values)]
+    numbers += [each.share.value for each in explanation.settings if each.share is not None]
     if not explanation.mixtures or not all(map(math.isfinite, numbers)):
         raise RunnerError(f"{path}: no longer describes an explanation (a value is not finite).")
+    known_settings = {each.name for each in explanation.settings}
+    named = (*explanation.mixtures, *explanation.interactions)
+    if not all(known_settings.issuperset(each.settings) for each in named):
+        raise RunnerError(f"{path}: no longer describes an explanation (a setting is missing).")
     return explanation

@@ -217,9 +217,11 @@ def test_a_damaged_result_is_named(tmp_path):
     found = explained(LAKE, LAKE | PLANTED, tmp_path, seeds=1)
     assert found.difference.value == 100.0
     path = tmp_path / ".explain" / f"{found.name}.json"
-    path.write_text(json.dumps({"name": 3}))
-    with pytest.raises(RunnerError, match="no longer describes an explanation"):
-        read_explanation(found.name, tmp_path)
+    whole = found.as_json()
+    for damaged in ({"name": 3}, whole | {"settings": []}):
+        path.write_text(json.dumps(damaged))
+        with pytest.raises(RunnerError, match="no longer describes an explanation"):
+            read_explanation(found.name, tmp_path)
     with pytest.raises(RunnerError, match="no explanation 'other'"):
         read_explanation("other", tmp_path)
 
