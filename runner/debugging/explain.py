@@ -49,6 +49,7 @@ from runner.sweep.pool import worker_pool
 
 Source = str | os.PathLike[str] | Mapping[str, Any] | ExperimentConfig | Run
 DEFAULT_SEEDS: Final = 20
+MAX_SEEDS: Final = 10_000
 _START_SECONDS: Final = 10.0
 """About the time to start workers, load kernels in them, and record the two short runs of the first step."""
 _PROBES: Final = 2
@@ -186,8 +187,8 @@ class _Question:
 def _question(
     a: Source, b: Source, metric: str | None, at: int | None, seeds: int, folder: Path
 ) -> _Question:
-    if seeds < 1:
-        raise RunnerError(f"--seeds: found {seeds}, expected 1 or more.")
+    if not 1 <= seeds <= MAX_SEEDS:
+        raise RunnerError(f"--seeds: found {seeds}, expected 1 to {MAX_SEEDS:,}.")
     (side_a, config_a, first), (side_b, config_b, other) = (_resolved(source, folder) for source in (a, b))
     mixing = mix(config_a, config_b, at, exact=(metric or "").startswith("exact."))
     notes = list(mixing.notes)

@@ -258,7 +258,7 @@ def _mixtures_section(explanation: Explanation) -> Section:
 
 
 def _percent(part: float) -> str:
-    return f"{round(100 * part) or 0} %"
+    return f"{round(100 * part) or 0} %" if math.isfinite(part) else ""
 
 
 def number(value: float, sign: bool = False) -> str:

@@ -19,6 +19,8 @@ from runner.util.files import open_regular, replacing, storage_errors
 FOLDER: Final = ".explain"
 MAX_BYTES: Final = 32 << 20
 """The largest file of a result that is read."""
+MAX_VALUE: Final = 1e15
+"""What no metric exceeds."""
 
 
 def write_explanation(explanation: Explanation, recordings: Path) -> None:
@@ -60,10 +62,14 @@ def read_explanation(name: str, recordings: Path) -> Explanation:
         raise RunnerError(f"{path}: no longer describes an explanation ({reason}).") from error
     numbers = [explanation.difference.value, *(value for one in explanation.mixtures for value in one.values)]
     numbers += [each.share.value for each in explanation.settings if each.share is not None]
-    if not explanation.mixtures or not all(map(math.isfinite, numbers)):
+    numbers.append(explanation.seconds)
+    if not all(one.values for one in explanation.mixtures) or not explanation.mixtures:
+        raise RunnerError(f"{path}: no longer describes an explanation (a mixture has no values).")
+    if not all(math.isfinite(value) and abs(value) < MAX_VALUE for value in numbers):
         raise RunnerError(f"{path}: no longer describes an explanation (a value is not finite).")
     known_settings = {each.name for each in explanation.settings}
-    named = (*explanation.mixtures, *explanation.interactions)
-    if not all(known_settings.issuperset(each.settings) for each in named):
+    named = [each.settings for each in explanation.mixtures]
+    named += [each.settings for each in explanation.interactions]
+    if not all(known_settings.issuperset(names) for names in named):
         raise RunnerError(f"{path}: no longer describes an explanation (a setting is missing).")
     return explanation

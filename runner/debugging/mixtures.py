@@ -236,7 +236,7 @@ class Mixtures:
         """
         waiting = deque(self._tasks(mixtures, self._seeds[:seeds]))
         left = sum(len(task.seeds) for task in waiting)
-        busy, died = 0, set[int]()
+        busy, died = 0, list[Measurement]()
         while waiting or busy:
             while waiting and workers.idle:
                 workers.submit(waiting.popleft())
@@ -244,8 +244,8 @@ class Mixtures:
             self._report(self.trained, self.trained + left)
             for task, result in workers.collect(_WAIT_SECONDS):
                 busy -= 1
-                if result is None and id(task) not in died:
-                    died.add(id(task))
+                if result is None and task not in died:
+                    died.append(task)
                     waiting.append(task)
                     continue
                 if result is None or result.error:

@@ -32,6 +32,8 @@ from runner.util.values import Json
 
 MAX_INTERVALS: Final = 10_000
 """The most intervals of a result; further ones are counted."""
+MAX_VALUES: Final = 60_000
+"""The most parts of the expression, each with its values, at the ends of all intervals."""
 
 Scalar = float | int | bool | str | None
 
@@ -86,7 +88,7 @@ class When:
     held_before: bool | None
     """Whether it held before the first of them; None if it depends on a step before the first one."""
     intervals: tuple[Interval, ...]
-    """At most 10,000; the first one only unless `every`."""
+    """At most 10,000, fewer if the expression has many parts; the first one only unless `every`."""
     count: int
     """The number of all intervals that were found."""
     steps: int | None
@@ -204,6 +206,7 @@ def _search(
     moments: list[Moment] = []
     count = steps = 0
     holds, expected = False, start
+    limit = 2 * min(MAX_INTERVALS, MAX_VALUES // (2 * max(1, len(expression.terms))))
     for block in recording.blocks(schema.TRAIN_STEP, start, stop):
         first = int(block["step"][0])
         check_lost(recording, expected, first)
@@ -218,7 +221,7 @@ def _search(
             numbers, begins = block["step"][places[changed]], held[1:][changed]
             count += int(np.count_nonzero(begins))
             steps += int(numbers[~begins].sum()) - int(numbers[begins].sum())
-            listed = changed[: 2 * MAX_INTERVALS - len(moments) if every else 1].tolist()
+            listed = changed[: limit - len(moments) if every else 1].tolist()
             if listed:
                 parts = [(term, _values(term, values)) for term in expression.terms]
                 moments += [_moment(block[places[k]], parts, k, k + 1) for k in listed]

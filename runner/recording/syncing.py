@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import multiprocessing.util
 import os
 import threading
 import time
@@ -38,7 +39,7 @@ class Syncer:
         self._waiting: deque[tuple[Path, Failed]] = deque()
         self._lock, self._syncing = threading.Lock(), threading.Lock()
         self._thread: threading.Thread | None = None
-        self._is_exiting = False
+        self._is_exiting = self._ends_with_process = False
 
     def add(self, path: Path, failed: Failed) -> None:
         """Sync a finished file within seconds; at once if the interpreter ends."""
@@ -47,6 +48,10 @@ class Syncer:
             if self._thread is None and not self._is_exiting:
                 self._thread = threading.Thread(target=self._serve, name="recording-sync", daemon=True)
                 self._thread.start()
+            if not self._ends_with_process and multiprocessing.parent_process() is not None:
+                # a child of multiprocessing ends without `atexit`
+                multiprocessing.util.Finalize(None, self.exit, exitpriority=0)
+                self._ends_with_process = True
         if self._is_exiting:
             self.sync()
 
@@ -89,7 +94,8 @@ class Syncer:
             except FileNotFoundError:
                 continue  # it was removed since
             except OSError as error:
-                failed(error)
+                with contextlib.suppress(Exception):  # the other files are synced, whatever comes of this one
+                    failed(error)
 
 
 SYNCER: Final = Syncer()

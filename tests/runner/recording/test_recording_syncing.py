@@ -63,7 +63,7 @@ def test_the_interpreter_ends_when_all_is_on_disk(tmp_path: Path) -> None:
         tmp_path,
         """
         syncing.GROUP_SECONDS = 3600
-        syncing.sync = lambda path: print(path.parent.name, flush=True)
+        syncing.sync = lambda path: os.write(1, f"{path.parent.name}\\n".encode())
         closed = [record() for _ in range(20)]
         for env in closed:
             env.close()
@@ -73,6 +73,22 @@ def test_the_interpreter_ends_when_all_is_on_disk(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert sorted(done.stdout.split()) == sorted(path.name for path in tmp_path.iterdir() if path.is_dir())
     assert len(done.stdout.split()) == 21
+
+
+def test_a_forked_worker_ends_when_its_loops_are_on_disk(tmp_path: Path) -> None:
+    done = script(
+        tmp_path,
+        """
+        import multiprocessing
+        syncing.GROUP_SECONDS = 3600
+        syncing.sync = lambda path: os.write(1, f"{path.parent.name}\\n".encode())
+        worker = multiprocessing.get_context("fork").Process(target=lambda: record().close())
+        worker.start()
+        worker.join()
+        """,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == [path.name for path in tmp_path.iterdir() if path.is_dir()]
 
 
 def test_a_recording_that_does_not_reach_the_disk_is_failed(
