@@ -156,7 +156,7 @@ def test_the_difference_of_parent_and_branch_is_the_branch(runs, tmp_path):
             name = ("left", "down", "right", "up")[action]
             assert found.cause.text == f"{which}, at 1:{t}, action {action} ({name}), then recorded"
             lead = summary(found)
-            assert lead.startswith("The content differs. No setting that determines the content differs.")
+            assert lead.startswith(f"The content differs. {which}, at 1:{t}, action {action}")
             assert found.cause.text in lead
         same = runner.branch(run, at=f"1:{t}", recordings=tmp_path)
         with open_recording(same.run.recording) as c:
