@@ -25,6 +25,7 @@ def test_the_public_names():
         "__version__",
         "branch",
         "evaluate",
+        "explain",
         "find_run",
         "frames",
         "integrations",
@@ -43,6 +44,8 @@ def test_the_public_names():
         "run_all",
         "verify",
         "what_if",
+        "when",
+        "why",
     ]
     for name in runner.__all__:
         assert getattr(runner, name) is not None

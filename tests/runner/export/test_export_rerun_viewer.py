@@ -19,7 +19,8 @@ from click.testing import CliRunner
 from rerun.chunk import RrdReader
 
 from runner.analysis.step_reference import StepRef
-from runner.cli import cli, progress
+from runner.cli import cli
+from runner.cli.commands import view
 from runner.errors import RunnerError, StorageError
 from runner.export.rerun import live as live_view
 from runner.export.rerun import viewer, writing
@@ -124,7 +125,7 @@ def test_the_stages_of_view_are_shown_on_a_terminal(pictured, monkeypatch, names
         shown.append(stage)
         yield shown.append
 
-    monkeypatch.setattr(progress, "stage_line", stage_line)
+    monkeypatch.setattr(view, "stage_line", stage_line)
     monkeypatch.setattr(viewer, "screenshot", lambda *_: None)
     runs = [str(pictured(world).folder) for world in ("taxis", "rivals")[:names]]
     done = CliRunner().invoke(cli, ["view", *runs, "--screenshot", "step.png", "--force"])

@@ -55,6 +55,7 @@ def test_the_official_reader_reads_every_message(whole):
     with open_recording(path) as recording:
         assert recording.kind == KINDS[name]
         assert counts.pop("/clock") >= 2  # where it began, and where it ended
+        counts.pop("/host", None)  # of a loop that takes over a second
         assert dict(counts) == recording.result["messages"]
         one = next(recording.transitions("train"))
     assert first.step == 0

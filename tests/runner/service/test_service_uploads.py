@@ -161,7 +161,7 @@ def altered(data: bytes) -> bytes:
         lambda data: b"",
         lambda data: b"PK\x03\x04" + bytes(10_000),
         lambda data: data[:8] + bytes(5_000),
-        lambda data: data.replace(b"mcap", b"mcaq"),
+        lambda data: data.replace(b"/train/step", b"/train/stop"),
     ],
     ids=["altered", "empty", "a zip", "a magic and nothing", "other names"],
 )
