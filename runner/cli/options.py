@@ -1,217 +1,36 @@
-"""The types of arguments and options, how they complete, and those that several commands share."""
+"""The arguments and options that several commands share."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
-from click.shell_completion import CompletionItem
 
-from runner.errors import RunnerError
-from runner.util.values import Json
+from runner.cli.parameter_types import (
+    AXIS,
+    COUNT,
+    DIRECTORY,
+    FILTER_WORD,
+    INDEX,
+    NUMBERS,
+    RANGES,
+    SETTING,
+    TARGET,
+    TRIAL,
+    ConfigName,
+    RunName,
+)
 
 if TYPE_CHECKING:
-    from runner.analysis.axes import Axis
-    from runner.analysis.step_reference import StepRef
+    pass
 
 EXPORTS: Final = Path("exports")
 """Where commands write files by default; Git ignores it in a clone."""
 
 Decorator = Callable[[Callable[..., Any]], Any]
-Ranges = tuple[tuple[int, int | None], ...]
-"""Ranges of episodes: the first, and the one after the last or None."""
-
-# --- types ------------------------------------------------------------------------------------------------
-
-
-class Completed(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
-    """Text that completes to the names which a function returns, each with an explanation."""
-
-    def __init__(self, name: str, complete: Callable[[click.Context, str], Mapping[str, str]]) -> None:
-        self.name, self.complete = name, complete
-
-    def shell_complete(
-        self,
-        ctx: click.Context,
-        param: click.Parameter,  # noqa: ARG002
-        incomplete: str,
-    ) -> list[CompletionItem]:
-        """Return the names that begin with the incomplete word."""
-        names = self.complete(ctx, incomplete)
-        return [
-            CompletionItem(name, help=text) for name, text in names.items() if name.startswith(incomplete)
-        ]
-
-
-class Parsed(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
-    """Text that a function parses; the function raises ValueError or RunnerError."""
-
-    def __init__(self, name: str, expected: str, parse: Callable[[str], Any]) -> None:
-        self.name, self.expected, self.parse = name, expected, parse
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the parsed value."""
-        try:
-            return self.parse(value) if isinstance(value, str) else value
-        except ValueError:
-            self.fail(f"found {value!r}, expected {self.expected}", param, ctx)
-        except RunnerError as error:
-            self.fail(str(error), param, ctx)
-
-
-class RunName(Completed):
-    """The name of a run; completes ids and names, and paths after a slash."""
-
-    def __init__(self) -> None:
-        super().__init__("run", _runs)
-
-    def shell_complete(
-        self, ctx: click.Context, param: click.Parameter, incomplete: str
-    ) -> list[CompletionItem]:
-        """Return ids and names, newest first."""
-        if "/" in incomplete or "\\" in incomplete:
-            return [CompletionItem(incomplete, type="file")]
-        return super().shell_complete(ctx, param, incomplete)
-
-
-def _runs(ctx: click.Context, incomplete: str) -> Mapping[str, str]:
-    from runner.runs.resolve import completions
-    from runner.runs.run import recordings_folder
-
-    try:
-        return completions(incomplete, recordings_folder(ctx.params.get("recordings")))
-    except RunnerError:
-        return {}
-
-
-class ConfigName(click.Path):
-    """A file, or the name of a shipped `experiment` or `sweep`; completes both."""
-
-    def __init__(self, kind: str = "experiment") -> None:
-        super().__init__(path_type=Path)
-        self.kind = kind
-
-    def shell_complete(
-        self, ctx: click.Context, param: click.Parameter, incomplete: str
-    ) -> list[CompletionItem]:
-        """Return the shipped names, and have the shell add files."""
-        from runner.config.shipped import shipped
-
-        names = {each.name for each in shipped().values() if each.kind == self.kind}
-        own = [item for item in SHIPPED.shell_complete(ctx, param, incomplete) if item.value in names]
-        return [*own, *super().shell_complete(ctx, param, incomplete)]
-
-
-def _shipped(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
-    from runner.config.shipped import shipped
-
-    return {each.name: each.about for each in shipped().values()}
-
-
-def _filter_words(_ctx: click.Context, incomplete: str) -> Mapping[str, str]:
-    from runner.runs.catalogue.columns import FIELDS, SETTING, STATUSES
-
-    if incomplete.startswith("status:"):
-        return {f"status:{status}": "" for status in STATUSES}
-    words = {f"{name}:": field.meaning for name, field in FIELDS.items()}
-    return words | {SETTING: "a value of the configuration, such as config.discount"}
-
-
-def _settings(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
-    from runner.config import json_schema
-
-    return {f"{key}=": text for key, text in _keys(json_schema()).items()}
-
-
-def _keys(schema: Json, part: Json | None = None, prefix: str = "") -> dict[str, str]:
-    """Return the paths of a schema's values, sections included, and what each means."""
-    keys = {}
-    for name, value in (schema if part is None else part).get("properties", {}).items():
-        path = f"{prefix}{name}"
-        keys[path] = str(value.get("description", ""))
-        for kind in (value, *value.get("anyOf", ())):
-            if reference := kind.get("$ref"):
-                section = schema["$defs"][reference.rpartition("/")[2]]
-                keys |= _keys(schema, section, f"{path}.")
-    return keys
-
-
-def _number(text: str) -> int:
-    """Return a number from 0; `int` would accept signs, blanks and underscores."""
-    if not text.strip().isdecimal():
-        raise ValueError(text)
-    return int(text)
-
-
-def _trial(text: str) -> tuple[int, int]:
-    after, colon, trial = text.partition(":")
-    return _number(after), _number(trial) if colon else 0
-
-
-def _ranges(text: str) -> Ranges:
-    ranges = []
-    for part in text.split(","):
-        start, colon, stop = part.strip().partition(":")
-        first = 0 if colon and not start else _number(start)
-        end = first + 1 if not colon else _number(stop) if stop else None
-        ranges.append((first, end))
-    return tuple(ranges)
-
-
-def _pair(text: str, limit: int) -> tuple[int, int]:
-    first, _, second = text.partition("x")
-    if not 1 <= _number(first) <= limit >= _number(second) >= 1:
-        raise ValueError(text)
-    return _number(first), _number(second)
-
-
-def _step(text: str) -> StepRef:
-    from runner.analysis.step_reference import StepRef
-
-    return StepRef.parse(text)
-
-
-def _place(text: str) -> int | StepRef:
-    from runner.analysis.step_reference import parse_step
-
-    return parse_step(text)
-
-
-def _target(text: str) -> tuple[str, float]:
-    from runner.analysis.series import parse_target  # loads NumPy
-
-    return parse_target(text)
-
-
-def _axis(text: str) -> Axis:
-    from runner.analysis.axes import axis_of  # loads NumPy
-
-    return axis_of(text)
-
-
-SHIPPED: Final = Completed("name", _shipped)
-SETTING: Final = Completed("setting", _settings)
-FILTER_WORD: Final = Completed("filter", _filter_words)
-TRIAL: Final = Parsed("N:TRIAL", "N:TRIAL, such as 3000:0", _trial)
-RANGES: Final = Parsed("ranges", "START:STOP or N, such as 0:20,49980:50000", _ranges)
-NUMBERS: Final = Parsed(
-    "numbers", "numbers such as 1000,49000", lambda text: tuple(map(_number, text.split(",")))
-)
-PICTURE_SIZE: Final = Parsed(
-    "WxH", "WIDTHxHEIGHT up to 8192x8192, such as 1600x900", lambda text: "{}x{}".format(*_pair(text, 8192))
-)
-GRID: Final = Parsed("RxC", "ROWSxCOLUMNS up to 8x8, such as 3x3", lambda text: _pair(text, 8))
-TARGET: Final = Parsed("METRIC=LEVEL", "METRIC=LEVEL such as success_percent=80", _target)
-AXIS: Final = Parsed("axis", "episodes, steps, updates or time", _axis)
-STEP: Final = Parsed("step", "EPISODE:T, or eval:N:TRIAL:T", _step)
-PLACE: Final = Parsed("step", "EPISODE:T, the number of a training step, or eval:N:TRIAL:T", _place)
-DIRECTORY: Final = click.Path(file_okay=False, path_type=Path)
-FILE: Final = click.Path(dir_okay=False, path_type=Path)
-COUNT: Final = click.IntRange(1)
-INDEX: Final = click.IntRange(0)
 
 # --- arguments --------------------------------------------------------------------------------------------
 

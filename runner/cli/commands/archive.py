@@ -9,8 +9,9 @@ import click
 
 from runner.archive.places import default_target
 from runner.cli import Command
-from runner.cli.options import RunName, json_option, recordings_option, runs_argument
+from runner.cli.options import json_option, recordings_option, runs_argument
 from runner.cli.output import draw, facts, print_json, say
+from runner.cli.parameter_types import RunName
 from runner.cli.progress import stage_line, steps_line
 from runner.cli.runs import compilation_notice, find, print_received, run_as_json, run_facts
 from runner.errors import RunnerError

@@ -11,17 +11,9 @@ import click
 from click.core import ParameterSource
 
 from runner.cli import Command
-from runner.cli.options import (
-    COUNT,
-    INDEX,
-    PLACE,
-    json_option,
-    recordings_option,
-    run_argument,
-    set_option,
-    trust_option,
-)
+from runner.cli.options import json_option, recordings_option, run_argument, set_option, trust_option
 from runner.cli.output import draw, facts, print_json, say, table
+from runner.cli.parameter_types import COUNT, INDEX, PLACE
 from runner.cli.progress import steps_line
 from runner.cli.runs import command_for, compilation_notice, find_recorded, run_as_json, run_facts
 from runner.errors import ExitCode

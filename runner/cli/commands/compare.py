@@ -10,8 +10,6 @@ import click
 
 from runner.cli import Command
 from runner.cli.options import (
-    INDEX,
-    RunName,
     all_option,
     axis_option,
     force_option,
@@ -24,6 +22,7 @@ from runner.cli.options import (
     target_option,
 )
 from runner.cli.output import print_json, print_sections, require_one_form, require_page, say
+from runner.cli.parameter_types import INDEX, RunName
 from runner.cli.progress import stage_line
 from runner.cli.runs import find_all_recorded, find_recorded
 from runner.errors import ExitCode

@@ -11,15 +11,9 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli import Command
-from runner.cli.options import (
-    COUNT,
-    json_option,
-    markdown_option,
-    ray_option,
-    recordings_option,
-    workers_option,
-)
+from runner.cli.options import json_option, markdown_option, ray_option, recordings_option, workers_option
 from runner.cli.output import draw, facts, print_json, print_sections, require_one_form, say
+from runner.cli.parameter_types import COUNT
 from runner.cli.progress import total_line
 from runner.util.humanize import counted, duration
 

@@ -10,14 +10,9 @@ import click
 
 from runner.cli import Group
 from runner.cli.commands import export_film, export_tables, export_tools
-from runner.cli.options import (
-    EXPORTS,
-    Ranges,
-    run_argument,
-    selection_options,
-    writing_options,
-)
+from runner.cli.options import EXPORTS, run_argument, selection_options, writing_options
 from runner.cli.output import print_written, say
+from runner.cli.parameter_types import Ranges
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_recorded
 from runner.export.places import require_new

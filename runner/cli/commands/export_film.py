@@ -10,7 +10,6 @@ import click
 from runner.cli import Command
 from runner.cli.options import (
     EXPORTS,
-    GRID,
     best_option,
     episode_option,
     require_one_choice,
@@ -21,6 +20,7 @@ from runner.cli.options import (
     writing_options,
 )
 from runner.cli.output import print_written, say
+from runner.cli.parameter_types import GRID
 from runner.cli.progress import count_line
 from runner.cli.runs import opened_run
 from runner.errors import ExitCode

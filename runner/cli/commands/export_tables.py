@@ -7,14 +7,9 @@ from pathlib import Path
 import click
 
 from runner.cli import Command
-from runner.cli.options import (
-    EXPORTS,
-    Ranges,
-    episodes_option,
-    run_argument,
-    writing_options,
-)
+from runner.cli.options import EXPORTS, episodes_option, run_argument, writing_options
 from runner.cli.output import print_written, say
+from runner.cli.parameter_types import Ranges
 from runner.cli.progress import count_line
 from runner.cli.runs import opened_run
 from runner.export.places import new_folder

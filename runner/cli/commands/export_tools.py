@@ -9,7 +9,6 @@ import click
 from runner.cli import Command
 from runner.cli.options import (
     EXPORTS,
-    Ranges,
     episodes_option,
     force_option,
     json_option,
@@ -18,6 +17,7 @@ from runner.cli.options import (
     writing_options,
 )
 from runner.cli.output import print_written, say
+from runner.cli.parameter_types import Ranges
 from runner.cli.progress import count_line, stage_line
 from runner.cli.runs import opened_run
 from runner.export.places import new_folder

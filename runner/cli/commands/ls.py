@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import click
 
 from runner.cli import Command
-from runner.cli.options import INDEX, filter_argument, folders_option, json_option, limit_option
+from runner.cli.options import filter_argument, folders_option, json_option, limit_option
 from runner.cli.output import aligned, console, draw, json_list, printable, say, table
+from runner.cli.parameter_types import INDEX
 from runner.runs.catalogue.columns import (
     DEFAULT_JSON,
     FIELDS,

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli import Group, error_as_json, exit_code_of
-from runner.cli.options import ConfigName, RunName, json_option, limit_option, recordings_option
+from runner.cli.options import json_option, limit_option, recordings_option
 from runner.cli.output import draw, facts, print_json, say, table
+from runner.cli.parameter_types import ConfigName, RunName
 from runner.cli.progress import bytes_line
 from runner.cli.runs import find_recorded, print_received
 from runner.errors import ExitCode, RunnerError

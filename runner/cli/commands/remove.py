@@ -13,15 +13,9 @@ import click
 
 from runner.archive.places import archive_place
 from runner.cli import Command
-from runner.cli.options import (
-    INDEX,
-    filter_argument,
-    folders_option,
-    json_option,
-    recordings_option,
-    runs_argument,
-)
+from runner.cli.options import filter_argument, folders_option, json_option, recordings_option, runs_argument
 from runner.cli.output import aligned, console, draw, print_json, printable, say, table
+from runner.cli.parameter_types import INDEX
 from runner.cli.runs import find
 from runner.errors import RunnerError
 from runner.runs.catalogue.columns import STATUSES

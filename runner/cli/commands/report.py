@@ -8,16 +8,9 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli import Command
-from runner.cli.options import (
-    EXPORTS,
-    INDEX,
-    TRIAL,
-    axis_option,
-    normalise_option,
-    runs_argument,
-    writing_options,
-)
+from runner.cli.options import EXPORTS, axis_option, normalise_option, runs_argument, writing_options
 from runner.cli.output import print_written, say
+from runner.cli.parameter_types import INDEX, TRIAL
 from runner.cli.progress import count_line, stage_line
 from runner.cli.runs import find_all_recorded
 from runner.export.places import write_new, write_text_new

@@ -9,8 +9,6 @@ import click
 
 from runner.cli import Command
 from runner.cli.options import (
-    COUNT,
-    INDEX,
     accept_changes_option,
     checkpoint_option,
     json_option,
@@ -20,6 +18,7 @@ from runner.cli.options import (
     trust_option,
 )
 from runner.cli.output import console, draw, facts, print_json, say
+from runner.cli.parameter_types import COUNT, INDEX
 from runner.cli.progress import count_line
 from runner.cli.runs import (
     command_for,

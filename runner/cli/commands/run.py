@@ -12,16 +12,9 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from runner.cli import Command
-from runner.cli.options import (
-    COUNT,
-    INDEX,
-    config_argument,
-    json_option,
-    recordings_option,
-    set_option,
-    workers_option,
-)
+from runner.cli.options import config_argument, json_option, recordings_option, set_option, workers_option
 from runner.cli.output import console, draw, facts, print_json, say
+from runner.cli.parameter_types import COUNT, INDEX
 from runner.cli.progress import count_line, progress_line
 from runner.cli.runs import command_for, compilation_notice, run_as_json, run_facts
 from runner.errors import ExitCode

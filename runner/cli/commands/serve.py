@@ -8,8 +8,9 @@ from pathlib import Path
 import click
 
 from runner.cli import Command
-from runner.cli.options import FILE, folders_option, workers_option
+from runner.cli.options import folders_option, workers_option
 from runner.cli.output import say
+from runner.cli.parameter_types import FILE
 from runner.service.settings import Settings
 from runner.util.extras import require
 from runner.util.files import storage_errors

@@ -7,8 +7,9 @@ from pathlib import Path
 import click
 
 from runner.cli import Command, Group
-from runner.cli.options import DIRECTORY, SHIPPED, config_argument, json_option, output_option, set_option
+from runner.cli.options import config_argument, json_option, output_option, set_option
 from runner.cli.output import draw, print_json, print_written, say, table
+from runner.cli.parameter_types import DIRECTORY, SHIPPED
 
 
 @click.command("init", cls=Command)

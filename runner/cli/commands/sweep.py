@@ -14,7 +14,6 @@ import click
 
 from runner.cli import Group
 from runner.cli.options import (
-    ConfigName,
     accept_changes_option,
     all_option,
     force_option,
@@ -25,6 +24,7 @@ from runner.cli.options import (
     workers_option,
 )
 from runner.cli.output import draw, facts, print_json, print_sections, require_one_form, say
+from runner.cli.parameter_types import ConfigName
 from runner.cli.progress import stage_line
 from runner.errors import ExitCode, RunnerError
 from runner.export.places import require_new, write_text_new

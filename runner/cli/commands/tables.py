@@ -11,16 +11,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from runner.cli import Command
-from runner.cli.options import (
-    FILE,
-    INDEX,
-    force_option,
-    json_option,
-    recordings_option,
-    run_argument,
-    set_option,
-)
+from runner.cli.options import force_option, json_option, recordings_option, run_argument, set_option
 from runner.cli.output import draw, facts, files_written, print_json, say, table, title
+from runner.cli.parameter_types import FILE, INDEX
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_recorded
 from runner.export.places import require_new, write_new

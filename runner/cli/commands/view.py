@@ -11,8 +11,9 @@ import click
 
 from runner.cli import Command
 from runner.cli.commands.export import print_selection
-from runner.cli.options import PICTURE_SIZE, STEP, RunName, force_option, recordings_option, selection_options
+from runner.cli.options import force_option, recordings_option, selection_options
 from runner.cli.output import say
+from runner.cli.parameter_types import PICTURE_SIZE, STEP, RunName
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_recorded
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli import Command
-from runner.cli.options import STEP, json_option, limit_option, recordings_option, run_argument
+from runner.cli.options import json_option, limit_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, print_sections
+from runner.cli.parameter_types import STEP
 from runner.cli.progress import steps_line
 from runner.cli.runs import command_for, compilation_notice, find_recorded
 

@@ -19,7 +19,7 @@ from click.testing import CliRunner
 import runner
 from runner.cli import cli
 from runner.cli.commands import remote
-from runner.cli.options import RunName
+from runner.cli.parameter_types import RunName
 from runner.client.jobs import RemoteJob
 from runner.errors import ExitCode
 
