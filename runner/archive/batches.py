@@ -26,14 +26,7 @@ _BYTES_AT_ONCE: Final = 4 << 20
 
 
 class Batches:
-    """The messages of a recording as Arrow columns; counts and hashes the messages that it yielded.
-
-    Args:
-        recording: the recording.
-
-    Raises:
-        RecordingError: its parts contradict each other.
-    """
+    """The messages of a recording as Arrow columns; counts and hashes the messages that it yielded."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -59,11 +52,7 @@ class Batches:
         return self._counts["/train/step"] + self._counts["/eval/step"]
 
     def of(self, table: Table) -> Iterator[pa.RecordBatch]:
-        """Yield the rows of a table in the order in which they were recorded.
-
-        Raises:
-            RecordingError: a message is damaged, or has what no recorder writes.
-        """
+        """Yield the rows of a table in the order in which they were recorded."""
         if table.topics[0] in self.shape.sizes:
             yield from (batch for _, _, batch in self.blocks(table))
             return
@@ -97,11 +86,7 @@ class Batches:
             yield position, payload
 
     def compare(self, topic: Topic, position: int, restored: bytes, payload: bytes) -> None:
-        """Compare a payload with the one restored from its columns.
-
-        Raises:
-            RecordingError: they differ.
-        """
+        """Compare a payload with the one restored from its columns."""
         if restored != payload:
             raise self._unarchivable(topic, f"after {position} steps")
 

@@ -260,14 +260,7 @@ def shape_of(
 ) -> Shape:
     """Return the shape of a run.
 
-    Args:
-        run: the recording's metadata record `run`.
-        mdp: its environment, if that is tabular.
-        where: the archive or recording, for errors.
-        extras: the names of its extras, from when on.
-
-    Raises:
-        RecordingError: they contradict each other.
+    `extras`: the names of its extras, from when on.
     """
     try:
         learners = json.loads(run["agents"])
@@ -329,11 +322,7 @@ def records_of(topic: Topic, batch: pa.RecordBatch, shape: Shape) -> Records:
 
 
 def checked_batch(topic: Topic, records: Records, shape: Shape, where: str) -> pa.RecordBatch:
-    """Return the columns of message records, which turn back into exactly these records.
-
-    Raises:
-        RecordingError: they do not: the records have what no recorder writes.
-    """
+    """Return the columns of message records, which turn back into exactly these records."""
     batch = batch_of(topic, records, shape)
     restored = records_of(topic, batch, shape)
     if topic.message is schema.EXTRA:
@@ -374,11 +363,7 @@ def record_bytes(records: Records) -> memoryview:
 
 
 def of_phase(batch: pa.RecordBatch, phase: str, where: str) -> pa.RecordBatch:
-    """Return the rows of one phase.
-
-    Raises:
-        RecordingError: there is a phase other than training and evaluation.
-    """
+    """Return the rows of one phase."""
     column = batch.column("phase")
     names = column.dictionary.to_pylist()
     codes = numbers(column.indices)

@@ -69,11 +69,7 @@ def _json(values: Mapping[str, object]) -> bytes:
 
 
 def read_manifest(data: bytes, where: str) -> Manifest:
-    """Return the manifest in a file's bytes.
-
-    Raises:
-        RecordingError: they are not a manifest of a dualtaxi archive.
-    """
+    """Return the manifest in a file's bytes."""
     try:
         values = json.loads(data[:MAX_MANIFEST_BYTES])
         if values["format"] != FORMAT:

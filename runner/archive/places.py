@@ -38,14 +38,7 @@ def default_target(recordings: Path) -> str:
 def at_hand(run: Run, log: Callable[[str], None] = lambda _: None, report: Report = lambda _: None) -> Run:
     """Return the run with a recording that can be read: an archived one is restored into the user's cache.
 
-    Args:
-        run: any run.
-        log: called with a line if it must be restored, which takes seconds.
-        report: called with the steps restored so far.
-
-    Raises:
-        RecordingError: the archive is damaged, missing, or of another run.
-        StorageError: the cache cannot be written, or another process has been restoring it for too long.
+    `log`: called with a line if it must be restored, which takes seconds.
     """
     if run.status != "archived" or run.restored:
         return run
@@ -80,12 +73,7 @@ def at_hand(run: Run, log: Callable[[str], None] = lambda _: None, report: Repor
 
 @contextlib.contextmanager
 def archive_of(run: Run) -> Iterator[Path]:
-    """Yield a local folder with the archive of a run.
-
-    Raises:
-        RecordingError: it is at none of its places.
-        StorageError: its place cannot be read.
-    """
+    """Yield a local folder with the archive of a run."""
     from runner.archive.store import Store, split_place
 
     place = archive_place(run)
@@ -99,12 +87,7 @@ def archive_of(run: Run) -> Iterator[Path]:
 
 
 def archive_place(run: Run) -> str | None:
-    """Return the place of a run's archive; None if it is at none of its places.
-
-    Raises:
-        RecordingError: something else than an archive is there.
-        StorageError: its place cannot be read.
-    """
+    """Return the place of a run's archive; None if it is at none of its places."""
     from runner.archive.store import Store, split_place
 
     for place in _places(run):
@@ -121,12 +104,7 @@ def _places(run: Run) -> list[str]:
 
 
 def restore_to(folder: Path, path: Path, digest: str, report: Report) -> None:
-    """Restore an archive with a digest into a file; it is checked completely.
-
-    Raises:
-        RecordingError: the archive is damaged, or has another digest; there is no file then.
-        StorageError: the file cannot be written.
-    """
+    """Restore an archive with a digest into a file; it is checked completely."""
     path.unlink(missing_ok=True)
     try:
         found = _in_child_process(folder, path, report)
@@ -138,11 +116,7 @@ def restore_to(folder: Path, path: Path, digest: str, report: Report) -> None:
 
 
 def check_archive(folder: Path, report: Report) -> None:
-    """Restore an archive in memory alone.
-
-    Raises:
-        RecordingError: the archive is damaged.
-    """
+    """Restore an archive in memory alone."""
     _in_child_process(folder, None, report)
 
 

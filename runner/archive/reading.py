@@ -35,14 +35,7 @@ _ROW_BYTES: Final = 88
 
 
 class Archive(RunDescription):
-    """An archive in a folder.
-
-    Args:
-        folder: the folder, with a manifest.
-
-    Raises:
-        RecordingError: it has no valid manifest.
-    """
+    """An archive in a folder."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
@@ -58,11 +51,7 @@ class Archive(RunDescription):
         self.manifest: Manifest = read_manifest(data, str(path))
 
     def check_files(self) -> None:
-        """Compare size and hash of every file with what the manifest says.
-
-        Raises:
-            RecordingError: one is missing or changed; it is named.
-        """
+        """Compare size and hash of every file with what the manifest says."""
         for name, expected in self.manifest.files.items():
             path = self.folder / name
             try:
@@ -108,11 +97,7 @@ class Archive(RunDescription):
         return RecordingError(f"{self.folder / layout.METADATA}: is invalid ({error!r}).")
 
     def metadata(self, name: str) -> dict[str, str]:
-        """Return a metadata record's entries.
-
-        Raises:
-            RecordingError: there is none of that name.
-        """
+        """Return a metadata record's entries."""
         if name not in self._metadata:
             raise RecordingError(f"{self.folder}: has no metadata {name!r}.")
         return self._metadata[name]
@@ -147,11 +132,7 @@ class Archive(RunDescription):
         return read_layouts(columns, str(self.folder / name))
 
     def attachment(self, name: str) -> bytes:
-        """Return the data of an attachment.
-
-        Raises:
-            RecordingError: there is no such attachment.
-        """
+        """Return the data of an attachment."""
         if name not in dict(self.attachments):
             raise RecordingError(f"{self.folder}: has no attachment {name!r}.")
         return self._bytes(name)
@@ -172,17 +153,7 @@ class Archive(RunDescription):
         return sum(self.manifest.topics.get(topic.name, Entry(0, "")).size for topic in topics)
 
     def batches(self, name: str, columns: pa.Schema, rows: int, n: int) -> Iterator[pa.RecordBatch]:
-        """Yield the rows of a table in batches.
-
-        Args:
-            name: the table's file.
-            columns: the columns it must have.
-            rows: the number of rows it must have.
-            n: the maximum number of rows in a batch.
-
-        Raises:
-            RecordingError: it is not such a table.
-        """
+        """Yield the rows of a table in batches."""
         path = self.folder / name
         try:
             # pre_buffer would keep everything that was read until the file is closed

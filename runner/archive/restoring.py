@@ -49,14 +49,7 @@ _MAX_PENDING: Final = 8
 def restore(folder: Path, path: Path, report: Callable[[int], None] = lambda _: None) -> Manifest:
     """Write the recording of an archive to a new file; return the archive's manifest.
 
-    Args:
-        folder: the archive.
-        path: the file, which does not exist yet; nor does it after an error.
-        report: called with the steps restored so far.
-
-    Raises:
-        RecordingError: the archive is damaged, or does not have the content in its manifest.
-        StorageError: the file cannot be written.
+    `path`: the file, which does not exist yet; nor does it after an error.
     """
     archive = Archive(folder)
     archive.check_files()
@@ -255,11 +248,7 @@ class _Restorer:
 
 
 def _packing_of(archive: Archive) -> Packing:
-    """Return the packing of the recording.
-
-    Raises:
-        RunnerError: it is invalid in the configuration.
-    """
+    """Return the packing of the recording."""
     config = archive.config
     if archive.is_job:
         return from_mapping(config).recording.packing

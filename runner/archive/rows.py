@@ -35,7 +35,6 @@ def message_row(topic: Topic, payload: bytes, shape: Shape) -> Message:
     """Return a message as the values of its columns, but run and position.
 
     Raises:
-        RecordingError: the payload is not such a message.
         ValueError: it has a value outside its space.
     """
     values = decode(topic.message, payload)

@@ -48,12 +48,8 @@ def archive_run(
 ) -> Archived:
     """Archive a run.
 
-    Args:
-        run: a run of a recordings folder, not running.
-        to: a folder, or `s3://bucket/prefix`.
-        remove: remove the recording after the archive was restored in memory and compared with it.
-        report: called with the steps done so far.
-        dry_run: write the archive to a temporary folder, and change nothing.
+    `remove`: remove the recording after the archive was restored in memory and compared with it.
+    `dry_run`: write the archive to a temporary folder, and change nothing.
 
     Raises:
         RunnerError: the run stands alone, or is running; the target has another archive of its id.
@@ -160,18 +156,7 @@ def _restore_contents(archive: Path, folder: Path) -> None:
 
 
 def restore_place(place: str, recordings: Path, report: Report = lambda _: None) -> Run:
-    """Restore a run from its archive alone, with the same id, into a recordings folder.
-
-    Args:
-        place: path or URL of the archive.
-        recordings: the folder of runs.
-        report: called with the steps done so far.
-
-    Raises:
-        RunnerError: there is a run of that id.
-        RecordingError: there is no archive, or it is damaged.
-        StorageError: the run cannot be written.
-    """
+    """Restore a run from its archive alone, with the same id, into a recordings folder."""
     location, run_id = split_place(place)
     store = Store(location)
     manifest = store.manifest(run_id)

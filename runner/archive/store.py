@@ -30,14 +30,8 @@ _PIECE: Final = 1 << 20
 class Store:
     """A folder or an object storage prefix that has one archive per run, named by the run's id.
 
-    Args:
-        location: a folder, or `s3://bucket/prefix`. Credentials, region and endpoint of object storage come
-            from the usual AWS variables and files.
-
-    Raises:
-        RunnerError: it is a URL of another kind.
-        MissingExtra: pyarrow is not installed.
-        StorageError: the storage cannot be reached.
+    `location`: a folder, or `s3://bucket/prefix`. Credentials, region and endpoint of object storage come
+    from the usual AWS variables and files.
     """
 
     def __init__(self, location: str) -> None:
@@ -62,12 +56,7 @@ class Store:
         return str(self._folder / run_id) if self._folder else f"{self._url}/{run_id}"
 
     def manifest(self, run_id: str) -> Manifest | None:
-        """Return the manifest of a run's archive; None if there is no archive.
-
-        Raises:
-            RecordingError: what is there is not a manifest of an archive.
-            StorageError: it cannot be read.
-        """
+        """Return the manifest of a run's archive; None if there is no archive."""
         where = f"{self.place(run_id)}/{layout.MANIFEST}"
         with self._reaching(where):
             path = self._path(run_id, layout.MANIFEST)
@@ -133,12 +122,7 @@ class Store:
 
     @contextlib.contextmanager
     def reading(self, run_id: str) -> Iterator[Path]:
-        """Yield a local folder with a run's archive, read-only: its own folder, or a downloaded copy.
-
-        Raises:
-            RecordingError: there is no archive of the run, or a file of it is missing.
-            StorageError: it cannot be read.
-        """
+        """Yield a local folder with a run's archive, read-only: its own folder, or a downloaded copy."""
         manifest = self.manifest(run_id)
         if manifest is None:
             raise no_archive(self.place(run_id))
@@ -182,11 +166,7 @@ class Store:
                     left -= target.write(data)
 
     def _path(self, *parts: str) -> str:
-        """Return the path of a file in the store's file system.
-
-        Raises:
-            RecordingError: it would lead out of the store.
-        """
+        """Return the path of a file in the store's file system."""
         if not is_inside(path := "/".join(parts)):
             raise RecordingError(f"{self._url}: {path!r} is not the name of an archive's file.")
         return f"{self._root}/{path}"

@@ -95,14 +95,7 @@ class _LeafColumns:
 class SpaceColumns:
     """The columns of the values of a space.
 
-    Args:
-        description: the space's description in the recording.
-        field: the field of records with the values.
-        where: the archive or recording, for errors.
-        prefix: the beginning of the columns' names; the field unless given.
-
-    Raises:
-        RecordingError: the description is not of a space.
+    `prefix`: the beginning of the columns' names; the field unless given.
     """
 
     def __init__(

@@ -43,13 +43,9 @@ def write_archive(
 ) -> Manifest:
     """Write a recording into a folder as an archive, the manifest last; return the manifest.
 
-    Args:
-        recording: the recording, finished or not.
-        folder: an empty folder.
-        report: called with the steps written so far.
+    `folder`: an empty folder.
 
     Raises:
-        RecordingError: the recording is damaged, or has what no recorder writes.
         OSError: the folder cannot be written.
     """
     manifest = _ArchiveWriter(recording, folder, report).write()

@@ -59,13 +59,7 @@ def load(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Experim
 def from_text(text: str, source: str, overrides: Sequence[str] = ()) -> ExperimentConfig:
     """Return the experiment that the text of a file describes.
 
-    Args:
-        text: the contents of the file.
-        source: the file's name, for messages and as the default name of the experiment.
-        overrides: as for `load`.
-
-    Raises:
-        ConfigError: as for `load`.
+    `source`: the file's name, for messages and as the default name of the experiment.
     """
     stem, document = FilePath(source).stem, read_yaml(text, source)
     if document.value is None and not document.problems:
@@ -100,11 +94,7 @@ def from_mapping(
 
 
 def packing_from(values: Mapping[str, object]) -> Recording:
-    """Return the section `recording` of a configuration with these values.
-
-    Raises:
-        ConfigError: there is no such option, or a value is out of its bounds.
-    """
+    """Return the section `recording` of a configuration with these values."""
     try:
         return Recording.model_validate(dict(values))
     except ValidationError as error:
@@ -113,11 +103,7 @@ def packing_from(values: Mapping[str, object]) -> Recording:
 
 
 def read_text(file: FilePath) -> str:
-    """Return the text of a file.
-
-    Raises:
-        ConfigError: it cannot be read, is too large, or is not UTF-8.
-    """
+    """Return the text of a file."""
     try:
         with file.open("rb") as stream:
             content = stream.read(MAX_BYTES + 1)

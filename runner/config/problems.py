@@ -41,10 +41,7 @@ _ELSEWHERE = {
 def problems_in(error: ValidationError, value: object, schema: Schema | None = None) -> list[Problem]:
     """Return the problems of `value`, without those that are only a consequence of others.
 
-    Args:
-        error: pydantic's error.
-        value: the mapping that was validated.
-        schema: its schema, without references; that of a configuration unless given.
+    `schema`: its schema, without references; that of a configuration unless given.
     """
     details = error.errors(include_url=False, include_input=False)
     paths = [_path(detail) for detail in details]

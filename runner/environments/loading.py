@@ -53,11 +53,7 @@ def load_mdp(env_id: str, kwargs: Mapping[str, object], rewards: str = "team") -
 
 
 def mdp_of(env: Any, kwargs: Mapping[str, object]) -> Mdp:
-    """Return the arrays of an environment made with `kwargs`, whose agents share the reward.
-
-    Raises:
-        EnvironmentNotUsable: it has no transition table, or one that is invalid.
-    """
+    """Return the arrays of an environment made with `kwargs`, whose agents share the reward."""
     spec = env.spec
     env_id = spec.id if spec is not None else type(env.unwrapped).__qualname__
     try:

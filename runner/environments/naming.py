@@ -73,11 +73,7 @@ def numbered_actions(mdp: Mdp) -> list[list[str]]:
 
 
 def agent_of(mdp: Mdp, name: str) -> int:
-    """Return the number of the agent with this name, written as in the environment or as people write it.
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """Return the number of the agent with this name, written as in the environment or as people write it."""
     known = {text: i for i, agent in enumerate(mdp.agents) for text in (agent, spoken(agent))}
     if name not in known:
         raise ConfigError(
@@ -87,30 +83,18 @@ def agent_of(mdp: Mdp, name: str) -> int:
 
 
 def state_of(mdp: Mdp, text: str) -> int:
-    """Return a state from its name, such as `taxi 1 (0,0), passenger at B`, or its number.
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """Return a state from its name, such as `taxi 1 (0,0), passenger at B`, or its number."""
     return _numbered(text, [str(name) for name in states_in_words(mdp)], "a state", 1)
 
 
 def own_action(mdp: Mdp, agent: int, text: str) -> int:
-    """Return an agent's action from its name or its number.
-
-    Raises:
-        ConfigError: the agent has no such action.
-    """
+    """Return an agent's action from its name or its number."""
     names = numbered_actions(mdp)[agent]
     return _numbered(text, names, f"an action of {spoken(mdp.agents[agent])}")
 
 
 def joint_action(mdp: Mdp, text: str) -> int:
-    """Return a joint action from its name, such as `pickup + east`, or its number.
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """Return a joint action from its name, such as `pickup + east`, or its number."""
     return _numbered(text, [str(name) for name in actions_in_words(mdp)], "a joint action")
 
 
@@ -136,9 +120,7 @@ def agent_actions(mdp: Mdp, action: int) -> tuple[int, ...]:
 def exploration_in_words(mask: int, learners: Sequence[str]) -> str:
     """Return which learners explored in a step: `explored` if all did, `taxi 1 explored`, or nothing.
 
-    Args:
-        mask: the step's `explored`: bit i is learner i.
-        learners: their names.
+    `mask`: the step's `explored`: bit i is learner i.
     """
     explorers = [spoken(name) for i, name in enumerate(learners) if mask >> i & 1]
     if not explorers or len(explorers) == len(learners):

@@ -55,13 +55,7 @@ class GridWorld:
 def grid_world(env_id: str, base: object, arrays: Arrays) -> GridWorld | None:
     """Return the additions to one of Gymnasium's grid worlds; None for any other environment.
 
-    Args:
-        env_id: its id, for messages.
-        base: the environment, unwrapped.
-        arrays: its transition arrays, as `runner.environments.mdp` has them.
-
-    Raises:
-        EnvironmentNotUsable: it is a variant that its transition table does not describe.
+    `arrays`: its transition arrays, as `runner.environments.mdp` has them.
     """
     adapt = _ADAPTERS.get(f"{type(base).__module__}.{type(base).__qualname__}")
     return None if adapt is None else adapt(env_id, base, arrays)

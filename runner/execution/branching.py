@@ -139,11 +139,7 @@ def chosen_actions(mdp: Mdp, action: Action | None) -> dict[str, str]:
 
 
 def _changes(now: ExperimentConfig, wanted: ExperimentConfig) -> Changes:
-    """Return the settings of a branch.
-
-    Raises:
-        ConfigError: something differs that cannot change at a step.
-    """
+    """Return the settings of a branch."""
     differing = [key for key, value in wanted if value != getattr(now, key)]
     fixed = [key for key in differing if key not in (*Changes.model_fields, *OF_THE_WHOLE)]
     if fixed:
@@ -156,11 +152,7 @@ def _changes(now: ExperimentConfig, wanted: ExperimentConfig) -> Changes:
 
 
 def _check_beginning(parent: Recording, own: Run, episodes: int) -> None:
-    """Check that the episodes before a branch are those of its parent.
-
-    Raises:
-        RunnerError: they are not.
-    """
+    """Check that the episodes before a branch are those of its parent."""
     with open_recording(own.recording) as recording:
         count = min(episodes, unbroken(parent)[1], recording.count(schema.TRAIN_EPISODE))
         ours, theirs = (one.blocks(schema.TRAIN_EPISODE, 0, count) for one in (recording, parent))

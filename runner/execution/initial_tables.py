@@ -25,13 +25,7 @@ from runner.runs.run import Run
 def resolve_initial_q(config: ExperimentConfig, recordings: Path, exclude: str = "") -> ExperimentConfig:
     """Return a configuration whose `initial_q`, if it is a run's table, has the run's id and the step.
 
-    Args:
-        config: the configuration.
-        recordings: the folder to find the run in.
-        exclude: the id of the run that begins with the table, which is never meant.
-
-    Raises:
-        RunnerError: `initial_q` names no run, or one that cannot be read.
+    `exclude`: the id of the run that begins with the table, which is never meant.
     """
     start = config.initial_q
     if not isinstance(start, RunTable):
@@ -46,11 +40,7 @@ def resolve_initial_q(config: ExperimentConfig, recordings: Path, exclude: str =
 
 
 def resolve_job(job: Job, run: Run) -> tuple[Job, Run]:
-    """Return a job and its run with `initial_q` resolved, also in `run.json`.
-
-    Raises:
-        RunnerError: `initial_q` names no run, or the run's folder cannot be written.
-    """
+    """Return a job and its run with `initial_q` resolved, also in `run.json`."""
     config = resolve_initial_q(job.config, run.folder.parent, exclude=run.run_id)
     if config == job.config:
         return job, run
@@ -71,14 +61,7 @@ def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Held] | None:
 def tables_of(config: ExperimentConfig, mdp: Mdp, recordings: Path, exclude: str = "") -> list[Held] | None:
     """Return what the learners of the run in `initial_q` held; None if the configuration has none.
 
-    Args:
-        config: the configuration.
-        mdp: its environment.
-        recordings: the folder to find the run in.
-        exclude: the id of a run that is never meant.
-
-    Raises:
-        RunnerError: there is no such run or step, or its tables have another shape.
+    `exclude`: the id of a run that is never meant.
     """
     start = config.initial_q
     if not isinstance(start, RunTable):

@@ -74,17 +74,9 @@ def verify_by_redoing(
 ) -> Redone:
     """Do the episodes of a loop again, in a child process with limits, and compare every step.
 
-    Args:
-        path: of the recording.
-        sample: how many episodes to do again, at even distances; None for all that happened.
-        tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
-        trust: whether what the recording names may be imported, see `runner.replay.specifications`.
-        report: called with the number of steps taken so far.
-        seconds: how long a block of steps may take, which is meant to take 0.2 s.
-        memory_bytes: how much the process may allocate.
-
-    Raises:
-        RecordingError: the recording is damaged.
+    `sample`: how many episodes to do again, at even distances; None for all that happened.
+    `tolerance`: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
+    `seconds`: how long a block of steps may take, which is meant to take 0.2 s.
     """
     result = Redone("impossible", tolerance=tolerance)
     with open_recording(path) as recording:

@@ -34,11 +34,6 @@ def rerecord_loop(run: Run, trust: bool, report: Callable[[int], None]) -> Run:
 
     The new recording replaces the old one when it is complete and has the same content digest.
 
-    Args:
-        run: a run of which the actions were recorded.
-        trust: whether what the recording names may be imported, see `runner.replay.specifications`.
-        report: called with the number of steps done, about five times a second.
-
     Raises:
         CannotRedo: the environment cannot be had.
         Diverged: it gives other observations or rewards; the recording stays as it is.

@@ -97,11 +97,7 @@ def resume(
 
 
 def require_same_makers(run: Run) -> None:
-    """Refuse to resume a run with other code or libraries than it was started with.
-
-    Raises:
-        RunnerError: they differ.
-    """
+    """Refuse to resume a run with other code or libraries than it was started with."""
     _refuse_changes(run, _changes(run))
 
 
@@ -158,9 +154,7 @@ def _mark_failed(run: Run, error: BaseException) -> None:
 def _place(run: Run, described: bool) -> tuple[Path, Contents]:
     """Return the file to continue, and its undamaged contents: the recording, or its replacement.
 
-    Args:
-        run: the run.
-        described: whether the recording has the job's description.
+    `described`: whether the recording has the job's description.
     """
     if not run.recording.is_file():
         return run.recording, Contents()

@@ -88,19 +88,10 @@ def run_job(
 ) -> Run:
     """Train, evaluate and record a job; return its run, finished or interrupted.
 
-    Args:
-        job: the job.
-        run: its run, from `create_run`.
-        report: called with the progress a few times a second, and after every evaluation.
-        stop: called every few milliseconds; when it returns True the recording is closed properly and the
-            run is marked interrupted.
-        observer: sees every step and metric as they come.
-        mdp: the job's environment, if it is loaded already.
-        threads: False records in the learning thread: quicker if it has one processor to itself.
-        initial: the tables to begin with instead of those that the configuration names.
-
-    Raises:
-        RunnerError: the environment cannot be used, or the disk is full; the run is then marked failed.
+    `stop`: called every few milliseconds; when it returns True the recording is closed properly and the run
+    is marked interrupted.
+    `threads`: False records in the learning thread: quicker if it has one processor to itself.
+    `initial`: the tables to begin with instead of those that the configuration names.
     """
     started = time.monotonic()
     code = CodeCollector(run.folder.parent, job.config.recording.code)
@@ -380,9 +371,6 @@ def describe(
     """Write the description that makes a recording self-contained.
 
     `made_by` is its provenance; this process's by default.
-
-    Raises:
-        StorageError: the disk is full or failing.
     """
     events = len(learner.mdp.event_names)
     facts = run_metadata(

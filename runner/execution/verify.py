@@ -46,15 +46,7 @@ from runner.util.files import open_regular
 
 
 def damage_of(path: Path, report: BytesReport = lambda *_: None) -> str:
-    """Return the first damage of a recording's bytes; empty if there is none.
-
-    Args:
-        path: the recording.
-        report: called with the bytes checked so far, and those of the file.
-
-    Raises:
-        RecordingError: there is no such file, or it is not a dualtaxi recording.
-    """
+    """Return the first damage of a recording's bytes; empty if there is none."""
     refuse_foreign(path)
     try:
         check_integrity(path, report)

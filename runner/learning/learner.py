@@ -42,11 +42,7 @@ class Segment(NamedTuple):
 class Learner:
     """Tables, cursors and tallies of one job; `train` and `evaluate` fill blocks of records.
 
-    Args:
-        config: the experiment.
-        mdp: its environment.
-        seed: fixes every draw.
-        initial: tables to start from instead of `config.initial_q`, as `held` returns them, for each learner.
+    `initial`: tables to start from instead of `config.initial_q`, as `held` returns them, for each learner.
     """
 
     def __init__(

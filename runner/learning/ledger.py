@@ -89,15 +89,11 @@ def spread(
 
     Return how many of the steps' rewards have a weight.
 
-    Args:
-        model: the environment.
-        rules: of the run at these steps.
-        i: the learner.
-        first: the number of the first step.
-        updates: of the steps, [N].
-        ledger: as it is after these steps; it is moved to before them.
-        stretch: episodes of a stretch.
-        shares: [N] of `SHARE`, filled with the steps whose rewards have a weight, the last ones first.
+    `rules`: of the run at these steps.
+    `updates`: of the steps, [N].
+    `ledger`: as it is after these steps; it is moved to before them.
+    `stretch`: episodes of a stretch.
+    `shares`: [N] of `SHARE`, filled with the steps whose rewards have a weight, the last ones first.
     """
     algorithm = len(rules.algorithm)
     width = model.width[i]

@@ -38,9 +38,7 @@ _KNOWN_IN: Final = ("gymnasium.envs.", "mpe2.")
 def action_names(env: object, space: Space) -> tuple[str, ...]:
     """Return the names of an environment's discrete actions, the least action's first; empty if unknown.
 
-    Args:
-        env: a Gymnasium environment, a vector environment without its wrappers, or a game.
-        space: of the actions as the user takes them: names are only returned if there is one for each.
+    `space`: of the actions as the user takes them: names are only returned if there is one for each.
     """
     layer, base = env, getattr(env, "unwrapped", env)
     while layer is not base:
@@ -77,15 +75,9 @@ def action_in_words(space: Space, action: Any, names: Names) -> str:
 def parsed_action(space: Space, given: object, recorded: Any, names: Names) -> Any:
     """Return an action in the dtypes of the recorded one.
 
-    Args:
-        space: of the environment's actions; of a game a `Dict` by agent.
-        given: text, or a value; of a game `AGENT=VALUE`, or a mapping by agent: the others act as
-            recorded. None for the recorded action.
-        recorded: the recorded action at the same step; of a game those of the agents that acted.
-        names: of discrete actions, if known; of a game by agent.
-
-    Raises:
-        ConfigError: it is not in the space.
+    `given`: text, or a value; of a game `AGENT=VALUE`, or a mapping by agent: the others act as recorded.
+    None for the recorded action.
+    `recorded`: the recorded action at the same step; of a game those of the agents that acted.
     """
     if given is None:
         return recorded

@@ -20,12 +20,7 @@ from runner.recording.recorder import Recorder
 class BatchRows(VectorRows):
     """The steps of one phase that are not committed yet, put down many at once.
 
-    Args:
-        recorder: as for `VectorRows`.
-        described: likewise.
-        phase: likewise.
-        first_action: likewise.
-        mode: how the environments reset themselves.
+    `mode`: how the environments reset themselves.
     """
 
     def __init__(
@@ -55,18 +50,13 @@ class BatchRows(VectorRows):
     ) -> None:
         """Record T steps of all environments; all or nothing of them.
 
-        Args:
-            observations: [T, N, ...], nested as their space: what the steps returned.
-            actions: [T, N, ...], nested as their space.
-            rewards: [T, N].
-            terminated: [T, N].
-            truncated: [T, N].
-            finals: [T, N, ...], the last observations of episodes that ended, where `observations` are
-                already of the next ones; None if they are unknown.
+        `observations`: [T, N, ...], nested as their space: what the steps returned.
+        `actions`: [T, N, ...], nested as their space.
+        `rewards`, `terminated` and `truncated`: [T, N].
+        `finals`: [T, N, ...], the last observations of episodes that ended, where `observations` are already
+        of the next ones; None if they are unknown.
 
         Raises:
-            RecordingError: a value is not of its space, or not of this shape; or a step follows the end of
-                an episode without a reset.
             ResetNeeded: the phase has no reset yet.
         """
         require_reset(self._reset_count, self._phase)
@@ -112,11 +102,7 @@ class BatchRows(VectorRows):
                 self.commit()
 
     def continues_with(self, observations: object) -> bool:
-        """Return whether these are the observations [N, ...] after the last step or reset of the phase.
-
-        Raises:
-            RecordingError: they are not of their space.
-        """
+        """Return whether these are the observations [N, ...] after the last step or reset of the phase."""
         now = np.zeros(self._n, self._observation_dtype)
         put_fitted(
             self._observation_leaves, fitted(self._observation_leaves, observations, (self._n,)), ..., now

@@ -184,13 +184,7 @@ def _record_branch(path: Path, folder: Path, task: _Task) -> None:
 
 
 class _Player:
-    """Records an episode from its reset on, and plays on from a step.
-
-    Args:
-        recording: of the parent.
-        folder: the recordings folder of the branch.
-        task: what to do.
-    """
+    """Records an episode from its reset on, and plays on from a step."""
 
     rec: Any
     """The recorded environment."""

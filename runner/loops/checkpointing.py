@@ -23,14 +23,7 @@ _MAX_NUMBER: Final = 8
 def content_of(name: str, value: object, pickle: bool) -> tuple[bytes | memoryview | Path, str]:
     """Return the content of a checkpoint, and its format.
 
-    Args:
-        name: of the checkpoint.
-        value: bytes, the path of a file, or a mapping of arrays or tensors.
-        pickle: whether to pickle it.
-
-    Raises:
-        ConfigError: name or value cannot be recorded.
-        MissingExtra: safetensors is not installed.
+    `value`: bytes, the path of a file, or a mapping of arrays or tensors.
     """
     if not is_checkpoint_name(name):
         raise ConfigError(

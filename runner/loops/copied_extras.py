@@ -16,15 +16,7 @@ from runner.recording.recorder import Recorder
 
 
 class CopiedExtras:
-    """The extras of all processes, with the names of all of them.
-
-    Args:
-        recorder: takes them.
-        sources: what each process recorded.
-
-    Raises:
-        ConfigError: they have too many names, or too many bytes, together.
-    """
+    """The extras of all processes, with the names of all of them."""
 
     def __init__(self, recorder: Recorder, sources: Sequence[Source]) -> None:
         self._recorder = recorder
@@ -55,12 +47,9 @@ class CopiedExtras:
     ) -> None:
         """Copy the extras of some steps, which follow each other in the run.
 
-        Args:
-            source: of the process.
-            phase: `train` or `eval`.
-            numbers: of the steps, as their process counted them.
-            new_step: the number of the first step in the run.
-            new_position: the steps of the run before it.
+        `numbers`: of the steps, as their process counted them.
+        `new_step`: the number of the first step in the run.
+        `new_position`: the steps of the run before it.
         """
         own = self._own[source.number, phase]
         if not own:

@@ -31,13 +31,7 @@ class Copied:
 
 
 class _Copies(Rows):
-    """What copied rows have in common.
-
-    Args:
-        recorder: takes them.
-        copied: the kind and the table of the recording.
-        phase: `train` or `eval`.
-    """
+    """What copied rows have in common."""
 
     def __init__(self, recorder: Recorder, copied: Copied, phase: str) -> None:
         self._fields = _SHARED_FIELDS + (_STEP_FIELDS if copied.kind == "step" else _TRANSITION_FIELDS)

@@ -85,11 +85,7 @@ class Described:
 
 
 def describe(env: object, observation: Space, action: Space) -> Described:
-    """Return the description of a Gymnasium environment with these spaces.
-
-    Raises:
-        EnvironmentNotUsable: one of its spaces cannot be recorded.
-    """
+    """Return the description of a Gymnasium environment with these spaces."""
     env_id, kwargs, step_limit = _registration(env)
     kind = kind_of(observation, action)
     mdp = _tabular(env, kwargs, observation, action) if kind == "step" else None
@@ -124,11 +120,7 @@ def _registration(env: object) -> tuple[str, dict[str, object], int]:
 
 
 def kind_of(observation: Space, action: Space) -> str:
-    """Return the kind of recording of these spaces.
-
-    Raises:
-        EnvironmentNotUsable: one of them cannot be recorded.
-    """
+    """Return the kind of recording of these spaces."""
     parts = [*parts_of(observation, "the observation space"), *parts_of(action, "the action space")]
     if type(observation) is type(action) is spaces.Discrete:
         return "step" if max(int(observation.n), int(action.n)) <= _MAX_STATES else "transition"

@@ -40,9 +40,7 @@ Put = Callable[[object], None]
 class Extras:
     """The extras of a loop that the recorder does not have yet; the caller holds the loop's lock.
 
-    Args:
-        recorder: takes their records.
-        batch: (N,) for N environments that step at once, whose values are arrays [N, ...]; else ().
+    `batch`: (N,) for N environments that step at once, whose values are arrays [N, ...]; else ().
     """
 
     def __init__(self, recorder: Recorder, batch: tuple[int, ...] = ()) -> None:
@@ -69,13 +67,6 @@ class Extras:
         """Return a function that puts down the values of a step that was just taken, by name.
 
         It is called with each step, so it has what it needs at hand.
-
-        Args:
-            phase: `train` or `eval`.
-            rows: its steps.
-
-        Raises:
-            ConfigError: (from the returned function) a name or a value cannot be recorded.
         """
         steps, fast, taken, n, array = self._steps, self._fast, self._taken, self._n, np.ndarray
 
@@ -111,17 +102,7 @@ class Extras:
         return take
 
     def extend(self, phase: str, rows: PhaseRows, values: Mapping[str, object]) -> None:
-        """Put down further values of the last step of the phase that is recorded now.
-
-        Args:
-            phase: `train` or `eval`.
-            rows: its steps.
-            values: by name.
-
-        Raises:
-            ConfigError: a name or a value cannot be recorded.
-            RunnerError: there is no such step, or it cannot be extended any more.
-        """
+        """Put down further values of the last step of the phase that is recorded now."""
         step = self._taken[phase] + rows.filled - self._n
         if step <= self._final[phase]:
             raise RunnerError(
@@ -147,12 +128,8 @@ class Extras:
     def checked_batch(self, values: Mapping[str, object], shape: tuple[int, ...]) -> dict[str, Array]:
         """Return the values of T steps of N environments, by name, as `put_batch` takes them.
 
-        Args:
-            values: [T, N, ...] each.
-            shape: T and N.
-
-        Raises:
-            ConfigError: a name or a value cannot be recorded.
+        `values`: [T, N, ...] each.
+        `shape`: T and N.
         """
         if not isinstance(values, Mapping):
             raise ConfigError(f"extras: found {type(values).__name__}, expected arrays by name")
@@ -172,10 +149,7 @@ class Extras:
     def put_batch(self, phase: str, rows: PhaseRows, values: Mapping[str, Array]) -> None:
         """Hand the values of the T steps of all environments that were just taken to the recorder.
 
-        Args:
-            phase: `train` or `eval`.
-            rows: its steps.
-            values: as `checked_batch` returned them.
+        `values`: as `checked_batch` returned them.
         """
         self._write(len(self._steps))
         self._phase = phase
@@ -306,11 +280,7 @@ class Extras:
 
 
 def _putter(name: str, base: np.dtype[np.generic], shape: tuple[int, ...], column: list[bytes]) -> Put:
-    """Return a function that adds a value of a name to its column, which is of this dtype and shape.
-
-    Raises:
-        ConfigError: (from the returned function) it has another shape or dtype than the first one.
-    """
+    """Return a function that adds a value of a name to its column, which is of this dtype and shape."""
     exact = {
         kind for kind in SCALARS if np.can_cast(kind, base) and (kind is not np.bool_ or base.kind == "b")
     }

@@ -49,10 +49,7 @@ Report = Callable[[int, int], None]
 class Fold:
     """Writes the recordings of several processes into one.
 
-    Args:
-        run: the run.
-        sources: of its processes; that which began it comes first, unless it recorded nothing.
-        report: called while episodes are copied.
+    `sources`: of its processes; that which began it comes first, unless it recorded nothing.
     """
 
     def __init__(self, run: Run, sources: Sequence[Source], report: Report) -> None:

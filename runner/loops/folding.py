@@ -36,10 +36,7 @@ _POLL_SECONDS: Final = 0.05
 def fold_if_over(run: Run, seconds: float = 0.0, report: Report = lambda *_: None) -> Run:
     """Fold the shards of a run into its recording if no process records into it; return the run as it is.
 
-    Args:
-        run: the run.
-        seconds: how long to wait for the processes of its shards to end.
-        report: called while episodes are copied.
+    `seconds`: how long to wait for the processes of its shards to end.
 
     Raises:
         RecordingError: a recording is damaged; all stay as they are.
@@ -82,11 +79,7 @@ def _fold(run: Run, report: Report) -> Run:
 
 
 def _sources(run: Run, stack: ExitStack) -> list[Source]:
-    """Open what each process recorded; leave out those that joined and recorded nothing.
-
-    Raises:
-        RecordingError: one is damaged.
-    """
+    """Open what each process recorded; leave out those that joined and recorded nothing."""
     sources: list[Source] = []
     first = 0
     for name, part in [("", run), *((shard.run_id, shard) for shard in shards_of(run))]:

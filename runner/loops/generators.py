@@ -30,9 +30,7 @@ States = dict[int, ResetState]
 class GeneratorWatch:
     """The generator of one environment: read at the resets at which its state is recorded.
 
-    Args:
-        env: the environment, wrapped or not.
-        sparse: whether the states of emulators, which take kilobytes, are recorded less often.
+    `sparse`: whether the states of emulators, which take kilobytes, are recorded less often.
     """
 
     def __init__(self, env: object, sparse: bool = False) -> None:
@@ -48,11 +46,7 @@ class GeneratorWatch:
         """The number of steps from which on a state is recorded again."""
 
     def before(self, steps: int) -> ResetState | None:
-        """Return what a reset without a seed is going to depend on; None if it is not to be recorded.
-
-        Args:
-            steps: the number of steps of the environment so far.
-        """
+        """Return what a reset without a seed is going to depend on; None if it is not to be recorded."""
         generator, last = getattr(self._base, self._name, None), self._generator
         self._generator = generator
         if steps < self.due and generator is last:
@@ -68,9 +62,8 @@ class GeneratorWatch:
     def after(self, state: ResetState | None, seed: int | None) -> ResetState | None:
         """Return what a reset depended on; None if it is not to be recorded.
 
-        Args:
-            state: what `before` returned; None for a reset with a seed.
-            seed: the seed of the reset.
+        `state`: what `before` returned; None for a reset with a seed.
+        `seed`: the seed of the reset.
         """
         generator, before = getattr(self._base, self._name, None), self._generator
         self._generator = generator
@@ -85,11 +78,7 @@ class VectorWatch:
     Those of a `SyncVectorEnv` are read, or that of a vector environment of its own class. An `AsyncVectorEnv`
     is asked for the seeds of its generators once, after its first reset without seeds.
 
-    Args:
-        envs: the vector environment.
-        first: its first environment, or one made as that was; the vector itself if there is none.
-        autoreset: how its environments reset themselves.
-        sparse: as for `GeneratorWatch`.
+    `first`: its first environment, or one made as that was; the vector itself if there is none.
     """
 
     def __init__(
@@ -122,8 +111,7 @@ class VectorWatch:
     def before_step(self, over: NDArray[np.bool_]) -> States:
         """Return what the resets that a step does in place of steps are going to depend on.
 
-        Args:
-            over: [N], the environments whose episodes are over.
+        `over`: [N], the environments whose episodes are over.
         """
         states = self._before(np.flatnonzero(over).tolist())
         self.due = min(watch.due for watch in self._watches)
@@ -132,9 +120,8 @@ class VectorWatch:
     def before_reset(self, which: NDArray[np.bool_], seeds: Sequence[int | None]) -> States:
         """Return what a reset is going to depend on, where it has no seed.
 
-        Args:
-            which: [N], the environments that are reset.
-            seeds: of all environments; empty for none.
+        `which`: [N], the environments that are reset.
+        `seeds`: of all environments; empty for none.
         """
         unseeded = [i for i in np.flatnonzero(which).tolist() if not seeds or seeds[i] is None]
         return self._before(unseeded)

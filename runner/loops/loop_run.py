@@ -46,19 +46,7 @@ from runner.runs.shards import RUN_VARIABLE, new_shard
 
 
 class LoopRun:
-    """The run of a loop that is being recorded. Not thread-safe: the loop holds its lock.
-
-    Args:
-        described: the environment and its spaces.
-        options: how to record it.
-        maker: how it was made.
-
-    Raises:
-        ConfigError: the steps of this environment, or of a shard, cannot be left out; or its spaces are
-            others than those of the run that is joined.
-        RunnerError: the run that is joined is over.
-        StorageError: the recordings folder cannot be written.
-    """
+    """The run of a loop that is being recorded. Not thread-safe: the loop holds its lock."""
 
     def __init__(self, described: Described, options: Options, maker: EnvironmentMaker) -> None:
         is_shard = options.join is not None
@@ -113,12 +101,7 @@ class LoopRun:
             os.environ[RUN_VARIABLE] = os.path.abspath(self.run.folder)  # noqa: PTH100 - links stay what they are
 
     def _new_run(self, folder: Path | None, facts: Mapping[str, Any]) -> Run:
-        """Create the folder of the run, or of the shard of the run that is joined.
-
-        Raises:
-            ConfigError: the spaces are others than those of the run that is joined.
-            RunnerError: that run is over.
-        """
+        """Create the folder of the run, or of the shard of the run that is joined."""
         options, config = self._options, self._config
         if options.join is None:
             folder = folder or recordings_folder(options.recordings)
@@ -191,11 +174,7 @@ class LoopRun:
             self._actions.commit()
 
     def finish(self, status: str, error: str, rewards_off_table: int) -> dict[str, object]:
-        """Write everything and the result; return the summary.
-
-        Raises:
-            StorageError: the disk is full or failing.
-        """
+        """Write everything and the result; return the summary."""
         topic_digests = self.recorder.drain()
         self._code.write(self._file, wait=True)
         self._write_makers()
@@ -233,20 +212,12 @@ class LoopRun:
         self._file.close()
 
     def write_status(self, status: str, summary: Mapping[str, object]) -> None:
-        """Write how the run ended next to its recording, which is synced to disk within seconds.
-
-        Raises:
-            StorageError: the disk is full or failing.
-        """
+        """Write how the run ended next to its recording, which is synced to disk within seconds."""
         SYNCER.add(self.run.recording, partial(_mark_unsynced, self.run.folder))
         self.run = self.run.update(status=status, summary=summary, provenance=self._code.made_by(self.run))
 
     def fold(self) -> None:
-        """Put together what several processes recorded, if this was the last one.
-
-        Raises:
-            RunnerError: it cannot be put together.
-        """
+        """Put together what several processes recorded, if this was the last one."""
         if os.environ.get(RUN_VARIABLE) == os.path.abspath(self.run.folder):  # noqa: PTH100
             del os.environ[RUN_VARIABLE]
         joined = self._options.join

@@ -83,11 +83,8 @@ def _with_spec(
 ) -> EnvironmentMaker:
     """Return a maker with a specification.
 
-    Args:
-        maker: has the names of the wrappers.
-        spec: Gymnasium's, of the environment inside of them.
-        wrapping: returns the fields that describe the wrappers; appends those whose arguments are unknown.
-        top: the top package of the environment, for versions where there is no specification.
+    `wrapping`: returns the fields that describe the wrappers; appends those whose arguments are unknown.
+    `top`: the top package of the environment, for versions where there is no specification.
     """
     if not isinstance(spec, EnvSpec):
         return _with_versions(maker, [top] if top else [], "it was not made by gymnasium.make")
@@ -116,11 +113,7 @@ def vector_maker_of(
 ) -> EnvironmentMaker:
     """Return how a vector environment was made.
 
-    Args:
-        envs: the vector environment.
-        first: its first environment, or one made as that was; the vector itself if there is none.
-        autoreset: how its environments reset themselves.
-        make: the function that the user named, if any.
+    `first`: its first environment, or one made as that was; the vector itself if there is none.
     """
     layers = list(layers_of(envs))
     base, reason = layers[-1], ""
@@ -227,11 +220,7 @@ def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
 
 
 def checked_make(make: object) -> str:
-    """Return the `module:function` of the argument `make` of `record`, a function or its name; "" for None.
-
-    Raises:
-        ConfigError: it is something else, or cannot be imported by that name.
-    """
+    """Return the `module:function` of the argument `make` of `record`; empty for None."""
     if make is None:
         return ""
     text = make if isinstance(make, str) else f"{_module_of(make)}:{getattr(make, '__qualname__', '?')}"
@@ -286,8 +275,7 @@ def _with_versions(maker: EnvironmentMaker, tops: Sequence[str], reason: object 
 def package_versions(tops: Sequence[str] = ()) -> dict[str, str]:
     """Return the versions of Gymnasium, NumPy, simulators that are loaded, and the distributions of modules.
 
-    Args:
-        tops: names of further modules, without dots; those that no distribution is named after have no entry.
+    `tops`: names of further modules, without dots; those that no distribution is named after have no entry.
     """
     names = {"gymnasium", "numpy", *tops, *(name for name in _SIMULATORS if name in sys.modules)}
     found = (_installed(name) for name in sorted(names))

@@ -94,11 +94,7 @@ class Messages:
         """Reset states that it does not have yet, with their positions."""
 
     def log(self, phase: str, name: str, value: object) -> None:
-        """Record a number or a text under a name, at this moment.
-
-        Raises:
-            ConfigError: it is neither, or the name is not valid.
-        """
+        """Record a number or a text under a name, at this moment."""
         series = self._series.get((phase, name))
         if value.__class__ is not float or series is None:
             if isinstance(value, str):
@@ -149,11 +145,7 @@ class Messages:
                 self.has_logged = True
 
     def snapshot(self, phase: str, name: str, array: object) -> None:
-        """Record an array of numbers, or all arrays of a mapping, as they are now.
-
-        Raises:
-            ConfigError: it holds something else, or is too large; nothing is recorded then.
-        """
+        """Record an array of numbers, or all arrays of a mapping, as they are now."""
         arrays = dict(arrays_of(name, array))
         with self._loop.lock:
             if not self._loop.records():
@@ -167,13 +159,7 @@ class Messages:
                 self.has_logged = True
 
     def checkpoint(self, phase: str, name: str, value: object, pickle: bool) -> str:
-        """Store a checkpoint, and record it at this moment; return its digest.
-
-        Raises:
-            ConfigError: the name or the value cannot be recorded.
-            MissingExtra: safetensors is not installed.
-            StorageError: the file cannot be read, or the store cannot be written.
-        """
+        """Store a checkpoint, and record it at this moment; return its digest."""
         with self._loop.lock:
             if not self._loop.records():
                 return ""
@@ -193,10 +179,7 @@ class Messages:
     def info(self, phase: str, info: Mapping[str, object], reset: Mapping[str, object] | None = None) -> None:
         """Record the chosen fields of an info, of the step or reset that was just put down.
 
-        Args:
-            phase: `train` or `eval`.
-            info: as the environment returned it.
-            reset: options and seed of the reset, if it is a reset.
+        `reset`: options and seed of the reset, if it is a reset.
         """
         names = self._options.info
         chosen = info if ALL_INFO in names else {key: info[key] for key in names if key in info}
@@ -250,14 +233,7 @@ class Messages:
     def frame(self, phase: str, image: object, is_reset: bool, environment: int | None = None) -> None:
         """Record a picture, [height, width, 3] of uint8; another thread encodes it.
 
-        Args:
-            phase: `train` or `eval`.
-            image: the picture after the last step or reset.
-            is_reset: whether that was a reset.
-            environment: its number among those of a vector; None for a single one.
-
-        Raises:
-            ConfigError: it is something else.
+        `environment`: its number among those of a vector; None for a single one.
         """
         with self._loop.lock:
             if not self._loop.records():
@@ -277,12 +253,7 @@ class Messages:
             self._recorder.submit(self._topics[f"/{phase}/frame"], make, position)
 
     def picture(self, name: str, picture: Picture) -> None:
-        """Record a picture or a film under a name, at this moment; another thread encodes it.
-
-        Raises:
-            ConfigError: the name is not valid.
-            MissingExtra: Pillow is not installed.
-        """
+        """Record a picture or a film under a name, at this moment; another thread encodes it."""
         check_log_name(name, "a picture")
         pillow()
         with self._loop.lock:

@@ -65,11 +65,7 @@ class RecordOptions(RunOptions, total=False):
 
 @dataclass(frozen=True)
 class Options:
-    """How a loop is recorded.
-
-    Raises:
-        ConfigError: a value cannot be used.
-    """
+    """How a loop is recorded."""
 
     recordings: str | os.PathLike[str] | None
     seed: int | None
@@ -111,11 +107,7 @@ class Options:
         checked_run_name(self.name)
 
     def config(self, described: Described) -> Json:
-        """Return the configuration that the recording carries.
-
-        Raises:
-            ConfigError: the steps of this environment, or of a shard, cannot be left out.
-        """
+        """Return the configuration that the recording carries."""
         if self.steps != "all" and (described.kind == "variable" or self.join is not None):
             reason = "a shard has whole steps" if self.join else "the environment's values vary in size"
             raise ConfigError(f"steps: found {self.steps!r}, expected all: {reason}.")
@@ -140,16 +132,8 @@ def options_of(
 ) -> Options:
     """Return the options for the arguments of `record`.
 
-    Args:
-        recordings: the argument of that name.
-        given: the other arguments.
-        frames_of: the environments of a vector of which frames are recorded.
-        valid: the names of the arguments that the function has.
-
-    Raises:
-        ConfigError: an argument is unknown or cannot be used.
-        RunnerError: the run to join is over, or there is none.
-        MissingExtra: frames need Pillow, which is not installed.
+    `frames_of`: the environments of a vector of which frames are recorded.
+    `valid`: the names of the arguments that the function has.
     """
     options: dict[str, Any] = dict(given)
     if unknown := sorted(set(options) - {*valid}):
@@ -193,11 +177,7 @@ def options_of(
 
 
 def settings_in(config: object) -> Mapping[Any, Any]:
-    """Return the user's own settings in a mapping, a dataclass or a namespace; none in None.
-
-    Raises:
-        ConfigError: it is something else.
-    """
+    """Return the user's own settings in a mapping, a dataclass or a namespace; none in None."""
     mapping = as_mapping({} if config is None else config)
     if mapping is None:
         raise ConfigError(
@@ -207,9 +187,5 @@ def settings_in(config: object) -> Mapping[Any, Any]:
 
 
 def pillow() -> Any:
-    """Return the module `PIL.Image`.
-
-    Raises:
-        MissingExtra: Pillow is not installed.
-    """
+    """Return the module `PIL.Image`."""
     return require("PIL.Image", extra="plots", purpose="recording frames")

@@ -19,11 +19,7 @@ _MAX_PIXELS: Final = 1 << 28
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture, or a film.
-
-    Raises:
-        ConfigError: it has no pixels, too many, or they are not RGB.
-    """
+    """A picture, or a film."""
 
     frames: NDArray[np.uint8]
     """[frames, height, width, 3]."""

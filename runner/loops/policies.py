@@ -45,11 +45,7 @@ MakePolicy = Callable[[object, object, object], Policy]
 
 
 def policy_named(name: str) -> MakePolicy:
-    """Return the function `module:function`; the module is imported, also from the current folder.
-
-    Raises:
-        ConfigError: there is none of that name, or importing the module fails.
-    """
+    """Return the function `module:function`; the module is imported, also from the current folder."""
     module_name, _, function_name = name.partition(":")
     if not module_name or not function_name:
         raise ConfigError(f"--policy: found {name!r}, expected module:function")
@@ -81,21 +77,12 @@ def play_checkpoint(
 ) -> Run:
     """Play a checkpoint in the recorded environment; return the run that it was recorded in.
 
-    Args:
-        run: the run that the checkpoint is of.
-        checkpoint: the checkpoint.
-        policy: `module:function`, see `policy_named`.
-        recordings: the recordings folder of the new run, whose settings name the run, step and digest.
-        episodes: the number of evaluation episodes.
-        seed: of the first reset; the following ones have the next numbers.
-        trust: whether to import what the recording names, and to load a pickle.
-        report: called with the number of episodes played.
+    `recordings`: the recordings folder of the new run, whose settings name the run, step and digest.
+    `seed`: of the first reset; the following ones have the next numbers.
+    `trust`: whether to import what the recording names, and to load a pickle.
 
     Raises:
         CannotRedo: the environment cannot be made again.
-        ConfigError: the policy cannot be imported.
-        RunnerError: the policy fails; what was played is kept.
-        RecordingError: the content of the checkpoint is not here, or was changed.
     """
     with open_recording(run.recording) as recording:
         maker = recording.maker_of("eval")
@@ -155,18 +142,8 @@ def values_along(
     The policy is called with each recorded observation before a step. It may return a number, an array, or a
     mapping of names to these; without names, the name is `value`.
 
-    Args:
-        recording: of a loop.
-        phase: `train` or `eval`.
-        episode: the number of an episode that ended.
-        checkpoint: of this run, or of another one with the same spaces.
-        policy: `module:function`, see `policy_named`.
-        trust: whether to load a pickle.
-
-    Raises:
-        ConfigError: the policy cannot be imported, or returns something else.
-        RunnerError: the policy fails.
-        RecordingError: there is no such episode, or the content of the checkpoint is not here.
+    `checkpoint`: of this run, or of another one with the same spaces.
+    `trust`: whether to load a pickle.
     """
     recording.episode_span(phase, episode)  # with its message, if there is none
     found = next(episodes_in(recording, phase, ((episode, episode + 1),)), None)
@@ -196,11 +173,7 @@ def values_along(
 
 
 def _named(value: object) -> dict[str, Array]:
-    """Return what a policy returned, by name.
-
-    Raises:
-        ConfigError: it is no number, array, or mapping of these.
-    """
+    """Return what a policy returned, by name."""
     pieces = value if isinstance(value, Mapping) else {"value": value}
     named = {}
     for name, piece in pieces.items():

@@ -134,14 +134,7 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
 def record_vec_env(env: VecEnv, options: dict[str, Any]) -> VecEnv:
     """Return a `VecEnv` whose environments are recorded, as they are inside of all wrappers.
 
-    Args:
-        env: the `VecEnv`; of one with wrappers, the innermost wrapper gets the recorded environments.
-        options: the arguments of `record_vector`.
-
-    Raises:
-        ConfigError: it is recorded already, or an argument cannot be used.
-        EnvironmentNotUsable: a space cannot be recorded.
-        StorageError: the recordings folder cannot be written.
+    `env`: the `VecEnv`; of one with wrappers, the innermost wrapper gets the recorded environments.
     """
     base = env.unwrapped
     if isinstance(base, RecordedVecEnv):

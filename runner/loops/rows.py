@@ -52,11 +52,7 @@ class PhaseRows(Protocol):
 class Rows:
     """The rows of one phase of one environment that are not committed yet, and the state of its episodes.
 
-    Args:
-        recorder: takes the rows.
-        described: the environment and its spaces.
-        phase: `train` or `eval`.
-        first_action: called with the first action of the phase before it is put down; may call `reshape`.
+    `first_action`: called with the first action of the phase before it is put down; may call `reshape`.
     """
 
     def __init__(
@@ -171,11 +167,7 @@ class Rows:
         self._room, self._reset_room = self._open_steps()
 
     def commit(self) -> None:
-        """Complete what was put down and hand it to the recorder; then `open` again.
-
-        Raises:
-            StorageError: the disk is full or failing.
-        """
+        """Complete what was put down and hand it to the recorder; then `open` again."""
         n, before = self.filled, sum(self._recorder.steps.values())
         if not (n or self._ends or self._reset_rows):
             return

@@ -24,20 +24,12 @@ _PACKAGE: Final = str(Path(__file__).parents[1])
 
 
 def lone_number(value: object, what: str) -> float:
-    """Return a number that may stand in an array of one.
-
-    Raises:
-        RecordingError: it is not a number.
-    """
+    """Return a number that may stand in an array of one."""
     return float(_lone(value, what, "iubf", "a number"))
 
 
 def whole_number(value: object, what: str) -> int:
-    """Return a whole number that may stand in an array of one.
-
-    Raises:
-        RecordingError: it is not a whole number.
-    """
+    """Return a whole number that may stand in an array of one."""
     return int(_lone(value, what, "iub", "a whole number of its Discrete space"))
 
 
@@ -49,11 +41,7 @@ def _lone(value: object, what: str, kinds: str, expected: str) -> NDArray[Any]:
 
 
 def logged_number(name: str, value: Any) -> float:
-    """Return a logged number, which may stand in an array of one.
-
-    Raises:
-        ConfigError: it is not a number.
-    """
+    """Return a logged number, which may stand in an array of one."""
     try:
         if callable(detach := getattr(value, "detach", None)):  # a tensor of PyTorch
             value = detach()
@@ -66,11 +54,7 @@ def logged_number(name: str, value: Any) -> float:
 
 
 def check_log_name(name: object, value: object) -> None:
-    """Refuse a name that a logged value cannot have.
-
-    Raises:
-        ConfigError: it is empty, or not text.
-    """
+    """Refuse a name that a logged value cannot have."""
     if name == "":
         raise ConfigError(f"log: found an empty name for {value!r}, expected a name that is not empty")
     if not isinstance(name, str) or not is_utf8(name):
@@ -78,11 +62,7 @@ def check_log_name(name: object, value: object) -> None:
 
 
 def arrays_of(name: str, value: object) -> Iterator[tuple[str, Array]]:
-    """Yield the arrays of a snapshot: the value itself, or those of a mapping as `name/key`.
-
-    Raises:
-        ConfigError: a value holds something else than numbers, or too many.
-    """
+    """Yield the arrays of a snapshot: the value itself, or those of a mapping as `name/key`."""
     if not isinstance(name, str) or not is_utf8(name):
         raise ConfigError(f"snapshot: found the name {name!r}, expected an array of numbers and a name.")
     if (inside := as_mapping(value)) is not None:
@@ -118,11 +98,7 @@ def as_array(value: Any) -> NDArray[Any]:
 
 
 def check_phase(phase: str) -> None:
-    """Refuse what is not a phase.
-
-    Raises:
-        ConfigError: it is not.
-    """
+    """Refuse what is not a phase."""
     if phase not in schema.PHASES:
         raise ConfigError(f"phase: found {phase!r}, expected one of {', '.join(schema.PHASES)}")
 

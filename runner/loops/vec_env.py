@@ -19,8 +19,7 @@ class VecEnvVector(AnyVectorEnv):
     A `DummyVecEnv` rounds rewards to float32. As long as this object is open they are kept as they came, and
     rounded for `native`.
 
-    Args:
-        base: the `VecEnv`. Its methods are those that it has now: they may be replaced afterwards.
+    `base`: the `VecEnv`. Its methods are those that it has now: they may be replaced afterwards.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012

@@ -86,12 +86,8 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
     ) -> None:
         """Record a step of all environments.
 
-        Args:
-            actions: of all.
-            result: what the vector returned.
-            extras: the user's own arrays by name.
-            over: [N], whether their episodes were over before; None where that does not matter.
-            states: what resets within the step depended on.
+        `over`: [N], whether their episodes were over before; None where that does not matter.
+        `states`: what resets within the step depended on.
         """
         observations, rewards, terminated, truncated, infos = result
         final = final_observations(infos) if self._mode == AutoresetMode.SAME_STEP else None
@@ -161,13 +157,9 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
     ) -> None:
         """Record a reset of some environments, or of all, that was just done.
 
-        Args:
-            observations: batched.
-            infos: as the reset returned them.
-            seeds: of all environments; empty for none.
-            which: [N], the environments; all unless given.
-            states: what the reset depended on, as far as it is to be recorded.
-            options: of the reset.
+        `seeds`: of all environments; empty for none.
+        `which`: [N], the environments; all unless given.
+        `states`: what the reset depended on, as far as it is to be recorded.
         """
         which = np.ones(self.env.num_envs, np.bool_) if which is None else which
         with self._loop.lock:
@@ -238,12 +230,7 @@ def record_vector(
 
 
 def autoreset_mode_of(envs: AnyVectorEnv | None, chosen: AutoresetMode | str | None) -> AutoresetMode:
-    """Return how environments reset themselves: as chosen, else as their metadata states.
-
-    Raises:
-        ConfigError: there is no such mode.
-        EnvironmentNotUsable: none is chosen and none is stated.
-    """
+    """Return how environments reset themselves: as chosen, else as their metadata states."""
     if chosen is not None or envs is None:
         try:
             return AutoresetMode(chosen)

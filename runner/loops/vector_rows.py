@@ -35,12 +35,8 @@ class VectorRows:
 
     Not thread-safe: the caller holds the loop's lock.
 
-    Args:
-        recorder: takes their records.
-        described: the environments and their spaces.
-        phase: `train` or `eval`.
-        first_action: called with the first action of the phase before it is recorded; may call `reshape`.
-        next_step: whether an environment whose episode is over ignores its next action and is reset.
+    `first_action`: called with the first action of the phase before it is recorded; may call `reshape`.
+    `next_step`: whether an environment whose episode is over ignores its next action and is reset.
     """
 
     off_table = 0
@@ -157,15 +153,10 @@ class VectorRows:
     ) -> None:
         """Record a step of all environments.
 
-        Args:
-            actions: batched, as the vector environment takes it.
-            observations: batched, as it returns it.
-            rewards: [N].
-            terminated: [N].
-            truncated: [N].
-            final: the last observations of episodes that ended, where `observations` are already of the
-                next ones; None where they are not.
-            states: what the resets in place of steps depended on, if it is to be recorded.
+        `rewards`, `terminated` and `truncated`: [N].
+        `final`: the last observations of episodes that ended, where `observations` are already of the next
+        ones; None where they are not.
+        `states`: what the resets in place of steps depended on, if it is to be recorded.
         """
         if not self._room:
             self._first_action(actions)
@@ -208,11 +199,9 @@ class VectorRows:
     def reset(self, observation: object, seeds: Sequence[int | None], which: Flags, states: States) -> None:
         """Record a reset of some environments; it ends episodes in progress in them.
 
-        Args:
-            observation: batched.
-            seeds: of all environments; empty for none.
-            which: [N], the environments.
-            states: what the reset depended on, if it is to be recorded.
+        `seeds`: of all environments; empty for none.
+        `which`: [N], the environments.
+        `states`: what the reset depended on, if it is to be recorded.
         """
         chosen = np.flatnonzero(which)
         own_seeds = [seeds[i] if len(seeds) else None for i in chosen.tolist()]
@@ -244,11 +233,7 @@ class VectorRows:
             self._return[which] = 0.0
 
     def commit(self) -> None:
-        """Make the records of the block and hand them to the recorder.
-
-        Raises:
-            StorageError: the disk is full or failing.
-        """
+        """Make the records of the block and hand them to the recorder."""
         rows, n = self._filled, self._n
         if not rows:
             return

@@ -26,12 +26,7 @@ Policy = NDArray[np.int32] | Sequence[NDArray[np.float64]]
 
 
 class ExactEvaluator:
-    """Evaluates policies exactly in one environment; the optimum is computed once for each discount.
-
-    Args:
-        mdp: the environment; it must have a step limit.
-        learners: 1, or the number of agents.
-    """
+    """Evaluates policies exactly in one environment; the optimum is computed once for each discount."""
 
     def __init__(self, mdp: Mdp, learners: int) -> None:
         self._mdp = mdp
@@ -43,10 +38,8 @@ class ExactEvaluator:
 
         With a discount of 1 the values are nan: those of a process without end are not defined.
 
-        Args:
-            policy: [S]: the joint action of each state; or, for learners that draw, an array for each,
-                [S, n]: the probability of each of its own actions.
-            discount: of values; 1 if undiscounted.
+        `policy`: [S]: the joint action of each state; or, for learners that draw, an array for each, [S, n]:
+        the probability of each of its own actions.
         """
         if isinstance(policy, np.ndarray):
             outcome = evaluate_policy(self._mdp, policy, self._learners, discount)

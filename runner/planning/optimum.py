@@ -22,9 +22,6 @@ def optimal_values(mdp: Mdp, discount: float) -> NDArray[np.float64]:
 
     Value iteration, in place: Sutton and Barto, Reinforcement Learning, 2nd edition, section 4.4. The
     horizon is infinite: an episode that the environment cuts off counts as if it went on.
-
-    Raises:
-        EnvironmentNotUsable: the discount is not below 1.
     """
     weight = _weight(mdp, discount)
     reward = (mdp.probability * mdp.summed_rewards).sum(axis=-1)
@@ -47,15 +44,9 @@ def best_response(
 ) -> NDArray[np.float64]:
     """Return what one learner can get at most from each state while all others keep to a policy, [S].
 
-    Args:
-        mdp: the environment.
-        policy: [S]: the joint action of each state.
-        learner: whose own action is free, and whose reward counts.
-        learners: how many there are; 1 is all agents together, whose best response is the optimum.
-        discount: below 1.
-
-    Raises:
-        EnvironmentNotUsable: the discount is not below 1.
+    `policy`: [S]: the joint action of each state.
+    `learner`: whose own action is free, and whose reward counts.
+    `learners`: how many there are; 1 is all agents together, whose best response is the optimum.
     """
     widths = mdp.action_counts if learners > 1 else (mdp.joint_actions,)
     stride = int(np.prod(widths[learner + 1 :], dtype=np.int64))
@@ -72,15 +63,9 @@ def best_response_to_stochastic(
 ) -> NDArray[np.float64]:
     """Return what one learner can get at most from each state while all others draw from their policies, [S].
 
-    Args:
-        mdp: the environment.
-        policies: one a learner, [S, n]: the probability of each of its own actions; a single one is over
-            joint actions, and its best response is the optimum.
-        learner: whose own action is free, and whose reward counts.
-        discount: below 1.
-
-    Raises:
-        EnvironmentNotUsable: the discount is not below 1.
+    `policies`: one a learner, [S, n]: the probability of each of its own actions; a single one is over joint
+    actions, and its best response is the optimum.
+    `learner`: whose own action is free, and whose reward counts.
     """
     widths = tuple(policy.shape[1] for policy in policies)
     states, outcomes = mdp.states, mdp.probability.shape[2]
@@ -101,11 +86,7 @@ def best_response_to_stochastic(
 
 
 def require_discount(discount: float) -> None:
-    """Refuse a discount with which an infinite process may have no value.
-
-    Raises:
-        EnvironmentNotUsable: it is not below 1.
-    """
+    """Refuse a discount with which an infinite process may have no value."""
     if not 0 <= discount < 1:
         raise EnvironmentNotUsable(
             f"found discount {discount}, expected one from 0 up to below 1: "

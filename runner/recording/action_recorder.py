@@ -17,10 +17,7 @@ from runner.recording.schema import RESET_ONLY, Topic
 class ActionRecorder:
     """Records the actions of the steps that a recorder gets and leaves out of the file.
 
-    Args:
-        recorder: takes the messages.
-        environments: how many take turns.
-        block_steps: how many steps a message has, but for those that are flushed by time.
+    `block_steps`: how many steps a message has, but for those that are flushed by time.
     """
 
     def __init__(self, recorder: Recorder, environments: int, block_steps: int) -> None:
@@ -55,11 +52,7 @@ class ActionRecorder:
             self.commit()
 
     def commit(self) -> None:
-        """Hand what was taken to the recorder.
-
-        Raises:
-            StorageError: the disk is full or failing.
-        """
+        """Hand what was taken to the recorder."""
         if self._rows:
             rows, self._rows = np.concatenate(self._rows), []
             position = int(rows["log_time"][-1]) // schema.STEP_NANOSECONDS

@@ -33,11 +33,7 @@ def pack_array(array: Array) -> bytes:
 
 
 def unpack_array(data: bytes, max_bytes: int, where: str) -> Array:
-    """Return the array in a compressed `.npy` file; never unpickles or takes more memory than it declares.
-
-    Raises:
-        RecordingError: it holds no array, or one of more than `max_bytes`.
-    """
+    """Return the array in a compressed `.npy` file; never unpickles or takes more memory than it declares."""
     try:
         with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data) as stream:
             return _read_array(stream, max_bytes, where)

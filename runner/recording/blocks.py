@@ -55,11 +55,9 @@ MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
 def record_dtype(message: MessageType, sizes: Sizes) -> np.dtype[np.void]:
     """Return the dtype of a whole MCAP message record of a fixed-width message.
 
-    Args:
-        message: its fields must all be of fixed width.
-        sizes: of each repeated field the number of elements, of each bytes field its dtype, in order.
-
     Fields named `tag…` hold protobuf's constant bytes (see `blank_records`).
+
+    `sizes`: of each repeated field the number of elements, of each bytes field its dtype, in order.
     """
     layout: list[tuple[object, ...]] = list(HEADER)
     for field, value in zip(message.fields, _value_dtypes(message, sizes), strict=True):
@@ -131,15 +129,7 @@ def topic_sizes(
     action: np.dtype[np.generic] | None = None,
     observation: np.dtype[np.generic] | None = None,
 ) -> Sizes:
-    """Return the sizes of a topic in a run, as `record_dtype` takes them.
-
-    Args:
-        topic: one of `ALL_BLOCK_TOPICS`.
-        learners: number of reward columns.
-        events: number of event counters.
-        action: dtype of an action, for `Transition`.
-        observation: dtype of an observation, for `Transition` and `Reset`.
-    """
+    """Return the sizes of a topic in a run, as `record_dtype` takes them."""
     known: dict[MessageType, tuple[int | np.dtype[np.generic] | None, ...]] = {
         STEP: (learners,),
         EPISODE: (learners, events),

@@ -50,11 +50,8 @@ class _Gathered:
 class _Compaction:
     """Writes the chunks of one recording into another.
 
-    Args:
-        file: the new recording.
-        packing: how chunks are packed, and the most steps whose actions share a message.
-        steps: the dtype of whole steps, by the topic of their actions.
-        environments: how many take turns.
+    `packing`: how chunks are packed, and the most steps whose actions share a message.
+    `steps`: the dtype of whole steps, by the topic of their actions.
     """
 
     def __init__(
@@ -134,11 +131,8 @@ def compacted(
 
     Metadata, attachments and all messages are the same, but that more actions share a message.
 
-    Args:
-        file: the recording; it is closed.
-        packing: how its chunks are packed.
-        steps: the dtype of whole steps, by the topic of their actions.
-        environments: how many take turns.
+    `file`: the recording; it is closed.
+    `steps`: the dtype of whole steps, by the topic of their actions.
 
     Raises:
         OSError: the new recording cannot be written; the old one is as before.

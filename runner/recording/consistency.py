@@ -62,16 +62,12 @@ class _State:
 def check_phase(recording: Recording, phase: str, complete: bool, on_block: OnBlock) -> Findings:
     """Compare the steps, resets and episodes of a phase with one another; each block is read once.
 
-    Args:
-        recording: of a loop.
-        phase: `train` or `eval`.
-        complete: whether the recording was completed; else it is checked up to its last reset, as later ones
-            may not have been written.
-        on_block: called with each block of a fixed-width topic, also of what is not compared.
+    `complete`: whether the recording was completed; else it is checked up to its last reset, as later ones
+    may not have been written.
+    `on_block`: called with each block of a fixed-width topic, also of what is not compared.
 
     Raises:
         Inconsistent: something does not follow from the rest.
-        RecordingError: the recording cannot be read.
     """
     return _Phase(recording, phase, complete, on_block).check()
 
@@ -79,15 +75,10 @@ def check_phase(recording: Recording, phase: str, complete: bool, on_block: OnBl
 def check_extras(recording: Recording, phase: str, complete: bool, on_block: OnBlock) -> None:
     """Compare the extras of a phase with its steps: each belongs to a step, at its time, in their order.
 
-    Args:
-        recording: of a loop.
-        phase: `train` or `eval`.
-        complete: whether the recording was completed; else the steps of the last extras may be missing.
-        on_block: called with each block of extras.
+    `complete`: whether the recording was completed; else the steps of the last extras may be missing.
 
     Raises:
         Inconsistent: one does not.
-        RecordingError: the recording cannot be read.
     """
     extras, last = recording.extras(phase), -1
     steps, topic = recording.topic(f"/{phase}/step"), recording.topic(f"/{phase}/extra")
@@ -294,13 +285,8 @@ class _Phase:
     ) -> None:
         """Compare the records of the episodes that ended in a block with its steps.
 
-        Args:
-            b: the block.
-            lengths: of each segment's episode.
-            returns: of each segment's episode.
-            counts: events and penalties of each segment's episode.
-            ended: whether each segment's episode ended in the block.
-            interrupted: whether a reset before the segment ended the episode of the block before.
+        `ended`: whether each segment's episode ended in the block.
+        `interrupted`: whether a reset before the segment ended the episode of the block before.
         """
         n, state, done = self._n, self._state, np.flatnonzero(ended)
         owners = b.heads[np.flatnonzero(interrupted)] // b.times

@@ -36,11 +36,7 @@ from runner.util.values import Json
 
 
 class RunDescription(ABC):
-    """What is recorded about a run besides its messages; raises a `RecordingError` where it is damaged.
-
-    Args:
-        path: the file or folder, for errors.
-    """
+    """What is recorded about a run besides its messages; raises a `RecordingError` where it is damaged."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -80,12 +80,7 @@ class ExtraLayout:
 def read_layouts(columns: Iterable[tuple[int, str]], where: str) -> list[ExtraLayout]:
     """Return the layouts of a recording.
 
-    Args:
-        columns: log time and text of each `ExtraColumns`, in order.
-        where: the recording, for errors.
-
-    Raises:
-        RecordingError: they are not what a recorder writes.
+    `columns`: log time and text of each `ExtraColumns`, in order.
     """
     layouts: list[ExtraLayout] = []
     for time, text in columns:
@@ -122,10 +117,8 @@ def _values_dtype(description: dict[str, object], what: str) -> np.dtype[Any]:
 class Extras(Mapping[str, np.dtype[np.generic]]):
     """The extras of a phase: a mapping of the names to their dtypes, which include the shapes.
 
-    Args:
-        parts: each layout, and the chunks of the phase that have it.
-        episode_span: returns the numbers of an episode's steps.
-        where: the recording, for errors.
+    `parts`: each layout, and the chunks of the phase that have it.
+    `episode_span`: returns the numbers of an episode's steps.
     """
 
     def __init__(

@@ -83,12 +83,7 @@ def value_of(space: Space, text: str) -> object:
 
 
 def structure_of(space: Space, describe: Callable[[Space], object]) -> Mapping[str, object]:
-    """Return what describes a space whose values are recorded as text.
-
-    Args:
-        space: the space.
-        describe: returns the description of a part.
-    """
+    """Return what describes a space whose values are recorded as text."""
     kind, own = registered(space), {"holds": repr(space)[:_MAX_REPR]}
     if kind is not None:
         return own | {"space": {"type": f"{kind.__module__}:{kind.__qualname__}"}}

@@ -26,11 +26,9 @@ Put = Callable[[int, Any], None]
 class Leaf:
     """A part of a space, with the checks that its values pass before they are recorded.
 
-    Args:
-        part: where the part is in a value, and its dtype.
-        what: `observation` or `action`. An action may have another shape with as many numbers, because
-            only the environment knows which shapes it accepts.
-        on_rounded: called with a text the first time that a value is rounded.
+    `what`: `observation` or `action`. An action may have another shape with as many numbers, because only the
+    environment knows which shapes it accepts.
+    `on_rounded`: called with a text the first time that a value is rounded.
     """
 
     def __init__(self, part: Part, what: str, on_rounded: OnRounded) -> None:
@@ -51,12 +49,7 @@ class Leaf:
     def fit(self, value: object, batch: tuple[int, ...] = ()) -> Array:
         """Return a value as an array that can be recorded.
 
-        Args:
-            value: the value of this part alone.
-            batch: the shape of the batch that it is, if it is one.
-
-        Raises:
-            RecordingError: it has another shape, holds no numbers, or numbers out of the dtype's range.
+        `batch`: the shape of the batch that it is, if it is one.
         """
         array = np.asarray(value)
         shape = batch + self.shape
@@ -99,13 +92,8 @@ def leaves_of(space: Space, what: str, where: str = "", on_rounded: OnRounded = 
 def filler(leaves: Sequence[Leaf], column: NDArray[Any], batch: tuple[int, ...] = ()) -> Put:
     """Return a function that puts a value of a space into a row of a column.
 
-    Args:
-        leaves: the leaves of the space.
-        column: [rows, *batch] values of the space.
-        batch: the shape of the batch that each value is, if it is one.
-
-    Raises:
-        RecordingError: (from the returned function) a value is not of its space.
+    `column`: [rows, *batch] values of the space.
+    `batch`: the shape of the batch that each value is, if it is one.
     """
     if len(leaves) == 1 and not leaves[0].part.keys:
         return _leaf_filler(leaves[0], column, batch)
@@ -150,11 +138,7 @@ def _column_of(leaf: Leaf, column: NDArray[Any]) -> NDArray[Any]:
 
 
 def fitted(leaves: Sequence[Leaf], value: object, batch: tuple[int, ...]) -> list[Array]:
-    """Return a batch of values of a space as an array for each leaf, [*batch, ...].
-
-    Raises:
-        RecordingError: it is not of its space, or not of this shape.
-    """
+    """Return a batch of values of a space as an array for each leaf, [*batch, ...]."""
     arrays = []
     for leaf in leaves:
         try:
@@ -185,11 +169,7 @@ def leaves_by_agent(space: Any, what: str, on_rounded: OnRounded = lambda _: Non
 def filler_by_agent(
     leaves: Mapping[str, Sequence[Leaf]], column: NDArray[Any]
 ) -> Callable[[int, Mapping[str, Any]], None]:
-    """Return a function that puts the values of some agents into a row, and zeros for the others.
-
-    Raises:
-        RecordingError: (from the returned function) there is no such agent, or a value is not of its space.
-    """
+    """Return a function that puts the values of some agents into a row, and zeros for the others."""
     fillers = {agent: filler(own, column) for agent, own in leaves.items()}
     zeros = np.zeros((), column.dtype)
 
@@ -205,11 +185,7 @@ def filler_by_agent(
 
 
 def value_bytes(leaves: Sequence[Leaf], value: object) -> bytes:
-    """Return a value of a space as its bytes in a recording.
-
-    Raises:
-        RecordingError: it is not of the space, or too large.
-    """
+    """Return a value of a space as its bytes in a recording."""
     pieces = []
     for leaf in leaves:
         try:
@@ -226,11 +202,7 @@ def value_bytes(leaves: Sequence[Leaf], value: object) -> bytes:
 
 
 def put_chosen(leaves: Sequence[Leaf], values: object, into: Array, which: NDArray[np.intp]) -> None:
-    """Put values of single environments into their rows, as a vector's info holds them.
-
-    Raises:
-        RecordingError: they are not of the space.
-    """
+    """Put values of single environments into their rows, as a vector's info holds them."""
     put = filler(leaves, into)
     for i in which.tolist():
         put(i, element_of(values, i))

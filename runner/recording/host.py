@@ -161,15 +161,7 @@ class HostMetrics:
 
 
 def read_host(recording: TopicReader, clock: Clock | None) -> HostMetrics | None:
-    """Return what a run used of its machine; None if that was not recorded.
-
-    Args:
-        recording: the recording.
-        clock: its clock.
-
-    Raises:
-        RecordingError: samples are damaged, or too many.
-    """
+    """Return what a run used of its machine; None if that was not recorded."""
     rows: list[tuple[float, ...]] = []
     gpus: list[list[list[float]]] = []
     name = schema.HOST_TOPIC.name

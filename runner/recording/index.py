@@ -83,11 +83,7 @@ class ChunkTable:
         return ChunkEntry(*_ENTRY.unpack_from(self._packed, k * _ENTRY.size))
 
     def append(self, entry: ChunkEntry) -> None:
-        """Add a chunk after the last one.
-
-        Raises:
-            RecordingError: no recorder writes a chunk of the size, or at the place, that it declares.
-        """
+        """Add a chunk after the last one."""
         where = f"the chunk at {entry.offset}"
         if entry.length > MAX_CHUNK_BYTES or entry.uncompressed_size > MAX_CHUNK_BYTES:
             size = max(entry.length, entry.uncompressed_size)
@@ -104,11 +100,7 @@ class ChunkTable:
         self._packed += _ENTRY.pack(*entry)
 
     def set_channel(self, channel: int) -> None:
-        """Set the channel of the last chunk's messages.
-
-        Raises:
-            RecordingError: it was set before, or no recording has such a channel.
-        """
+        """Set the channel of the last chunk's messages."""
         last = self[len(self) - 1]
         if last.channel or channel not in TOPIC_OF:
             raise RecordingError(
@@ -142,11 +134,7 @@ class Index:
 
 
 def read_index(stream: BinaryIO, path: str) -> Index:
-    """Return the index of a recording: by its summary if it is finished, else by walking its records.
-
-    Raises:
-        RecordingError: it is not a dualtaxi recording, or is damaged before its first chunk.
-    """
+    """Return the index of a recording: by its summary if it is finished, else by walking its records."""
     size = stream.seek(0, 2)
     try:
         _check_beginning(stream)

@@ -72,16 +72,7 @@ def labels_from(values: Mapping[str, object]) -> Labels:
 
 
 def change_labels(folder: Path, change: Callable[[Labels], Labels]) -> Labels:
-    """Change the labels of the run in a folder, under a lock, and return them.
-
-    Args:
-        folder: the run's.
-        change: takes the current labels and returns the new ones.
-
-    Raises:
-        RunnerError: there are too many tags, or the note is too long.
-        StorageError: the folder cannot be written.
-    """
+    """Change the labels of the run in a folder, under a lock, and return them."""
     from filelock import FileLock, Timeout
 
     with storage_errors(folder / LABELS_FILE):

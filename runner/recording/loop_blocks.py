@@ -92,11 +92,7 @@ def aligned(
 class Blocks:
     """The blocks of a phase, each of whole steps of all environments.
 
-    Args:
-        recording: of a loop.
-        phase: `train` or `eval`.
-        complete: whether the recording was completed; else the blocks end at its last reset.
-        on_block: called with each block as it was recorded.
+    `complete`: whether the recording was completed; else the blocks end at its last reset.
     """
 
     def __init__(self, recording: Recording, phase: str, complete: bool, on_block: OnBlock) -> None:

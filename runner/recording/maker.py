@@ -102,15 +102,7 @@ class EnvironmentMaker:
 
 
 def parse_maker(values: Mapping[str, object], where: str) -> EnvironmentMaker:
-    """Return the maker in a metadata record.
-
-    Args:
-        values: the JSON object in it.
-        where: of the recording, for errors.
-
-    Raises:
-        RecordingError: a value is missing or not possible; it is named.
-    """
+    """Return the maker in a metadata record."""
     check = _Check(values, f"{where}: its {MAKER_RECORD}")
     vector = values.get("vector")
     return EnvironmentMaker(
@@ -227,11 +219,7 @@ class Shard(NamedTuple):
 
 
 def parse_shards(text: str | None, where: str) -> tuple[Shard, ...]:
-    """Return the shards in a metadata record `run`; none for a run of one process.
-
-    Raises:
-        RecordingError: they are damaged.
-    """
+    """Return the shards in a metadata record `run`; none for a run of one process."""
     if text is None:
         return ()
     try:

@@ -126,11 +126,7 @@ def _scalar_struct(before_value: int, before_step: int) -> struct.Struct:
 
 
 def decode(message: MessageType, payload: bytes) -> Message:
-    """Return the values of a message's fields; repeated ones as lists.
-
-    Raises:
-        RecordingError: the payload is not such a message.
-    """
+    """Return the values of a message's fields; repeated ones as lists."""
     try:
         parsed = message_class(message).FromString(payload)
     except DecodeError as error:
@@ -147,9 +143,7 @@ def unknown_measures(message: MessageType, schema_data: bytes) -> list[str]:
 
     Protobuf reads such a field as 0, as if that had been measured.
 
-    Args:
-        message: the message as this version defines it.
-        schema_data: the schema in the recording, a serialized FileDescriptorSet.
+    `schema_data`: the schema in the recording, a serialized FileDescriptorSet.
     """
     try:
         files = descriptor_pb2.FileDescriptorSet.FromString(schema_data).file
@@ -181,11 +175,7 @@ def encode_q_table(table: QTable) -> bytes:
 
 
 def decode_q_table(payload: bytes) -> QTable:
-    """Return the snapshot in a `dualtaxi.QTable`.
-
-    Raises:
-        RecordingError: shape, dtype and data do not fit together.
-    """
+    """Return the snapshot in a `dualtaxi.QTable`."""
     fields = decode(schema.Q_TABLE, payload)
     shape, data = tuple(fields["shape"]), fields["data"]
     if fields["dtype"] != "<f8" or len(shape) != 2 or shape[0] * shape[1] * 8 != len(data):
@@ -209,11 +199,7 @@ class Snapshot:
 
 
 def decode_array(payload: bytes) -> Snapshot:
-    """Return the array in a `dualtaxi.Array`.
-
-    Raises:
-        RecordingError: shape, dtype and data do not fit together.
-    """
+    """Return the array in a `dualtaxi.Array`."""
     fields = decode(schema.ARRAY, payload)
     shape, kind, data = tuple(fields["shape"]), fields["dtype"], fields["data"]
     if not NUMBERS.fullmatch(kind) or math.prod(shape) * np.dtype(kind).itemsize != len(data):

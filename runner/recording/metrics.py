@@ -157,12 +157,7 @@ METRIC_OF: Final[dict[str, Metric]] = {
 
 
 def defined_metrics(has_success: bool, has_penalties: bool) -> tuple[EvaluationMetric, ...]:
-    """Return the measures of an evaluation that an environment defines.
-
-    Args:
-        has_success: whether it states which events are a success.
-        has_penalties: whether it states which rewards are penalties.
-    """
+    """Return the measures of an evaluation that an environment defines."""
     defined = {"": True, "success_events": has_success, "penalty_below": has_penalties}
     return tuple(metric for metric in METRICS if defined[metric.requires])
 

@@ -31,11 +31,7 @@ _MAX_WAITING: Final = 1 << 18
 class Observer:
     """What is seen while one run is recorded.
 
-    Args:
-        folder: the folder of the run.
-        stopwatch: the run's; nothing is seen before it runs.
-        host: whether the machine is watched.
-        console: returns a line of the output as it is to be recorded; None for no output.
+    `console`: returns a line of the output as it is to be recorded; None for no output.
     """
 
     def __init__(

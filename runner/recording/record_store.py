@@ -30,9 +30,7 @@ _SMALL: Final = 8 << 20
 class RecordStore:
     """Reads records by their places.
 
-    Args:
-        stream: the file; closed with the store.
-        path: its path, for errors.
+    `stream`: the file; closed with the store.
     """
 
     def __init__(self, stream: BinaryIO, path: str) -> None:
@@ -49,11 +47,7 @@ class RecordStore:
         self._stream.close()
 
     def record(self, opcode: int, offset: int, length: int, max_bytes: int = MAX_CHUNK_BYTES) -> memoryview:
-        """Return the body of a record; its length includes the head.
-
-        Raises:
-            RecordingError: it is of another kind, cut off, larger than `max_bytes`, or cannot be read.
-        """
+        """Return the body of a record; its length includes the head."""
         if length > max_bytes:
             raise RecordingError(
                 f"{self._path}: the record at {offset} declares {length:,} bytes, "
@@ -72,11 +66,7 @@ class RecordStore:
         return memoryview(data)[RECORD_HEAD.size :]
 
     def metadata(self, name: str, offset: int, length: int) -> dict[str, str]:
-        """Return the entries of a metadata record.
-
-        Raises:
-            RecordingError: it cannot be read, or has another name.
-        """
+        """Return the entries of a metadata record."""
         try:
             body = bytes(self.record(Opcode.METADATA, offset, length, MAX_METADATA_BYTES))
             found, entries = metadata_of(body)
@@ -89,11 +79,7 @@ class RecordStore:
         return entries
 
     def attachment(self, name: str, offset: int, length: int) -> tuple[str, bytes]:
-        """Return an attachment's media type and data, after comparing its checksum.
-
-        Raises:
-            RecordingError: it cannot be read, is damaged, or has another name.
-        """
+        """Return an attachment's media type and data, after comparing its checksum."""
         body = bytes(self.record(Opcode.ATTACHMENT, offset, length))
         try:
             found, media_type, data = attachment_of(body, offset)
@@ -106,22 +92,14 @@ class RecordStore:
         return media_type, data
 
     def chunk(self, entry: ChunkEntry) -> bytes:
-        """Return a chunk's message records, after comparing its checksum; the last few are cached.
-
-        Raises:
-            RecordingError: it is damaged.
-        """
+        """Return a chunk's message records, after comparing its checksum; the last few are cached."""
         if entry.offset in self._cached:
             self._cached.move_to_end(entry.offset)
             return self._cached[entry.offset]
         return self._cache(entry, self._unpacked(entry))
 
     def chunks(self, entries: Iterable[ChunkEntry]) -> Iterator[bytes]:
-        """Yield the message records of chunks in order; the next ones are unpacked meanwhile.
-
-        Raises:
-            RecordingError: one is damaged.
-        """
+        """Yield the message records of chunks in order; the next ones are unpacked meanwhile."""
         pending: deque[tuple[ChunkEntry, Future[bytes] | None]] = deque()
         for k, entry in enumerate(entries):
             small = entry.uncompressed_size + entry.length <= _SMALL
@@ -133,11 +111,7 @@ class RecordStore:
             yield self._result(*pending.popleft())
 
     def first_channel(self, entry: ChunkEntry) -> int:
-        """Return the channel of a chunk's first message, where no index states it.
-
-        Raises:
-            RecordingError: it is damaged.
-        """
+        """Return the channel of a chunk's first message, where no index states it."""
         return first_channel(self.record(Opcode.CHUNK, entry.offset, entry.length), self._where(entry))
 
     @cached_property

@@ -72,10 +72,6 @@ class Repair:
 def repair(path: Path, report: Report = lambda *_: None) -> Repair:
     """Make a recording whole; the file is not touched until its successor is complete and read back.
 
-    Args:
-        path: the recording.
-        report: called with the bytes that were read, and the size of the file; it is read up to three times.
-
     Raises:
         RecordingError: it is not a dualtaxi recording, or its description is damaged.
         StorageError: there is no space for the new file, or the folder cannot be written.
@@ -131,11 +127,7 @@ def _kind(file: DamagedFile, path: Path) -> str:
 
 
 def _read_back(fresh: Path, done: Repair, report: Report) -> None:
-    """Check every byte of the new file, and count its messages.
-
-    Raises:
-        RecordingError: it is not as it should be; the old file stays.
-    """
+    """Check every byte of the new file, and count its messages."""
     check_integrity(fresh, report)
     with open_recording(fresh) as recording:
         for topic in recording.topics:
@@ -271,11 +263,7 @@ class _Salvage:
 
 
 def _recorded_counts(result: dict[str, str]) -> dict[str, int]:
-    """Return how many messages of each topic were recorded, according to a result.
-
-    Raises:
-        RecordingError: it does not say.
-    """
+    """Return how many messages of each topic were recorded, according to a result."""
     values = json_object(result.get("json"), "the metadata 'result'")
     counts = values.get("messages", {})
     if not isinstance(counts, dict) or not all(is_whole(n, 0, _MAX_MESSAGES) for n in counts.values()):

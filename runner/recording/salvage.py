@@ -34,15 +34,7 @@ _ALWAYS_WASTED: Final = 256 << 20
 
 
 class DamagedFile:
-    """A file of which any part may be damaged.
-
-    Args:
-        stream: the file, open for reading.
-        path: its path, for errors.
-
-    Raises:
-        RecordingError: it is empty, does not begin as a recording does, or cannot be read.
-    """
+    """A file of which any part may be damaged."""
 
     def __init__(self, stream: BinaryIO, path: Path) -> None:
         self._stream = stream
@@ -59,14 +51,7 @@ class DamagedFile:
             raise RecordingError(f"{path}: found {magic!r} at its start, expected an MCAP file.")
 
     def good_records(self, report: Report = lambda *_: None) -> Iterator[tuple[int, int, bytes]]:
-        """Yield (opcode, offset, body) of the readable records, skipping all others.
-
-        Args:
-            report: called with the bytes that were read, and the size of the file.
-
-        Raises:
-            RecordingError: too much only looks like chunks.
-        """
+        """Yield (opcode, offset, body) of the readable records, skipping all others."""
         offset = len(MCAP0_MAGIC)
         while offset + RECORD_HEAD.size <= self.size:
             report(offset, self.size)

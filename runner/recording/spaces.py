@@ -51,11 +51,7 @@ class Leaf:
 
 
 def leaves_of(description: object, where: str) -> list[Leaf]:
-    """Return the leaves of a space in order.
-
-    Raises:
-        RecordingError: this describes no space; `where` is named.
-    """
+    """Return the leaves of a space in order."""
     try:
         leaves = list(_leaves(description, ()))
         if len(leaves) > _MAX_LEAVES:
@@ -69,22 +65,14 @@ def leaves_of(description: object, where: str) -> list[Leaf]:
 
 
 def dtype_of(description: Any, where: str) -> np.dtype[np.generic] | None:
-    """Return the dtype of a space's values, `Dict` and `Tuple` as fields; None if their size varies.
-
-    Raises:
-        RecordingError: this describes no space; `where` is named.
-    """
+    """Return the dtype of a space's values, `Dict` and `Tuple` as fields; None if their size varies."""
     if any(leaf.dtype is None for leaf in leaves_of(description, where)):
         return None
     return _dtype(description)
 
 
 def decode(description: Description, data: bytes, where: str) -> Any:
-    """Return the value that stands in these bytes: dictionaries, tuples, texts and arrays.
-
-    Raises:
-        RecordingError: it is no value of the space; `where` is named.
-    """
+    """Return the value that stands in these bytes: dictionaries, tuples, texts and arrays."""
     try:
         value, end = _value(description, data, 0)
     except (struct.error, ValueError) as error:

@@ -28,15 +28,6 @@ def chunks_by_topic(
 
     Without a message index the topic of a chunk stands only in the chunk itself. Unpacking the beginning of
     every chunk takes seconds in a long recording, so most topics are inferred if the summary determines them.
-
-    Args:
-        index: of the file.
-        store: reads the chunks.
-        dtypes: of the message records of fixed-width topics.
-        path: of the recording, for errors.
-
-    Raises:
-        RecordingError: a chunk holds messages of a channel that the file does not have.
     """
     table = index.chunks
     channels = table.columns["channel"].copy() if table else np.empty(0, np.uint16)
@@ -125,14 +116,9 @@ class TopicChunks:
 
     Messages are numbered as recorded; where a repair lost some, the numbers continue after the gap.
 
-    Args:
-        topic: the topic.
-        places: which chunks of the file hold it.
-        table: all chunks of the file.
-        store: reads the chunks.
-        dtype: of a message record; None if messages vary in size.
-        lost: ranges (first, stop) of the numbers of messages that a repair could not save.
-        path: of the recording, for errors.
+    `places`: which chunks of the file hold it.
+    `dtype`: of a message record; None if messages vary in size.
+    `lost`: ranges (first, stop) of the numbers of messages that a repair could not save.
     """
 
     def __init__(

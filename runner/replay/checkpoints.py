@@ -34,8 +34,7 @@ MAX_CACHE_BYTES: Final = 2 << 30
 class Checkpoints:
     """The checkpoints of one recording.
 
-    Args:
-        recording: the run; unless it is finished, there are no checkpoints, as it may still change.
+    `recording`: the run; unless it is finished, there are no checkpoints, as it may still change.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -47,9 +46,7 @@ class Checkpoints:
     def nearest(self, step: int, shapes: Sequence[tuple[int, ...]]) -> tuple[int, list[NDArray[np.float64]]]:
         """Return the last checkpoint at or before a step, and its tables; step -1 if there is none.
 
-        Args:
-            step: training steps taken.
-            shapes: of the tables, in the order of a snapshot.
+        `shapes`: of the tables, in the order of a snapshot.
         """
         for found in sorted((found for found in self._steps() if found <= step), reverse=True):
             tables = self._load(found, shapes)

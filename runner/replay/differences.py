@@ -50,10 +50,8 @@ class Difference:
 def first_differing_row(recorded: Array, got: Array, tolerance: float) -> int | None:
     """Return the number of the first row that differs; None if none does.
 
-    Args:
-        recorded: a column of records, [rows, ...].
-        got: the same of another origin, in the same dtype.
-        tolerance: absolute and relative, for floating-point numbers; 0 compares bytes.
+    `recorded`: a column of records, [rows, ...].
+    `tolerance`: absolute and relative, for floating-point numbers; 0 compares bytes.
     """
     n = len(recorded)
     if recorded.dtype == object:
@@ -93,11 +91,7 @@ def differing_value(
 ) -> tuple[str, object, object]:
     """Return where in two observations the first difference is, such as `[2]`, and both values there.
 
-    Args:
-        recorded: a NumPy value of a space, or its bytes.
-        got: the same.
-        description: of the space.
-        tolerance: as for `first_differing_row`.
+    `recorded`: a NumPy value of a space, or its bytes.
     """
     if isinstance(recorded, bytes):
         recorded, got = (decode(description, each, "an observation") for each in (recorded, got))

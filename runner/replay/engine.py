@@ -41,13 +41,9 @@ _Key = tuple[str, int]
 class Replay:
     """A replay of a recording, from its beginning or from a reset; runs foreign code in this process.
 
-    Args:
-        recording: of a loop.
-        trust: whether what the recording names may be imported, see `runner.replay.specifications`.
-        tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
-        report: called with the number of steps taken so far, after each block.
-        render: whether the environments can draw.
-        make: returns the environment, instead of making it as the recording describes.
+    `trust`: whether what the recording names may be imported, see `runner.replay.specifications`.
+    `tolerance`: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
+    `make`: returns the environment, instead of making it as the recording describes.
     """
 
     def __init__(
@@ -101,10 +97,7 @@ class Replay:
     def steps(self, piece: Piece, environment: int, draws: bool) -> Iterator[RedoneSteps]:
         """Yield the steps of one environment in a piece, in blocks, up to the first difference.
 
-        Args:
-            piece: of the recording.
-            environment: the number of one in `environments`; `ALL` yields the steps of each in turn.
-            draws: whether to draw pictures.
+        `environment`: the number of one in `environments`; `ALL` yields the steps of each in turn.
         """
         phase, width = piece.phase, self._recording.environments if environment == ALL else 1
         rows, resets = own_steps(piece, environment, self._recording.environments)

@@ -108,21 +108,11 @@ def redo_in_child(
 
     The child works ahead of the caller by a block at most.
 
-    Args:
-        path: of the recording.
-        phase: see `redo`.
-        episodes: see `redo`.
-        render: see `redo`.
-        trust: see `redo`.
-        tolerance: see `redo`.
-        seconds: how long a block of steps may take, and making the environment.
-        memory_bytes: how much the process may allocate.
-        report: see `redo`.
-        draw_from: see `redo`.
+    `seconds`: how long a block of steps may take, and making the environment.
+    `memory_bytes`: how much the process may allocate.
 
     Raises:
         CannotRedo: see `redo`; or the environment hangs, crashes, or needs more memory.
-        RecordingError: see `redo`.
     """
     arguments = {"render": render, "trust": trust, "tolerance": tolerance, "draw_from": draw_from}
     for found in stream_from_child(
@@ -144,17 +134,11 @@ def stream_from_child(
 ) -> Iterator[Any]:
     """Yield what a function that runs foreign code passes to `report_progress` in a child process.
 
-    Args:
-        function: of a module; called with the path and the other arguments.
-        path: of a recording.
-        arguments: for the function.
-        seconds: how long it may take for each value.
-        memory_bytes: how much the process may allocate.
-        keywords: for the function.
+    `function`: of a module; called with the path and the other arguments.
+    `seconds`: how long it may take for each value.
 
     Raises:
         CannotRedo: the process hangs, crashes or needs more memory.
-        RunnerError: the function raised it.
     """
     with ChildProcess(memory_bytes) as child:
         try:

@@ -51,14 +51,7 @@ def redo_episode(
 ) -> Iterator[RedoneSteps]:
     """Yield the steps of one episode, begun as late as possible.
 
-    Args:
-        recording: of a loop.
-        phase: `train` or `eval`.
-        number: of an episode, as `Recording.episode_span` takes it.
-        make: returns a new replay.
-
-    Raises:
-        CannotRedo, RecordingError: see `runner.replay.environment.redo`.
+    `make`: returns a new replay.
     """
     target = _target(recording, phase, number)
     with closing(make()) as replay:
@@ -80,18 +73,12 @@ def episode_at(
 ) -> Iterator[None]:
     """Bring an environment to a step of an episode, by the recorded resets and actions; close it afterwards.
 
-    Args:
-        recording: of a loop.
-        phase: `train` or `eval`.
-        number: of an episode, as `Recording.episode_span` takes it.
-        t: the number of steps to take.
-        make: returns a new replay.
-        on_reset: called before the reset that begins the episode, with the recorded actions from `t` on; it
-            may wrap `RowStepper.env`.
+    `t`: the number of steps to take.
+    `on_reset`: called before the reset that begins the episode, with the recorded actions from `t` on; it may
+    wrap `RowStepper.env`.
 
     Raises:
         CannotRedo: the environment differs from the recording, or cannot be brought there.
-        RecordingError: there is no such episode or step.
     """
     span, n = recording.episode_span(phase, number), recording.environments
     if not 0 <= t < len(span):
@@ -133,11 +120,7 @@ def _right_start(recording: Recording, target: _Target, make: Callable[[], Repla
 
 
 def _target(recording: Recording, phase: str, number: int) -> _Target:
-    """Return where an episode is, and its reset.
-
-    Raises:
-        RecordingError: there is no such episode, or it has no reset.
-    """
+    """Return where an episode is, and its reset."""
     span, n = recording.episode_span(phase, number), recording.environments
     ended = recording.episodes(phase, number, number + 1)
     stop_time = int(ended["log_time"][0]) if len(ended) else _step_time(recording, phase, span[-1])

@@ -31,11 +31,7 @@ class StateHistory:
 
 
 def history_of(recording: Recording, state: int, step: int) -> StateHistory:
-    """Return the history of a state's values in the first `step` training steps, by replaying them.
-
-    Raises:
-        RecordingError: the steps are not recorded.
-    """
+    """Return the history of a state's values in the first `step` training steps, by replaying them."""
     replay = TableReplay(recording)
     shape = (len(replay.tables), max(table.shape[1] for table in replay.tables))
     history = StateHistory(np.zeros(shape, np.int64), np.full(shape, -1), np.full(shape, -1))
@@ -65,10 +61,7 @@ def _note_changes(
 ) -> tuple[NDArray[np.void], NDArray[np.float64]]:
     """Note which visit last changed each value; return the last visit, whose effect only the next shows.
 
-    Args:
-        history: where to note it.
-        steps: the visits to the state, in order.
-        rows: the state's values before each of them, [visits, learners, most actions].
+    `rows`: the state's values before each of them, [visits, learners, most actions].
     """
     if len(rows) > 1:
         bits = rows.view(np.int64)

@@ -15,8 +15,7 @@ from runner.replay.step_replay import StepReplay
 class DerivedTables:
     """The tables of a run as far as its steps determine them, updated by the steps as they come.
 
-    Args:
-        replay: at the run's first step.
+    `replay`: at the run's first step.
     """
 
     def __init__(self, replay: StepReplay) -> None:
@@ -26,11 +25,7 @@ class DerivedTables:
         """Whether the tables are the run's own: no step is missing since it began or they were given."""
 
     def take(self, steps: NDArray[np.void]) -> None:
-        """Take the next training steps.
-
-        Raises:
-            RecordingError: the environment cannot have them.
-        """
+        """Take the next training steps."""
         if not len(steps):
             return
         first, last = int(steps["step"][0]), int(steps["step"][-1])
@@ -75,10 +70,7 @@ S = TypeVar("S", bound=Snapshot)
 class SnapshotVisitor(Generic[S]):
     """Calls a function with each snapshot of a run, after the training steps before it were applied.
 
-    Args:
-        tables: moved forward by the steps.
-        snapshots: in order.
-        visit: called with each.
+    `tables`: moved forward by the steps.
     """
 
     def __init__(self, tables: DerivedTables, snapshots: Iterator[S], visit: Callable[[S], None]) -> None:

@@ -53,11 +53,7 @@ class Trace(NamedTuple):
 class StepReplay:
     """The tables of a run's learners, moved forward by its training steps in order.
 
-    Args:
-        config: the run's resolved configuration, as its recording holds it.
-        mdp: its environment.
-        seed: the seed of its job.
-        where: the recording or archive that the steps are from, for errors.
+    `config`: the run's resolved configuration, as its recording holds it.
     """
 
     def __init__(self, config: Mapping[str, object], mdp: Mdp, seed: int, where: str) -> None:
@@ -125,15 +121,11 @@ class StepReplay:
     ) -> None:
         """Apply the updates of the training steps that follow.
 
-        Args:
-            steps: a block of records; the first is step number `self.step`.
-            rows: filled with each learner's values of a step's state before its update, [steps, learners,
-                most actions]; empty if they are not needed.
-            probe: states to look at on the way.
-            trace: filled with what decides the weights of the updates; not together with `probe`.
-
-        Raises:
-            RecordingError: steps are missing, or the environment cannot have such steps.
+        `steps`: a block of records; the first is step number `self.step`.
+        `rows`: filled with each learner's values of a step's state before its update, [steps, learners, most
+        actions]; empty if they are not needed.
+        `probe`: states to look at on the way.
+        `trace`: filled with what decides the weights of the updates; not together with `probe`.
         """
         if probe is not None:
             _check_probe(probe, self._mdp)
@@ -155,9 +147,7 @@ class StepReplay:
     def watch(self, steps: NDArray[np.void], watch: Watch) -> Changes:
         """Apply updates as `apply` does, and return the watched values after each that could change them.
 
-        Args:
-            steps: as for `apply`.
-            watch: `begin_watch` was called with it at `step`, or this method for the steps before.
+        `watch`: `begin_watch` was called with it at `step`, or this method for the steps before.
         """
         found = [(empty_changes(watch, 0), 0)]
         for state, part in self._segments(steps):

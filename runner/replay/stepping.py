@@ -70,11 +70,8 @@ class Results:
     def part(self, first: int, stride: int, rows: NDArray[np.bool_], resets: Sequence[int]) -> Results:
         """Return the results of one environment of a vector.
 
-        Args:
-            first: its number.
-            stride: the number of environments.
-            rows: which of its own rows to return.
-            resets: the numbers of its resets.
+        `first`: its number.
+        `stride`: the number of environments.
         """
         part = Results.__new__(Results)
         for name in ("observations", "rewards", "terminated", "truncated"):
@@ -90,12 +87,7 @@ class Results:
 
 
 class Stepper(ABC):
-    """An environment that is stepped through a recording of one like it.
-
-    Args:
-        env: the environment.
-        recording: of a loop over such an environment.
-    """
+    """An environment that is stepped through a recording of one like it."""
 
     env: Any
 
@@ -120,9 +112,7 @@ class Stepper(ABC):
     def run(self, rows: NDArray[np.void], resets: Sequence[tuple[int, RecordedReset]]) -> Results:
         """Do recorded steps again, until the environment raises an error.
 
-        Args:
-            rows: the recorded steps.
-            resets: row and reset, in order; each comes before its row.
+        `resets`: row and reset, in order; each comes before its row.
         """
 
     def check_spaces(self) -> None:
@@ -146,12 +136,7 @@ class Stepper(ABC):
                 )
 
     def _restore(self, state: ResetState, base: Any) -> int | None:
-        """Bring random generators to a recorded state; return the seed that `reset` needs instead, if any.
-
-        Args:
-            state: the recorded state.
-            base: the environment inside of all wrappers.
-        """
+        """Bring random generators to a recorded state; return the seed that `reset` needs instead, if any."""
         if state.bit_generator is None and not state.ale_state:
             return state.np_random_seed
         if state.bit_generator is not None:

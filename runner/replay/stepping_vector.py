@@ -27,12 +27,9 @@ _Numbered = tuple[int, RecordedReset]
 class VectorStepper(Stepper):
     """All environments of a vector; rows are those of all of them, in the order of the recording.
 
-    Args:
-        env: the vector environment.
-        recording: of a loop over such a vector.
-        autoreset: `NextStep`, `SameStep` or `Disabled`; with `SameStep`, the picture after the last step of
-            an episode shows the beginning of the next one.
-        drawn: the environment that is drawn.
+    `autoreset`: `NextStep`, `SameStep` or `Disabled`; with `SameStep`, the picture after the last step of an
+    episode shows the beginning of the next one.
+    `drawn`: the environment that is drawn.
     """
 
     def __init__(self, env: Any, recording: Recording, autoreset: str, drawn: int = 0) -> None:
@@ -54,9 +51,8 @@ class VectorStepper(Stepper):
     def run(self, rows: NDArray[np.void], resets: Sequence[tuple[int, RecordedReset]]) -> Results:
         """Do recorded steps again, until the environment raises an error.
 
-        Args:
-            rows: the recorded steps, as many of each environment.
-            resets: step of each environment, and reset, in order; each comes before its step.
+        `rows`: the recorded steps, as many of each environment.
+        `resets`: step of each environment, and reset, in order; each comes before its step.
         """
         n, times = self._n, len(rows) // self._n
         results = Results(len(rows), len(resets), self.dtypes, 1, self._drawn)

@@ -20,11 +20,7 @@ _END_OF_TIME: Final = 2**62
 
 
 def step_of_episode(recording: Recording, episode: int) -> int:
-    """Return the number of training steps taken when `episode` episodes had ended.
-
-    Raises:
-        RecordingError: fewer episodes were recorded, or the last of them was lost.
-    """
+    """Return the number of training steps taken when `episode` episodes had ended."""
     ended = recording.count(schema.TRAIN_EPISODE)
     if not 0 <= episode <= ended:
         raise RecordingError(
@@ -39,11 +35,7 @@ def step_of_episode(recording: Recording, episode: int) -> int:
 
 
 def transitions_of(recording: Recording, phase: str, episode: int) -> Iterator[Any]:
-    """Yield an episode's steps one by one, as `Recording.transitions` yields them; memory is bounded.
-
-    Raises:
-        RecordingError: the recording has no such episode, or steps of it were lost.
-    """
+    """Yield an episode's steps one by one, as `Recording.transitions` yields them; memory is bounded."""
     if recording.topic(f"/{phase}/step") in recording.dtypes:
         for block in episode_blocks(recording, phase, episode):
             yield from block
@@ -53,11 +45,7 @@ def transitions_of(recording: Recording, phase: str, episode: int) -> Iterator[A
 
 
 def episode_blocks(recording: Recording, phase: str, episode: int) -> Iterator[NDArray[np.void]]:
-    """Yield an episode's steps in blocks, where they have one size.
-
-    Raises:
-        RecordingError: the recording has no such episode, or steps of it were lost.
-    """
+    """Yield an episode's steps in blocks, where they have one size."""
     topic, numbers = recording.topic(f"/{phase}/step"), recording.episode_span(phase, episode)
     if recording.has_actions_alone(phase):
         from runner.replay.whole_steps import whole_steps  # loads Gymnasium
@@ -80,7 +68,6 @@ def steps_of(recording: Recording, phase: str, episode: int) -> NDArray[np.void]
     """Return an episode's steps as one array, where they have one size.
 
     Raises:
-        RecordingError: the recording has no such episode, or its steps are too large for an array.
         CannotRedo: only its actions were recorded, and its environment cannot be had.
     """
     if recording.has_actions_alone(phase):
@@ -94,9 +81,6 @@ def reset_of(recording: Recording, phase: str, episode: int) -> Any | None:
     """Return the reset that an episode of a loop began with, as `Recording.resets` yields it.
 
     It is the last one of the episode's environment at or before its first step. None if it was lost.
-
-    Raises:
-        RecordingError: the recording has no such episode.
     """
     topic, numbers = recording.topic(f"/{phase}/reset"), recording.episode_span(phase, episode)
     if topic not in recording.dtypes:
@@ -120,14 +104,7 @@ def reset_of(recording: Recording, phase: str, episode: int) -> Any | None:
 def recorded_frames(recording: Recording, phase: str, episode: int, start: int = 0) -> Iterator[Message]:
     """Yield the last frame that was recorded up to each step of an episode, as a decoded message.
 
-    Args:
-        recording: of a loop with frames.
-        phase: `train` or `eval`.
-        episode: counted over the phase.
-        start: steps before the first one; 0 for the frame after the reset.
-
-    Raises:
-        RecordingError: the recording has no such episode, steps of it were lost, or its first frame.
+    `start`: steps before the first one; 0 for the frame after the reset.
     """
     span, n = recording.episode_span(phase, episode), recording.environments
     first = max(0, start - frames_every(recording))
@@ -159,11 +136,7 @@ def recorded_frames(recording: Recording, phase: str, episode: int, start: int =
 
 
 def log_times_of(recording: Recording, phase: str, episode: int) -> list[int]:
-    """Return the `log_time` of each step of an episode, in nanoseconds.
-
-    Raises:
-        RecordingError: the recording has no such episode, or steps of it were lost.
-    """
+    """Return the `log_time` of each step of an episode, in nanoseconds."""
     return [int(step["log_time"]) for step in transitions_of(recording, phase, episode)]
 
 
@@ -175,11 +148,7 @@ def frames_every(recording: Recording) -> int:
 
 
 def environment_of(recording: Recording, phase: str, episode: int) -> int:
-    """Return the environment of an episode, among those of a vector.
-
-    Raises:
-        RecordingError: the recording has no such episode.
-    """
+    """Return the environment of an episode, among those of a vector."""
     return recording.episode_span(phase, episode).start % recording.environments
 
 
@@ -190,17 +159,7 @@ def last_step(recording: Recording) -> int:
 
 
 def check_steps(block: NDArray[np.void], mdp: Mdp, where: str, phase: str = "training") -> None:
-    """Refuse steps with a state or an action that the environment does not have: they are used as indices.
-
-    Args:
-        block: the steps; not empty.
-        mdp: the environment.
-        where: the recording or archive, for the error.
-        phase: of the steps, for the error.
-
-    Raises:
-        RecordingError: there is such a step.
-    """
+    """Refuse steps with a state or an action that the environment does not have: they are used as indices."""
     bounds = {"state": mdp.states, "next_state": mdp.states, "action": mdp.joint_actions}
     for name, bound in bounds.items():
         if (found := int(block[name].max())) >= bound:

@@ -26,15 +26,7 @@ NEAR_STEPS: Final = 200_000
 
 
 class TableReplay(StepReplay):
-    """The tables of a recorded run, moved forward by its recording.
-
-    Args:
-        recording: the run.
-        step: the training step to begin at.
-
-    Raises:
-        RecordingError: there is no such step, or the steps from the nearest snapshot are not recorded.
-    """
+    """The tables of a recorded run, moved forward by its recording."""
 
     def __init__(self, recording: Recording, step: int = 0) -> None:
         super().__init__(recording.config, recording.mdp, recording.seed or 0, str(recording.path))
@@ -47,11 +39,7 @@ class TableReplay(StepReplay):
         self.advance(step)
 
     def advance(self, step: int) -> None:
-        """Replay up to a later step.
-
-        Raises:
-            RecordingError: the step is earlier, or not recorded.
-        """
+        """Replay up to a later step."""
         self._advance(step)
 
     def rows(self, stop: int) -> NDArray[np.float64]:
@@ -60,9 +48,6 @@ class TableReplay(StepReplay):
         Returns:
             float64 [steps, learners, most actions]: the values of each step's state before its update; nan
             beyond a learner's own actions.
-
-        Raises:
-            RecordingError: the step is earlier, or not recorded.
         """
         seen = self.empty_rows(max(stop - self.step, 0))
         self._advance(stop, rows=seen)
@@ -73,9 +58,6 @@ class TableReplay(StepReplay):
 
         Returns:
             [steps] of `UPDATE`.
-
-        Raises:
-            RecordingError: the step is earlier, or not recorded; or the environment cannot have such steps.
         """
         trace = Trace(np.empty(max(stop - self.step, 0), UPDATE), learner)
         first = self.step
@@ -89,11 +71,7 @@ class TableReplay(StepReplay):
         return trace.updates
 
     def seek(self, step: int) -> None:
-        """Go to any step, from here or from the nearest snapshot before it, whichever is shorter.
-
-        Raises:
-            RecordingError: there is no such step, or the steps from the nearest snapshot are not recorded.
-        """
+        """Go to any step, from here or from the nearest snapshot before it, whichever is shorter."""
         lost = self._recording.lost.get(schema.TRAIN_STEP.name, [])
         gap = any(start < step and stop > self.step for start, stop in lost)
         if gap or not self.step <= step <= self.step + NEAR_STEPS:
@@ -161,20 +139,12 @@ class TableReplay(StepReplay):
 
 
 def tables_at(recording: Recording, step: int) -> list[NDArray[np.float64]]:
-    """Return the tables after `step` training steps, one float64 [states, actions] per learner.
-
-    Raises:
-        RecordingError: there is no such step, or the steps from the nearest snapshot are not recorded.
-    """
+    """Return the tables after `step` training steps, one float64 [states, actions] per learner."""
     return TableReplay(recording, step).tables
 
 
 def held_at(recording: Recording, step: int) -> list[Held]:
-    """Return all tables of the learners after `step` training steps, by name; `q` are the Q-tables.
-
-    Raises:
-        RecordingError: as for `tables_at`.
-    """
+    """Return all tables of the learners after `step` training steps, by name; `q` are the Q-tables."""
     return TableReplay(recording, step).held
 
 

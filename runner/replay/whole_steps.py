@@ -25,7 +25,6 @@ def whole_steps(recording: Recording, phase: str, episode: int) -> NDArray[np.vo
     are kept for the next call.
 
     Raises:
-        RecordingError: there is no such episode, or it is too large for an array.
         CannotRedo: the environment cannot be made, or is another one.
     """
     span, topic = recording.episode_span(phase, episode), recording.topic(f"/{phase}/step")

@@ -151,11 +151,7 @@ def is_checkpoint_name(name: object) -> bool:
 
 
 def read_checkpoints(recording: Recording, recordings: Path) -> list[Checkpoint]:
-    """Return the checkpoints in a recording, in order; their contents are in a recordings folder's store.
-
-    Raises:
-        RecordingError: one is invalid.
-    """
+    """Return the checkpoints in a recording, in order; their contents are in a recordings folder's store."""
     if schema.CHECKPOINT_TOPIC not in recording.topics:
         return []
     store = Store(recordings)
@@ -182,11 +178,6 @@ def find_checkpoint(every: Sequence[Checkpoint], reference: str, where: str) -> 
     `@STEP` is the last one at or before a step, `NAME@STEP` the last one of a name; without a step, the last.
     Steps are those of training, unless all checkpoints are of the evaluation phase.
 
-    Args:
-        every: the checkpoints of a run, in order.
-        reference: the text.
-        where: the run, for errors.
-
     Raises:
         RunNotFound: there is none.
     """
@@ -206,12 +197,7 @@ def find_checkpoint(every: Sequence[Checkpoint], reference: str, where: str) -> 
 
 
 def arrays_in(data: bytes, where: str) -> dict[str, Array]:
-    """Return the arrays in a safetensors file, by name; those of bfloat16 become float32, exactly.
-
-    Raises:
-        MissingExtra: safetensors is not installed.
-        RecordingError: it is not such a file, or has a dtype that NumPy lacks; `where` is named.
-    """
+    """Return the arrays in a safetensors file, by name; those of bfloat16 become float32, exactly."""
     safetensors = require("safetensors", extra="safetensors", purpose="reading a safetensors file")
     try:
         entries = safetensors.deserialize(data)

@@ -106,9 +106,7 @@ class RecordedCode:
 class CodeCollector:
     """Reads the code in a thread, and writes it into the recording as soon as it is known.
 
-    Args:
-        recordings: the folder of runs, in which nothing is code.
-        is_wanted: False records nothing.
+    `recordings`: the folder of runs, in which nothing is code.
     """
 
     def __init__(self, recordings: Path, is_wanted: bool = True) -> None:
@@ -151,12 +149,7 @@ class CodeCollector:
     def write(self, file: RecordingFile, wait: bool = False) -> None:
         """Write the code into a recording, once, if it is known; nothing else may write into it meanwhile.
 
-        Args:
-            file: the recording.
-            wait: wait for it, up to `WAIT_SECONDS` after the start; then write that it is not known.
-
-        Raises:
-            StorageError: the disk is full or failing.
+        `wait`: wait for it, up to `WAIT_SECONDS` after the start; then write that it is not known.
         """
         if not self._is_wanted or self.entries:
             return
@@ -233,11 +226,8 @@ def collect(
 ) -> RecordedCode:
     """Return the code in a folder.
 
-    Args:
-        folder: of the script; the current one if there is none.
-        script: the script, if it is the user's.
-        cells: the cells of a notebook that were executed.
-        recordings: a folder whose untracked files are no code.
+    `cells`: the cells of a notebook that were executed.
+    `recordings`: a folder whose untracked files are no code.
     """
 
     def used(root: Path) -> list[str]:

@@ -75,11 +75,8 @@ def read_repository(
 ) -> Repository:
     """Return the state of the repository that a folder is in.
 
-    Args:
-        folder: the folder.
-        used: returns the paths of files in the repository, whose root it gets: those that are ignored count
-            as untracked.
-        seconds: the time limit.
+    `used`: returns the paths of files in the repository, whose root it gets: those that are ignored count as
+    untracked.
 
     Raises:
         NotRecorded: there is none, or it cannot be read; after its commit is known, what cannot be read is

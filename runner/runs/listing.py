@@ -30,11 +30,7 @@ def list_runs(recordings: str | os.PathLike[str] | None = None) -> list[Run]:
 
 
 def run_entries(recordings: Path) -> list[str]:
-    """Return the names of the folders that may have a run: all but the hidden ones.
-
-    Raises:
-        StorageError: the recordings folder is there and cannot be read.
-    """
+    """Return the names of the folders that may have a run: all but the hidden ones."""
     try:
         with os.scandir(recordings) as entries:
             return [entry.name for entry in entries if entry.name[0] != "." and entry.is_dir()]
@@ -49,7 +45,6 @@ def run_at(path: Path) -> Run:
 
     Raises:
         RunNotFound: there is none.
-        RecordingError: the recording cannot be read.
     """
     if path.is_dir():
         if run := run_in(path):

@@ -22,10 +22,6 @@ RUN_LOCK: Final = "owner.lock"
 def locked(run: Run, archived: bool = False) -> Iterator[Run]:
     """Lock the folder of a run, and yield the run as it is now.
 
-    Args:
-        run: the run.
-        archived: whether it may be archived.
-
     Raises:
         RunnerError: it is running or archived, or locked by another process.
         StorageError: the folder cannot be written.
@@ -51,13 +47,8 @@ def locked(run: Run, archived: bool = False) -> Iterator[Run]:
 def acquired(path: Path, busy: RunnerError) -> FileLock:
     """Acquire the lock of a file without waiting; the caller releases it.
 
-    Args:
-        path: the lock file; its folder is created if it is missing.
-        busy: raised if another process has the lock.
-
-    Raises:
-        RunnerError: `busy`.
-        StorageError: the folder cannot be written.
+    `path`: the lock file; its folder is created if it is missing.
+    `busy`: raised if another process has the lock.
     """
     from filelock import FileLock, Timeout
 

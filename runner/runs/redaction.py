@@ -89,12 +89,7 @@ def is_secret_name(name: str) -> bool:
 
 
 def redacted_arguments(arguments: Sequence[str], variables: Mapping[str, str] = os.environ) -> list[str]:
-    """Return the arguments of a command with secrets replaced by `[redacted]`.
-
-    Args:
-        arguments: such as `sys.argv`.
-        variables: the environment variables.
-    """
+    """Return the arguments of a command with secrets replaced by `[redacted]`."""
     shown: list[str] = []
     is_value_secret = False
     for argument in arguments:
@@ -114,12 +109,7 @@ def _stays(name: str, value: str) -> bool:
 
 
 def redacted_text(text: str, variables: Mapping[str, str] = os.environ) -> str:
-    """Return a source, a patch or an address with secrets replaced by `[redacted]`.
-
-    Args:
-        text: the text.
-        variables: the environment variables; values of those with the name of a secret are replaced.
-    """
+    """Return a source, a patch or an address with secrets replaced by `[redacted]`."""
     for value in _secrets_among(frozenset(variables.items())):
         text = text.replace(value, REDACTED)
     text = _SHAPES.sub(REDACTED, text)

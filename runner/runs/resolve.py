@@ -126,11 +126,7 @@ def find_runs(name: str, recordings: Path, report: Report = lambda _: None) -> l
 
 
 def run_with_id(run_id: str, recordings: Path) -> Run | None:
-    """Return the run with an id, whatever its folder is called; None if there is none.
-
-    Raises:
-        StorageError: the recordings folder cannot be read.
-    """
+    """Return the run with an id, whatever its folder is called; None if there is none."""
     from runner.runs.catalogue.folders import Depth
     from runner.runs.catalogue.index import look
 
@@ -202,9 +198,6 @@ def completions(beginning: str, recordings: Path) -> dict[str, str]:
     """Return the ids and names of runs that begin with a text, and what each stands for.
 
     Of very many only the newest are offered.
-
-    Raises:
-        StorageError: the recordings folder cannot be read.
     """
     from runner.runs.catalogue.folders import Depth
     from runner.runs.catalogue.index import look

@@ -245,15 +245,8 @@ def create_run(
 ) -> Run:
     """Create the folder of a new run with its `run.json`; an id is never used twice.
 
-    Args:
-        recordings: the recordings folder, created if it is missing.
-        config: the configuration.
-        seed: the seed.
-        name: the name of the run; the configuration's name by default.
-        run_id: an id from `new_run_id`; replaced if it is taken by now.
-
-    Raises:
-        StorageError: the recordings folder cannot be written.
+    `name`: the name of the run; the configuration's name by default.
+    `run_id`: an id from `new_run_id`; replaced if it is taken by now.
     """
     return new_run(recordings, config.to_mapping(), seed, name or config.name, run_id)
 
@@ -323,11 +316,7 @@ def recordings_folder(chosen: str | os.PathLike[str] | None = None) -> Path:
 
 
 def check_folder_name(recordings: str | os.PathLike[str]) -> None:
-    """Refuse a recordings folder whose path is not UTF-8, which neither the index nor JSON can store.
-
-    Raises:
-        StorageError: it is not UTF-8.
-    """
+    """Refuse a recordings folder whose path is not UTF-8, which neither the index nor JSON can store."""
     path = os.path.abspath(recordings)  # noqa: PTH100 - links stay what they are
     if not is_utf8(path):
         raise StorageError(

@@ -34,15 +34,11 @@ _LOCK: Final = "shards.lock"
 def find_joined(join: object, recordings: str | os.PathLike[str] | None) -> Run:
     """Return the run that a process wants to join, which is running.
 
-    Args:
-        join: a run, or its id, the beginning of its id, its name or the path of its folder; True for the one
-            in $DUALTAXI_RUN.
-        recordings: the recordings folder.
+    `join`: a run, or its id, the beginning of its id, its name or the path of its folder; True for the one in
+    $DUALTAXI_RUN.
 
     Raises:
-        ConfigError: `join` is something else, or True without the variable.
         RunNotFound: there is no such run.
-        RunnerError: it is over, or a job.
     """
     if join is True:
         join = os.environ.get(RUN_VARIABLE, "")
@@ -79,17 +75,8 @@ def _require_open(run: Run) -> None:
 def new_shard(joined: Run, name: str | None, config: JsonView, seed: int | None, **more: Any) -> Run:
     """Create the folder of a new shard; where the name is taken, `-2`, `-3` ... is added.
 
-    Args:
-        joined: the run, as `find_joined` returned it.
-        name: of letters, digits and `_.-`; that of the process in `multiprocessing` by default.
-        config: the configuration that its recording carries.
-        seed: its seed.
-        more: further facts for its `run.json`.
-
-    Raises:
-        ConfigError: the name is not valid.
-        RunnerError: the run is over by now.
-        StorageError: the run's folder cannot be written.
+    `name`: of letters, digits and `_.-`; that of the process in `multiprocessing` by default.
+    `more`: further facts for its `run.json`.
     """
     if name is None:
         import multiprocessing
@@ -129,11 +116,7 @@ def are_over(run: Run) -> bool:
 
 
 def handed_over(run: Run) -> Run:
-    """Return a run that lasts until its shards end; it is owned by a process that still records one.
-
-    Raises:
-        StorageError: its `run.json` cannot be written.
-    """
+    """Return a run that lasts until its shards end; it is owned by a process that still records one."""
     if not is_ended(run):
         return run
     ends_as = run.facts.get(ENDS_AS) or ("interrupted" if run.file.status == "running" else run.file.status)
@@ -157,7 +140,6 @@ def shards_locked(run: Run) -> Iterator[None]:
 
     Raises:
         RunNotFound: the run is gone.
-        StorageError: its folder cannot be written.
     """
     from filelock import FileLock
 

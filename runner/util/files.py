@@ -123,12 +123,7 @@ def storage_errors(path: str | os.PathLike[str], advice: str = "") -> Iterator[N
 
     The `Timeout` of a `FileLock` is an `OSError` too: catch it within the block.
 
-    Args:
-        path: the file or folder that is written.
-        advice: the end of the message, such as `free some disk`.
-
-    Raises:
-        StorageError: there was one.
+    `advice`: the end of the message, such as `free some disk`.
     """
     try:
         yield

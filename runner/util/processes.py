@@ -67,8 +67,7 @@ def _without_main_module() -> Iterator[None]:
 def process_context(preload: Sequence[str] = ()) -> Any:
     """Return the multiprocessing context that starts processes, from a fork server where there is one.
 
-    Args:
-        preload: modules that the fork server imports once, for all processes.
+    `preload`: modules that the fork server imports once, for all processes.
     """
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
@@ -81,10 +80,8 @@ def process_context(preload: Sequence[str] = ()) -> Any:
 class ChildProcess:
     """A process that calls functions, one after the other.
 
-    Args:
-        memory_bytes: how much its calls may allocate; not limited on Windows.
-        context: how to start it; by default `process_context()`.
-        on_progress: called with what functions pass to `report_progress`.
+    `memory_bytes`: how much its calls may allocate; not limited on Windows.
+    `on_progress`: called with what functions pass to `report_progress`.
 
     Raises:
         OSError: the system cannot start another process.
@@ -121,15 +118,12 @@ class ChildProcess:
     ) -> Result:
         """Return what a function returns in the process.
 
-        Args:
-            function: of a module, not nested.
-            seconds: the time limit; the process is of no use after it.
-            args: of the function; they and the result are pickled.
-            keywords: of the function.
+        `function`: of a module, not nested.
+        `seconds`: the time limit; the process is of no use after it.
+        `args`: of the function; they and the result are pickled.
 
         Raises:
             TimedOut, OutOfMemory, ProcessDied: the call did not end by itself.
-            RunnerError, OSError: the function raised it.
             RuntimeError: the function raised anything else, whose traceback is in the message.
         """
         events = self._events(function, seconds, args, keywords)

@@ -27,22 +27,14 @@ RUN_NAME_EXPECTED: Final = (
 
 
 def checked_name(name: str | None) -> str | None:
-    """Return the name if a configuration can have it.
-
-    Raises:
-        ConfigError: it cannot.
-    """
+    """Return the name if a configuration can have it."""
     if name is not None and not re.fullmatch(NAME_PATTERN, name):
         raise ConfigError(f"name: found {name!r}, expected {NAME_EXPECTED}")
     return name
 
 
 def checked_run_name(name: str | None) -> str | None:
-    """Return the name if a recorded loop, or a renamed run, can have it, such as `ALE/Pong-v5__ppo+1`.
-
-    Raises:
-        ConfigError: it cannot.
-    """
+    """Return the name if a recorded loop, or a renamed run, can have it, such as `ALE/Pong-v5__ppo+1`."""
     if name is not None and not re.fullmatch(RUN_NAME_PATTERN, name):
         raise ConfigError(f"name: found {name!r}, expected {RUN_NAME_EXPECTED}")
     return name
@@ -75,10 +67,7 @@ def as_utf8(text: str) -> str:
 def flatten(values: Mapping[str, object], keep_empty: bool = False, prefix: str = "") -> dict[str, object]:
     """Return the values in nested mappings by dotted key, such as `evaluation.trials`.
 
-    Args:
-        values: the mapping.
-        keep_empty: whether an empty mapping counts as a value.
-        prefix: what each key begins with.
+    `keep_empty`: whether an empty mapping counts as a value.
     """
     flat: dict[str, object] = {}
     for key, value in values.items():

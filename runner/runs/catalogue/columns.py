@@ -176,11 +176,7 @@ _ALIASES: Final = {
 
 
 def field_of(name: str) -> Column:
-    """Return the column of a name that a filter can use.
-
-    Raises:
-        RunnerError: there is none.
-    """
+    """Return the column of a name that a filter can use."""
     column = FIELDS.get(_ALIASES.get(name, name))
     if column is None:
         hint = nearest(name, [*FIELDS, *_ALIASES])
@@ -192,11 +188,7 @@ def field_of(name: str) -> Column:
 
 
 def columns_of(text: str) -> list[str]:
-    """Return the columns in a list of names, separated by commas.
-
-    Raises:
-        RunnerError: there is no such column.
-    """
+    """Return the columns in a list of names, separated by commas."""
     names = [name.strip() for name in text.split(",") if name.strip()]
     if not names:
         raise RunnerError("columns: found nothing, expected names such as id,name,success_percent.")
@@ -218,9 +210,7 @@ def with_same_as(
 ) -> Iterator[IndexRow]:
     """Yield rows with `same_as`: the id of another run that recorded the same content first, or None.
 
-    Args:
-        rows: rows with their digest.
-        originals: as `Index.originals` returns them.
+    `originals`: as `Index.originals` returns them.
     """
     for row in rows:
         first = originals.get(row["digest"])

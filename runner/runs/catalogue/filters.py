@@ -72,12 +72,7 @@ ANY_RUN: Final = Filter(None)
 def parse(text: str, now: datetime | None = None) -> Filter:
     """Return the filter in a text; an empty one matches every run.
 
-    Args:
-        text: in the Lucene query syntax.
-        now: the time from which ages are counted; the present by default.
-
-    Raises:
-        RunnerError: it is no filter, or has an unknown field; the message shows the place.
+    `now`: the time from which ages are counted; the present by default.
     """
     if not text.strip():
         return ANY_RUN

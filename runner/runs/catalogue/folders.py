@@ -56,14 +56,7 @@ class Difference:
 
 
 class Folders:
-    """Some recordings folders, compared with the index.
-
-    Args:
-        database: the index.
-        roots: absolute paths of recordings folders.
-        depth: which changes are detected.
-        rebuild: read every run, changed or not.
-    """
+    """Some recordings folders, compared with the index."""
 
     def __init__(
         self,
@@ -80,11 +73,7 @@ class Folders:
         self._read: dict[str, set[str]] = {root: set() for root in roots}
 
     def differences(self) -> list[Difference]:
-        """Return how the folders, as they were at the first call, differ from the index as it is now.
-
-        Raises:
-            StorageError: a recordings folder cannot be read.
-        """
+        """Return how the folders, as they were at the first call, differ from the index as it is now."""
         found = [self._difference(root) for root in self._roots]
         return [each for each in found if each.changed or each.died or each.gone]
 

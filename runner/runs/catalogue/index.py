@@ -56,10 +56,8 @@ class Index:
     ) -> Iterator[IndexRow]:
         """Yield the rows that match a filter, the newest first.
 
-        Args:
-            chosen: the filter.
-            order: expressions to sort by before the age.
-            columns: the stored columns that are needed; all by default.
+        `order`: expressions to sort by before the age.
+        `columns`: the stored columns that are needed; all by default.
         """
         self._check_settings(chosen)
         query = self._of(chosen, *_stored(columns)).order_by(*order, Row.created.desc(), Row.id, Row.root)
@@ -81,12 +79,7 @@ class Index:
     ) -> tuple[list[IndexRow], int]:
         """Return some of the rows that match a filter, and how many match.
 
-        Args:
-            chosen: the filter.
-            order: as for `rows`.
-            limit: the maximum number of rows; None for all.
-            offset: the number of rows to skip.
-            columns: as for `rows`.
+        `limit`: the maximum number of rows; None for all.
         """
         if limit is None:
             every = self.select(chosen, *order, columns=columns)
@@ -106,11 +99,7 @@ class Index:
     ) -> list[IndexRow]:
         """Return the rows with the largest `size`, an expression, that match a filter.
 
-        Args:
-            chosen: the filter.
-            size: what to sort by, descending.
-            limit: the maximum number of rows; None for all.
-            columns: as for `rows`.
+        `size`: what to sort by, descending.
         """
         self._check_settings(chosen)
         if limit is None:
@@ -159,8 +148,7 @@ class Index:
     def originals(self, digests: Sequence[str] | None = None) -> dict[str, tuple[str, str, str]]:
         """Return root, entry and id of the first run with each content that was recorded twice or more.
 
-        Args:
-            digests: the contents; all by default, or if they are very many.
+        `digests`: the contents; all by default, or if they are very many.
         """
         several = self._recorded_twice(digests)
         if not list(self._tuples(several.limit(1))):
@@ -248,11 +236,7 @@ class Index:
         return tuples_of(self._database, query)
 
     def _check_settings(self, chosen: Filter) -> None:
-        """Refuse a filter with a path that no configuration has.
-
-        Raises:
-            RunnerError: it has one; the message suggests a similar path.
-        """
+        """Refuse a filter with a path that no configuration has."""
         for path in sorted(chosen.settings):
             kind = fn.json_type(Row.settings, setting_path(path))
             some = self._of(ANY_RUN, Row.entry).limit(1)
@@ -273,16 +257,8 @@ def look(
 ) -> Result:
     """Return the result of some work on the index of these folders, which is brought up to date before.
 
-    Args:
-        roots: recordings folders; a missing one has no runs.
-        work: called once, or once more if the index turns out to be damaged.
-        report: called with messages about the index itself.
-        rebuild: read every run again, changed or not.
-        cached: use the index as it is, without checking the folders.
-        depth: which changes of the folders are detected.
-
-    Raises:
-        StorageError: a recordings folder cannot be read.
+    `work`: called once, or once more if the index turns out to be damaged.
+    `cached`: use the index as it is, without checking the folders.
     """
     paths = (os.path.abspath(root) for root in roots)  # noqa: PTH100 - links stay as they are
     places = list(dict.fromkeys(paths))
@@ -311,9 +287,6 @@ def order_of(text: str) -> list[Expression]:
     """Return the order by a list of fields, `-FIELD` for descending, to sort rows by.
 
     Missing values come last. A value of the configuration is a field too: `config.discount`.
-
-    Raises:
-        RunnerError: there is no such field.
     """
     order = []
     for name in filter(None, (part.strip() for part in text.split(","))):

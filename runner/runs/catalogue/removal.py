@@ -73,10 +73,7 @@ class Removal:
 def plan(run: Run, root: Path, foreign: bool = False) -> Removal:
     """Return the removal of a run.
 
-    Args:
-        run: the run to remove.
-        root: the recordings folder it must be in.
-        foreign: also remove foreign files in its folder.
+    `foreign`: also remove foreign files in its folder.
     """
     row = row_of(run, None) | {"root": root, "entry": run.folder.name}
     return _removal(row, run.folder, _why_not_in(run, root) or _protected(run), foreign)
@@ -86,10 +83,6 @@ def plan_row(row: IndexRow, foreign: bool = False) -> Removal:
     """Return the removal of a run by its row in the index, which is quicker for very many runs.
 
     This is for showing only: before runs are removed, `plan` reads their own files.
-
-    Args:
-        row: a row that `unwanted` returned.
-        foreign: also remove foreign files in its folder.
     """
     folder = Path(row["root"], row["entry"])
     return _removal(row, folder, _linked(folder) or _unreadable(folder), foreign)
@@ -124,10 +117,6 @@ def _removal(row: IndexRow, folder: Path, refusal: str, foreign: bool) -> Remova
 
 def remove(removal: Removal, foreign: bool = False) -> None:
     """Remove a run.
-
-    Args:
-        removal: from `plan`.
-        foreign: also remove foreign files in its folder.
 
     Raises:
         RunnerError: it must not be removed, or another process is using it; it is unchanged.
@@ -186,13 +175,7 @@ class Criteria:
 
 
 def unwanted(index: Index, criteria: Criteria, now: float) -> tuple[list[IndexRow], Counter[str]]:
-    """Return the rows that meet the criteria, and how many more do but are protected, by reason.
-
-    Args:
-        index: of the recordings folders.
-        criteria: which runs.
-        now: seconds since 1970, from which ages are counted.
-    """
+    """Return the rows that meet the criteria, and how many more do but are protected, by reason."""
     chosen = criteria.filter
     if criteria.older_than is not None:
         chosen = chosen.also(Row.created < int((now - criteria.older_than) * 1000))

@@ -91,8 +91,7 @@ def belongs(name: str) -> bool:
 def cached(part: str) -> Counter[str]:
     """Return the bytes cached for each run, by its id; what is for several counts for the first.
 
-    Args:
-        part: the folder in the cache: `EXPORTS`, `TABLES` or `RESTORED`.
+    `part`: the folder in the cache: `EXPORTS`, `TABLES` or `RESTORED`.
     """
     found: Counter[str] = Counter()
     with contextlib.suppress(OSError), os.scandir(cache_folder() / part) as entries:
@@ -168,8 +167,7 @@ class Sums:
     def freeable(self, recordings: Sequence[Path]) -> dict[str, int]:
         """Return the bytes that could be freed, by reason.
 
-        Args:
-            recordings: the folders searched for runs whose removal was interrupted.
+        `recordings`: the folders searched for runs whose removal was interrupted.
         """
         interrupted = [contents_of(stray) for root in recordings for stray in strays(root)]
         return {
@@ -201,10 +199,7 @@ def usage_of(
     SQLite adds up and sorts what the index has. Folders that are new or changed are measured here, after the
     index was read: that may take long, and must not keep others from writing to it.
 
-    Args:
-        read: calls some work with the index and returns its result, as `look` does.
-        chosen: which runs.
-        limit: the maximum number of runs to return; None for all.
+    `read`: calls some work with the index and returns its result, as `look` does.
     """
     exports, restored = cached(EXPORTS) + cached(TABLES), cached(RESTORED)
     contents_in = lru_cache(lambda root: Store(Path(root)).sizes())
