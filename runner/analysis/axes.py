@@ -53,11 +53,7 @@ AXES: Final = {axis.name: axis for axis in (EPISODES, STEPS, UPDATES, TIME)}
 
 
 def axis_of(name: str) -> Axis:
-    """Return the axis of a name.
-
-    Raises:
-        RunnerError: there is none.
-    """
+    """Return the axis of a name."""
     if name not in AXES:
         raise RunnerError(f"axis: found {name!r}, expected one of {', '.join(AXES)}.{nearest(name, AXES)}")
     return AXES[name]
@@ -95,11 +91,7 @@ class Positions:
 
 
 def positions(recording: Recording, axis: Axis) -> Positions:
-    """Return the positions of a recording's moments on an axis.
-
-    Raises:
-        RecordingError: the recording does not have this axis; the message states what it would need.
-    """
+    """Return the positions of a recording's moments on an axis."""
     steps, values = np.empty(0), np.empty(0)
     if axis is UPDATES:
         if recording.has_reports:  # each training step of a job updates its tables
@@ -126,11 +118,7 @@ def edges_of(axis: Axis, last: float, parts: int) -> Values:
     """Return the edges of at most `parts` stretches of 1, 2, 5, 10, ... that reach from 0 to `last`.
 
     Those of runs of about the same length agree. Only an axis without whole numbers has shorter stretches.
-
-    Args:
-        axis: the axis.
-        last: its last value, finite and not negative.
-        parts: the maximum number of stretches.
+    `last` is finite and not negative.
     """
     width = max(last / parts, 1.0 if axis.whole else 0.0) or 1.0
     power = math.floor(math.log10(width))

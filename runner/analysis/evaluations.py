@@ -120,11 +120,7 @@ class Evaluation:
     """Number of the evaluation from 0, also where a repair lost others."""
 
     def trial(self, number: int, where: str) -> int:
-        """Return the number of a trial, counted from 0, among those of all evaluations.
-
-        Raises:
-            RecordingError: there is no such trial; the message begins with `where`.
-        """
+        """Return the number of a trial, counted from 0, among those of all evaluations."""
         trials = self.stop - self.start
         if not 0 <= number < trials:
             raise NotInRecording(
@@ -162,11 +158,7 @@ def evaluations_of(recording: Recording) -> list[Evaluation]:
 
 
 def evaluation_after(evaluations: Sequence[Evaluation], episodes: int, where: str) -> Evaluation:
-    """Return the evaluation after a number of training episodes.
-
-    Raises:
-        RecordingError: there is none; the message begins with `where`.
-    """
+    """Return the evaluation after a number of training episodes."""
     found = {one.after: one for one in evaluations}
     if episodes in found:
         return found[episodes]

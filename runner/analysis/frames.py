@@ -155,11 +155,7 @@ def transition_columns(mdp: Mdp) -> dict[str, Array]:
 def episode_columns(
     recording: Recording, phase: Phase = "train", start: int = 0, stop: int | None = None
 ) -> dict[str, Array]:
-    """Return the columns of `episodes`, an array each.
-
-    Raises:
-        RecordingError: the recording cannot be read.
-    """
+    """Return the columns of `episodes`, an array each."""
     records = recording.episodes(phase, start, stop)
     columns = _plain_columns(records, ("episode", "length", "penalties", "success"))
     columns |= _plain_columns(records, ("terminated", "truncated", "last_step"))
@@ -175,11 +171,7 @@ def step_columns(
     start: int = 0,
     stop: int | None = None,
 ) -> dict[str, Array]:
-    """Return the columns of `steps`, an array each.
-
-    Raises:
-        RecordingError: the recording cannot be read, or has no such episode.
-    """
+    """Return the columns of `steps`, an array each."""
     topic = recording.topic(f"/{phase}/step")
     if topic not in recording.dtypes:
         raise RecordingError(

@@ -98,11 +98,7 @@ def grouped(
 
 
 def require_two(groups: Sequence[Group], by: str | None = None) -> None:
-    """Refuse a single group.
-
-    Raises:
-        RunnerError: there are not two groups.
-    """
+    """Refuse a single group."""
     if len(groups) > 1:
         return
     (group,) = groups

@@ -125,9 +125,6 @@ def histograms(recording: Recording, axis: Axis = EPISODES) -> tuple[list[Histog
     """Return the histograms of a recording's training over an axis, and what is left out, a sentence each.
 
     Returns and lengths are at the ends of episodes, actions and rewards at their steps.
-
-    Raises:
-        RecordingError: the recording is damaged, or does not have the axis.
     """
     places = positions(recording, axis)
     done = recording.done()

@@ -57,28 +57,14 @@ class TablesDescription(TypedDict):
 
 
 def replay_at(recording: Recording, step: int | None = None, episode: int | None = None) -> TableReplay:
-    """Return the tables after a number of training steps, or episodes; by default after the last.
-
-    Raises:
-        RecordingError: there is no such step, or the steps before it are not recorded.
-    """
+    """Return the tables after a number of training steps, or episodes; by default after the last."""
     if episode is not None:
         step = step_of_episode(recording, episode)
     return TableReplay(recording, last_step(recording) if step is None else step)
 
 
 def describe_tables(recording: Recording, replay: TableReplay, state: int | None = None) -> TablesDescription:
-    """Return the tables at the step of a replay, as JSON can hold them.
-
-    Args:
-        recording: the run.
-        replay: of its tables.
-        state: whose values are added; None for none.
-
-    Raises:
-        RunnerError: there is no such state.
-        RecordingError: the steps are not recorded, which a state's history needs.
-    """
+    """Return the tables at the step of a replay as JSON can hold them, with a state's values if given."""
     tables = [summarize(agent, q) for agent, q in zip(replay.agents, replay.tables, strict=True)]
     description: TablesDescription = {"run": recording.run_id, "step": replay.step, "tables": tables}
     if state is not None:

@@ -127,12 +127,9 @@ def title_of(metric: str) -> tuple[str, str]:
 def points_of(run: RunSeries, metric: str, line: str, aligned: bool) -> dict[float, float]:
     """Return value by position; a reward that was never paid is 0 percent of the steps.
 
-    Args:
-        run: the run.
-        metric: the metric.
-        line: an agent, a reward, or "".
-        aligned: of the reports of training only those at evaluations, which are at the same episodes in
-            every run of a configuration; all of them if the run has no evaluation, or on another axis.
+    A line is an agent, a reward, or "". With `aligned`, of the reports of training only those at evaluations
+    count, which are at the same episodes in every run of a configuration; all of them if the run has no
+    evaluation, or on another axis.
     """
     source = run.training if metric.startswith("training.") else run.evaluation
     is_aligned = aligned and run.axis is EPISODES and run.can_train_again
@@ -163,11 +160,7 @@ def mean_height(places: Sequence[float], values: Sequence[float]) -> float:
 
 
 def parse_target(text: str) -> tuple[str, float]:
-    """Return metric and level of a target such as `success_percent=80`.
-
-    Raises:
-        RunnerError: the text is no target.
-    """
+    """Return metric and level of a target such as `success_percent=80`."""
     metric, _, level = text.partition("=")
     try:
         return metric, float(level)

@@ -39,15 +39,7 @@ class StepRef:
 
     @classmethod
     def parse(cls, text: str, expected: str = EXPECTED) -> Self:
-        """Return the step that a text refers to.
-
-        Args:
-            text: the reference.
-            expected: what the error says that was expected.
-
-        Raises:
-            RunnerError: the text is no step reference.
-        """
+        """Return the step that a text refers to; `expected` is as for `parse_step`."""
         if match := _TRAINING.fullmatch(text):
             return cls(*(int(part or 0) for part in match.groups()))
         if match := _EVALUATION.fullmatch(text):
@@ -89,12 +81,7 @@ class StepRef:
 def parse_step(text: str, expected: str = _EXPECTED_ANY) -> int | StepRef:
     """Return the step that a text refers to; a number alone is a training step, counted over the run.
 
-    Args:
-        text: the reference.
-        expected: what the error says that was expected.
-
-    Raises:
-        RunnerError: the text is no step reference.
+    `expected` is what the error says that was expected.
     """
     is_number = text.isascii() and text.isdecimal() and len(text) < 16
     return int(text) if is_number else StepRef.parse(text, expected)
@@ -107,12 +94,7 @@ def training_steps(recording: Recording) -> int:
 
 
 def training_step(recording: Recording, at: int | StepRef) -> int:
-    """Return the number of a training step of a job, also of one that recorded no steps.
-
-    Raises:
-        RecordingError: there is no such step.
-        RunnerError: the reference is to a step of an evaluation.
-    """
+    """Return the number of a training step of a job, also of one that recorded no steps."""
     taken = training_steps(recording)
     if isinstance(at, int):
         if not 0 <= at < taken:

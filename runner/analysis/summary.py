@@ -122,12 +122,7 @@ class RunDetails:
 
 
 def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> RunDetails:
-    """Return all about a run.
-
-    Args:
-        run: the run.
-        report: called with a sentence if the recording cannot be read.
-    """
+    """Return all about a run; `report` is called with a sentence if the recording cannot be read."""
     summary, config = run.summary, run.file.config
     if run.recording.is_file():
         try:

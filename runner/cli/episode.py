@@ -42,16 +42,7 @@ class Frame:
 
 
 class Episode:
-    """One episode of an open recording, read as it is needed.
-
-    Args:
-        recording: the run.
-        choice: the episode.
-        title: the first line of each frame.
-
-    Raises:
-        RecordingError: there is no such episode, or the recording holds no steps.
-    """
+    """One episode of an open recording, read as it is needed; the title is the first line of each frame."""
 
     def __init__(self, recording: Recording, choice: EpisodePlace, title: str) -> None:
         self._recording, self._phase, self._number = recording, choice.phase, choice.number

@@ -47,13 +47,9 @@ def json_list(name: str, rows: Iterable[Mapping[str, object]]) -> Iterator[str]:
 
 
 def print_written(text: str, as_json: bool, *paths: Path, **more: object) -> None:
-    """Print what a command wrote, as text or as JSON.
+    """Print what a command wrote: a text, or an object with the list `files`, of each its path and bytes.
 
-    Args:
-        text: a line with path, size and counts.
-        as_json: print an object with the list `files`, of each its path and bytes, instead.
-        paths: the files; of a folder all of its files.
-        more: further keys of the object.
+    All files of a folder are listed; `more` are further keys of the object.
     """
     if as_json:
         print_json({"files": files_written(*paths)} | more)
@@ -125,10 +121,8 @@ def title(text: str) -> Text:
 def table(*headings: str, left: tuple[str, ...] = (), shrinking: tuple[str, ...] = ()) -> Table:
     """Return an empty table; cells of a row and headings of several lines are aligned.
 
-    Args:
-        headings: of the columns, in order.
-        left: the headings of columns that are aligned to the left, as text is; numbers are aligned right.
-        shrinking: the headings of columns that are truncated where a terminal is too narrow.
+    Columns whose headings are in `left` are aligned to the left, as text is, others to the right; those in
+    `shrinking` are truncated where a terminal is too narrow.
     """
     from rich.align import Align
     from rich.table import Table

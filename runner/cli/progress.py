@@ -81,11 +81,8 @@ def _line(
 ) -> Iterator[Callable[..., None]]:
     """Yield the function that updates a line of columns; it does nothing without a terminal.
 
-    Args:
-        label: text at the beginning, if any.
-        names: the columns: names of the table below, or texts.
-        total: the number to be done, if it is known.
-        fields: values that the texts use.
+    The columns are names of the table below, or texts, which use the fields; `total` is None if it is
+    unknown.
     """
     if not sys.stderr.isatty():
         yield lambda **_: None

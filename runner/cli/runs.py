@@ -69,11 +69,7 @@ def folded(run: Run) -> Run:
 
 
 def recorded(run: Run) -> Run:
-    """Return a run with its recording, restored into the cache if it is archived.
-
-    Raises:
-        RunnerError: the recording is missing.
-    """
+    """Return a run with its recording, restored into the cache if it is archived."""
     run = restored(run)
     if run.recording.exists():
         return run
@@ -98,11 +94,7 @@ def restored(run: Run) -> Run:
 
 
 def find_recording(name: str, recordings: Path | None) -> tuple[Path, Run | None]:
-    """Return a recording, however damaged, by run name or path; and its run, if it is in a run's folder.
-
-    Raises:
-        RunnerError: there is no such recording.
-    """
+    """Return a recording, however damaged, by run name or path; and its run, if it is in a run's folder."""
     try:
         run = find_recorded(name, recordings)
         in_folder = run.recording.name == RECORDING_FILE and (run.folder / RUN_FILE).is_file()
@@ -116,11 +108,7 @@ def find_recording(name: str, recordings: Path | None) -> tuple[Path, Run | None
 
 
 def require_over(run: Run | None) -> None:
-    """Refuse a run that is still running.
-
-    Raises:
-        RunnerError: it is.
-    """
+    """Refuse a run that is still running."""
     if run is not None and run.status == "running":
         raise RunnerError(f"run {run.run_id} is running; wait until it has finished, or interrupt it.")
 
@@ -216,12 +204,8 @@ def _summary(run: Run) -> JsonView:
 def print_received(run: Run, digest: str, existing: str, as_json: bool, **more: object) -> None:
     """Print a run that was imported or downloaded.
 
-    Args:
-        run: the run in the recordings folder.
-        digest: its content digest.
-        existing: what was in the folder before, such as `this content`; empty if the run is new.
-        as_json: print JSON.
-        more: further keys of the JSON object.
+    `existing` is what was in the folder before, such as `this content`, empty if the run is new; `more` are
+    further keys of the JSON object.
     """
     if existing:
         say(f"Run {run.run_id} is there already with {existing}; nothing was written.")

@@ -203,11 +203,7 @@ class Client(Connection):
     ) -> UploadStatus:
         """Complete an upload, so that it is verified; errors as for `request`.
 
-        Args:
-            upload: the upload.
-            size: its number of bytes.
-            digest: the BLAKE3 of all of them.
-            about: what the run's folder has and its recording does not.
+        `digest` is the BLAKE3 of all bytes; `about` is what the run's folder has and its recording does not.
         """
         completion = {"digest": digest, "size": size} | (about or {})
         return self._upload("POST", f"/uploads/{upload.id}/complete", json=completion)
@@ -234,11 +230,7 @@ def _about(run: Run) -> dict[str, object]:
 
 
 def _read_pieces(path: Path, offset: int, size: int) -> Iterator[bytes]:
-    """Yield `size` bytes of a file.
-
-    Raises:
-        RunnerError: there are fewer.
-    """
+    """Yield `size` bytes of a file."""
     with path.open("rb") as stream:
         stream.seek(offset)
         while size:

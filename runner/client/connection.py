@@ -42,10 +42,8 @@ Report = Callable[[int, int], object]
 class ServerError(RunnerError):
     """A server refuses a request; the message contains its own.
 
-    Args:
-        message: what is wrong.
-        status: the response's status; 0 if there was none.
-        retry_seconds: the time after which the server asks to try again; 0 if it does not.
+    The status is 0 if there was no response; `retry_seconds` is the time after which the server asks to try
+    again, 0 if it does not.
     """
 
     exit_code = 1
@@ -64,9 +62,8 @@ class ServerUnavailable(ServerError):
 class Backoff:
     """Waits ever longer while a server is unavailable, at least as long as the server asks, up to a limit.
 
-    Args:
-        timeout: how long the server may be unavailable, in seconds.
-        log: called with the reason for a longer pause.
+    The timeout is how long the server may be unavailable, in seconds; `log` is called with the reason for a
+    longer pause.
     """
 
     def __init__(self, timeout: float, log: Callable[[str], object] = lambda _: None) -> None:
@@ -174,17 +171,7 @@ class Connection:
             yield response
 
     def download(self, path: str, tag: str, offset: int, size: int) -> Iterator[bytes]:
-        """Yield the bytes of a file from an offset on.
-
-        Args:
-            path: its path.
-            tag: its ETag.
-            offset: where to begin.
-            size: its number of bytes, all of them.
-
-        Raises:
-            ServerError: it has changed, or the server is unavailable.
-        """
+        """Yield the bytes of a file of `size` bytes, whose ETag is `tag`, from an offset on."""
         headers = {"Range": f"bytes={offset}-", "If-Range": tag, "Accept-Encoding": "identity"}
         with self.stream(path, headers) as response:
             if response.headers.get("content-range") != f"bytes {offset}-{size - 1}/{size}":
@@ -219,11 +206,7 @@ class Connection:
 
 
 def checked_url(url: str) -> str:
-    """Return the address of a server, without a slash at its end.
-
-    Raises:
-        RunnerError: it is none.
-    """
+    """Return the address of a server, without a slash at its end."""
     parts = urlsplit(url)
     if parts.scheme not in ("http", "https") or not parts.hostname or parts.query or parts.fragment:
         raise RunnerError(f"server: found {url!r}, expected an address such as http://localhost:8000.")
@@ -236,11 +219,7 @@ def checked_url(url: str) -> str:
 
 
 def find_token(token: str | None = None, file: Path | None = None) -> str | None:
-    """Return the given token, or that in a file; else that of the environment variables; None if none is set.
-
-    Raises:
-        RunnerError: it is no token, or its file cannot be read.
-    """
+    """Return the given token, or that in a file, else that of the environment variables; None without any."""
     if token is None and file is None:
         token, named = os.environ.get(TOKEN_VARIABLE), os.environ.get(TOKEN_FILE_VARIABLE)
         file = Path(named) if named else None

@@ -131,11 +131,7 @@ class JobEvent:
 
     @classmethod
     def from_json(cls, kind: str, values: JsonView, event_id: str = "") -> JobEvent:
-        """Return an event from a stream or the database.
-
-        Raises:
-            RunnerError: it is none.
-        """
+        """Return an event from a stream or the database."""
         try:
             found: type[EventData] = SweepProgress if "done" in values else RunProgress
             if kind != "progress":
@@ -171,11 +167,7 @@ class RemoteJob:
 
     @classmethod
     def from_json(cls, response: JsonView) -> RemoteJob:
-        """Return the job in a response.
-
-        Raises:
-            RunnerError: there is none in it.
-        """
+        """Return the job in a response."""
         keys = ("number", "kind", "name", "state", "runs", "error", "progress")
         try:
             begun = {int(run["seed"]): str(run["run_id"]) for run in response["begun"]}

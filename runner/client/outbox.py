@@ -56,11 +56,7 @@ def outbox_folder() -> Path:
 
 
 def waiting(outbox: Path) -> list[tuple[Run, str]]:
-    """Return the runs in an outbox that are over, the oldest first, each with its server.
-
-    Raises:
-        StorageError: the folder cannot be read.
-    """
+    """Return the runs in an outbox that are over, the oldest first, each with its server."""
     for sent in outbox.glob(f"{_SENT}*"):
         shutil.rmtree(sent, ignore_errors=True)
     runs = [run for run in reversed(list_runs(outbox)) if run.status != "running"]
@@ -94,10 +90,7 @@ def deliver(run: Run, client: Client, report: Report = lambda *_: None) -> Uploa
 class Follower:
     """Pushes a run while it is recorded, in a thread of its own; problems are reported at the end only.
 
-    Args:
-        client: a connection to the server; closed at the end.
-        run: a run in the outbox.
-        size: returns how many bytes of its recording are final.
+    The client is closed at the end; `size` returns how many bytes of the recording are final.
     """
 
     def __init__(self, client: Client, run: Run, size: Callable[[], int]) -> None:
@@ -154,11 +147,7 @@ def forget_upload(run: Run) -> None:
 
 
 def connect(url: str) -> Client:
-    """Return a client of the server that a run is recorded for.
-
-    Raises:
-        RunnerError: it is no address, its token cannot be read, or HTTPX is not installed.
-    """
+    """Return a client of the server that a run is recorded for."""
     return Client(url, find_token(), LAST_SECONDS)
 
 

@@ -74,12 +74,7 @@ def pull(client: Connection, name: str, recordings: Path, report: Report = lambd
 
 
 def _pull_contents(client: Connection, run: Run, report: Report) -> None:
-    """Download the contents of a run's checkpoints that are at the server and not here.
-
-    Raises:
-        ServerError: the server was unavailable for too long.
-        RecordingError: one has another digest; what came before it stays.
-    """
+    """Download the contents of a run's checkpoints that are at the server and not here."""
     store = Store(run.folder.parent)
     wanted = {each.digest: each for each in run.checkpoints() if not each.is_here}
     if not wanted:
@@ -98,13 +93,7 @@ def _pull_contents(client: Connection, run: Run, report: Report) -> None:
 
 
 def _download(client: Connection, path: str, tag: str, size: int, part: Path, report: Report) -> None:
-    """Download a file, from where it was interrupted the last time.
-
-    Raises:
-        ServerError: it has changed, or the server was unavailable for too long.
-        StorageError: there is no room.
-        OSError: it cannot be written.
-    """
+    """Download a file, from where it was interrupted the last time."""
     backoff = client.backoff()
     with part.open("ab") as stream:
         missing, free = size - stream.tell(), shutil.disk_usage(part.parent).free

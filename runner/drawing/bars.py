@@ -24,12 +24,9 @@ _BARS: Final = 160, 390
 
 
 class BarRaster:
-    """Draws values as horizontal bars from zero.
+    """Draws values as horizontal bars from zero, between the lowest and the highest that each value gets.
 
-    Args:
-        names: of the values; those after the first `MAX_BARS` are counted in a line, and not drawn.
-        low: the lowest that each value gets, float64 [values].
-        high: the highest that each value gets.
+    Those after the first `MAX_BARS` are counted in a line, and not drawn.
     """
 
     def __init__(self, names: Sequence[str], low: NDArray[np.float64], high: NDArray[np.float64]) -> None:

@@ -35,23 +35,13 @@ _PURPOSE: Final = "a picture"
 
 
 def require_packages() -> None:
-    """Check that the packages that draw pictures are installed.
-
-    Raises:
-        MissingExtra: one is not.
-    """
+    """Check that the packages that draw pictures are installed."""
     require("resvg_py", "PIL", extra="plots", purpose=_PURPOSE)
     _fonts()
 
 
 class SceneRaster:
-    """Draws states of a scene as pixels.
-
-    Args:
-        drawing: the drawing of the scene.
-        width: the largest width of a picture in pixels.
-        height: the largest height of a picture in pixels.
-    """
+    """Draws states of a scene as pixels, in pictures of at most this width and height."""
 
     def __init__(self, drawing: svg.Drawing, width: int, height: int) -> None:
         self._drawing = drawing
@@ -73,11 +63,10 @@ class SceneRaster:
         return ground
 
     def draw(self, places: NDArray[np.int16]) -> Pixels:
-        """Return the picture of a state, and of the trail that leads there.
+        """Return the picture of the last of some states, and of the trail that leads there.
 
-        Args:
-            places: int16 [states, things, 3], as `Drawing.places` returns them: of the states so far, in
-                order, at least the last `svg.TRAIL`; the last one is shown.
+        The places are int16 [states, things, 3], as `Drawing.places` returns them: at least the last
+        `svg.TRAIL`.
         """
         picture = self._ground.copy()
         trail = places[-svg.TRAIL :]

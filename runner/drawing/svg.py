@@ -181,13 +181,10 @@ class Drawing:
         trail: NDArray[np.int16] | None = None,
         style: str = STYLE,
     ) -> str:
-        """Return a whole picture.
+        """Return a whole picture, with a description for screen readers.
 
-        Args:
-            place: where the things are, [things, 3]; None for anywhere, if a script moves them.
-            title: the picture's description for screen readers.
-            trail: the places of earlier frames, [frames, things, 3].
-            style: CSS of the picture; empty if the page has it.
+        `place` is where the things are, [things, 3], None for anywhere, if a script moves them; the trail has
+        the places of earlier frames, [frames, things, 3]; `style` is CSS, empty if the page has it.
         """
         if place is None:
             place = np.zeros((len(self._things), 3), np.int16)

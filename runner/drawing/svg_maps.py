@@ -45,14 +45,10 @@ def policy_map(
     bounds: tuple[float, float],
     title: str,
 ) -> str:
-    """Return the map of one mover.
+    """Return the map of one mover: the highest value and the greedy action in each cell.
 
-    Args:
-        scene: its grid and its actions.
-        values: [cells], the highest value there; nan where no action is better than another.
-        greedy: the mover's greedy action in each cell; None where there is none.
-        bounds: the values of the darkest and of the lightest colour.
-        title: the description for screen readers.
+    The values are [cells], nan where no action is better than another; the bounds are those of the darkest
+    and of the lightest colour.
     """
     letters = {
         row * scene["columns"] + column: mark["name"][:2]

@@ -34,11 +34,8 @@ def moves_map(
 ) -> str:
     """Return the grid with an arrow for each move; for one that stayed in its cell, a ring.
 
-    Args:
-        scene: the grid.
-        moves: the moves; the width of each is proportional to its weight.
-        place: where the things are drawn, [things, 3]; None for no things.
-        title: the description for screen readers.
+    The width of an arrow is proportional to the move's weight; `place` is where the things are drawn,
+    [things, 3].
     """
     drawing = Drawing(scene)
     heaviest = max((move.weight for move in moves), default=0.0)

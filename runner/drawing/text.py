@@ -24,11 +24,7 @@ Cell = tuple[int, int]
 
 
 class Drawing:
-    """Draws states of one scene.
-
-    Args:
-        scene: rows, columns, walls, landmarks and things, as an environment describes them.
-    """
+    """Draws states of one scene."""
 
     def __init__(self, scene: SceneDescription) -> None:
         self._rows, self._columns = scene["rows"], scene["columns"]

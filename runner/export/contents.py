@@ -44,15 +44,9 @@ def shortcomings(recording: Recording) -> list[str]:
 
 
 def require_steps(recording: Recording, purpose: str, may_redo: bool = False) -> None:
-    """Refuse a recording without steps.
+    """Refuse a recording without steps for a purpose, such as `play`.
 
-    Args:
-        recording: the recording.
-        purpose: what the steps are needed for, such as `play`.
-        may_redo: whether recorded actions are enough, as their steps are done again.
-
-    Raises:
-        RecordingError: it has none.
+    With `may_redo` recorded actions are enough, as their steps are done again.
     """
     if not (recording.has_steps or (may_redo and recording.has_actions)):
         raise RecordingError(f"{recording.path}: found no steps to {purpose}: {why_no_steps(recording)}.")
@@ -81,11 +75,7 @@ def ending_of(recording: Recording, phase: str, number: int) -> str:
 def whole_ranges(
     ranges: Iterable[tuple[int, int | None]], count: int, phase: str, where: str
 ) -> list[tuple[int, int]]:
-    """Return ranges of episodes with an end in place of None.
-
-    Raises:
-        RecordingError: one is empty, or exceeds the `count` episodes; the message begins with `where`.
-    """
+    """Return ranges of episodes, which must be among `count` ones, with an end in place of None."""
     whole = [(start, count if stop is None else stop) for start, stop in ranges]
     for start, stop in whole:
         if not start < stop <= count:

@@ -54,12 +54,6 @@ def encoded_pictures(
     Before the first one there may be a note, a text: why they are not drawn by the environment, although it
     could be made again.
 
-    Args:
-        path: the recording.
-        phase: `train` or `eval`.
-        episode: counted over the phase.
-        start: steps before the first picture.
-
     Raises:
         RecordingError: there is no such episode, or the recording is damaged.
         CannotRedo: the environment cannot be made again, or is another one than was recorded, and the

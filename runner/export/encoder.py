@@ -70,12 +70,7 @@ LOSSLESS: Final = Format("matroska", "libx264rgb", "rgb24", {"preset": "ultrafas
 
 
 def format_of(path: Path) -> Format:
-    """Return how a film is encoded in a file of this name.
-
-    Raises:
-        RunnerError: its ending stands for no format of films.
-        MissingExtra: PyAV is not installed.
-    """
+    """Return how a film is encoded in a file of this name."""
     if path.suffix.lower() not in FORMATS:
         raise RunnerError(
             f"{path}: found the ending {path.suffix!r}, expected one of {', '.join(FORMATS)}: "
@@ -87,16 +82,7 @@ def format_of(path: Path) -> Format:
 
 
 class Encoder:
-    """Encodes frames of one size into a file; a context manager.
-
-    Args:
-        path: the file to write.
-        form: how.
-        fps: frames per second.
-
-    Raises:
-        RunnerError: there is no encoder for it.
-    """
+    """Encodes frames of one size into a file; a context manager."""
 
     def __init__(self, path: Path, form: Format, fps: float) -> None:
         import av
@@ -131,11 +117,7 @@ class Encoder:
             self._container.close()
 
     def add(self, pixels: Pixels) -> None:
-        """Add a frame, uint8 [height, width, 3]; sides of odd length get a white line more.
-
-        Raises:
-            RunnerError: it is too large.
-        """
+        """Add a frame, uint8 [height, width, 3]; sides of odd length get a white line more."""
         import av
 
         height, width, _ = pixels.shape

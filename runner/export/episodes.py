@@ -28,15 +28,7 @@ class EpisodePlace:
 
 
 def place_of(recording: Recording, which: tuple[int, ...]) -> EpisodePlace:
-    """Return where an episode stands.
-
-    Args:
-        recording: the run.
-        which: (episode,) of training, or (training episodes before, trial) of an evaluation.
-
-    Raises:
-        RecordingError: there is no such evaluation or trial.
-    """
+    """Return where an episode stands: (episode,) of training, or (training episodes before, trial)."""
     if len(which) == 1:
         return EpisodePlace("train", which[0], f"training episode {which[0]:,}")
     after, number = which
@@ -47,17 +39,9 @@ def place_of(recording: Recording, which: tuple[int, ...]) -> EpisodePlace:
 
 
 def chosen_episode(recording: Recording, episode: int | None, trial: tuple[int, int] | None) -> EpisodePlace:
-    """Return the training episode or trial of these numbers; without any, a typical one.
+    """Return a training episode, or a trial (training episodes before, number); without any, a typical one.
 
     That is `default_trial`, or the last training episode of a run without evaluations.
-
-    Args:
-        recording: the run.
-        episode: a training episode.
-        trial: the training episodes before an evaluation, and a trial of it.
-
-    Raises:
-        RecordingError: there is no such evaluation or trial, or no steps.
     """
     require_steps(recording, "show", may_redo=True)
     if episode is not None:
@@ -69,9 +53,6 @@ def ranked_episodes(recording: Recording) -> tuple[str, NDArray[np.int64]]:
     """Return the phase and the numbers of its episodes from worst to best: by success, return and length.
 
     They are the trials of all evaluations; of a run without trials the training episodes.
-
-    Raises:
-        RecordingError: no episode ended, or there are no steps.
     """
     require_steps(recording, "show", may_redo=True)
     phase = "eval" if recording.count(schema.EVAL_EPISODE) else "train"
@@ -122,11 +103,7 @@ def _by_rank(records: NDArray[np.void]) -> NDArray[np.int64]:
 
 
 def typical_trial(recording: Recording) -> tuple[int, int]:
-    """Return the last evaluation (training episodes before it) and its median trial.
-
-    Raises:
-        RecordingError: there is no evaluation, or no steps.
-    """
+    """Return the last evaluation (training episodes before it) and its median trial."""
     require_steps(recording, "show", may_redo=True)
     after = last_whole_evaluation(recording)
     if after is None:

@@ -64,20 +64,10 @@ def write_film(
     width: int | None = None,
     progress: Callable[[int], None] = lambda _: None,
 ) -> Film:
-    """Write the film of an episode.
+    """Write the film of an episode; the ending of `path` chooses the format.
 
-    Args:
-        path: the file to write; its ending chooses the format.
-        shot: the episode.
-        fps: frames, and thus steps, per second.
-        width: of the film in pixels; None for about that of the pictures.
-        progress: called with the number of frames that are done.
-
-    Raises:
-        RunnerError: the format is unknown, or has no encoder here.
-        RecordingError: a picture cannot be made.
-        MissingExtra: a package is not installed.
-        OSError: the file cannot be written.
+    `fps` are frames, and thus steps, per second; `width` is in pixels, None for about that of the pictures;
+    `progress` is called with the number of frames that are done.
     """
     notes: list[str] = []
     with contextlib.closing(shot.pictures), Encoder(path, format_of(path), fps) as film:
@@ -97,16 +87,8 @@ def write_grid(
 ) -> Film:
     """Write a film of several episodes side by side; each stays at its last frame until all have ended.
 
-    Args:
-        path: as for `write_film`.
-        shots: the episodes, row by row.
-        columns: of the grid.
-        fps: as for `write_film`.
-        width: of the film in pixels; None for at most `MAX_WIDTH`.
-        progress: called with the number of frames of single episodes that are done.
-
-    Raises:
-        As for `write_film`.
+    The arguments are those of `write_film`, of episodes row by row; `progress` counts the frames of single
+    episodes, and a `width` of None is at most `MAX_WIDTH`.
     """
     form = format_of(path)
     notes: list[str] = []
@@ -140,10 +122,8 @@ def write_grid(
 def captioned(shot: Shot, width: int | None, notes: list[str]) -> Iterator[Pixels]:
     """Yield the frames of an episode: each picture with a heading above, and step, action and rewards below.
 
-    Args:
-        shot: the episode.
-        width: of a frame; None for about that of the pictures.
-        notes: gets the note of the last picture, if it has one.
+    `width` is that of a frame, None for about that of the pictures; `notes` gets the note of the last
+    picture.
     """
     from PIL import Image
 

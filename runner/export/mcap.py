@@ -32,18 +32,9 @@ class McapExport(NamedTuple):
 
 
 def export_mcap(run: Run, target: Path, anonymous: bool = False, force: bool = False) -> McapExport:
-    """Write a run into one MCAP file, which `import_recording` reads; the same run gives the same bytes.
+    """Write a run that is over into one MCAP file for `import_recording`; the same run gives the same bytes.
 
-    Args:
-        run: a run that is not running; an interrupted one stays interrupted.
-        target: the file to write.
-        anonymous: leave out host, user, command line, folder, code and output, and the text of an error.
-        force: replace an existing file.
-
-    Raises:
-        RunnerError: the run is running or only in an archive, or the file exists.
-        RecordingError: the recording is damaged.
-        StorageError: the file cannot be written.
+    An anonymous file leaves out host, user, command line, folder, code and output, and the text of an error.
     """
     if run.status == "running":
         raise RunnerError(f"run {run.run_id} is running; wait until it has finished, or interrupt it.")
@@ -78,11 +69,7 @@ def _record(run: Run, anonymous: bool) -> dict[str, object]:
 
 
 def _without_names(name: str, entries: dict[str, str], recording: Path) -> dict[str, str]:
-    """Return the entries of a metadata record without host, user, command line and folders.
-
-    Raises:
-        RecordingError: the record cannot be parsed.
-    """
+    """Return the entries of a metadata record without host, user, command line and folders."""
     if name in {"provenance", "rerecord"} or name.startswith("resume/"):
         return {
             key: text

@@ -39,11 +39,7 @@ class Written:
 
 
 def require_packages() -> None:
-    """Check that Minari and its storage are installed.
-
-    Raises:
-        MissingExtra: one is not.
-    """
+    """Check that Minari and its storage are installed."""
     require("h5py", "minari", extra="minari", purpose="export minari")
 
 
@@ -59,22 +55,12 @@ def write_dataset(
     ranges: Ranges = (),
     report: Callable[[int], None] = lambda _: None,
 ) -> Written:
-    """Write whole episodes into the folder of a dataset.
+    """Write whole episodes into the empty folder of a dataset.
 
     For a job an observation is a state, an action the joint action; for a loop both are as they were. A
     reward is the sum over the learners; with several, `infos["rewards"]` has each, [steps + 1, learners],
     where the first row is 0 as of a reset, and in a loop `infos["acted"]` has which of them took part.
-
-    Args:
-        recording: the run's.
-        folder: the dataset's, empty.
-        phase: `train` or `eval`.
-        ranges: of episodes; all if empty.
-        report: called with the number of episodes written so far.
-
-    Raises:
-        RecordingError: there is no such episode, Minari cannot store it, or the recording is damaged.
-        OSError: the folder cannot be written.
+    `report` is called with the number of episodes written so far.
     """
     import minari
     from minari.dataset.minari_storage import MinariStorage

@@ -52,9 +52,6 @@ def episodes_in(recording: Recording, phase: str, ranges: Ranges) -> Iterator[Ep
     """Yield the episodes of a phase that ended, in these ranges.
 
     An episode of a loop is left out if a repair lost steps of it or the observation of its reset.
-
-    Raises:
-        RecordingError: one is too large, or the recording is damaged.
     """
     if not recording.has_spaces:
         yield from _job_episodes(recording, phase, ranges)

@@ -47,11 +47,7 @@ class MlflowExport:
 
 
 def require_packages() -> None:
-    """Check that MLflow's client is installed.
-
-    Raises:
-        MissingExtra: it is not.
-    """
+    """Check that MLflow's client is installed."""
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     with _quiet():
         require("mlflow", "sqlalchemy", extra="mlflow", purpose="export mlflow")
@@ -62,16 +58,8 @@ def export(
 ) -> MlflowExport:
     """Write a run into an MLflow store, unless it is there already with the same content.
 
-    Args:
-        recording: the run's.
-        tracking: the store: `sqlite:///exports/mlflow.db`, or the address of a server.
-        experiment: the name of the experiment, created if it is missing.
-        with_recording: also store the recording as an artifact.
-        force: write the run again, and delete what the store has of it.
-
-    Raises:
-        RunnerError: the store cannot be used, or has the run with other content.
-        RecordingError: the recording is damaged.
+    The store, `tracking`, is `sqlite:///exports/mlflow.db` or the address of a server. `force` writes the run
+    again, and deletes what the store has of it.
     """
     from mlflow.exceptions import MlflowException
 

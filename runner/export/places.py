@@ -14,12 +14,7 @@ from runner.util.files import replacing, storage_errors
 
 
 def write_new(path: Path, force: bool, write: Callable[[Path], object]) -> None:
-    """Call `write` with a temporary path next to `path`, then move that file there.
-
-    Raises:
-        RunnerError: there is a file already and `force` is not set.
-        StorageError: it cannot be written.
-    """
+    """Call `write` with a temporary path next to `path`, then move that file there."""
     require_new(path, force)
     with storage_errors(path):
         try:
@@ -31,11 +26,7 @@ def write_new(path: Path, force: bool, write: Callable[[Path], object]) -> None:
 
 
 def require_new(path: Path, force: bool) -> None:
-    """Refuse a path at which no file may be written.
-
-    Raises:
-        RunnerError: it is a folder, or there is a file already and `force` is not set.
-    """
+    """Refuse a path at which no file may be written."""
     if path.is_dir():
         raise RunnerError(f"{path}: found a folder, expected a file to write.")
     if path.exists() and not force:
@@ -51,14 +42,8 @@ def write_text_new(path: Path, force: bool, text: str) -> None:
 def new_folder(path: Path, force: bool, patterns: Sequence[str]) -> Iterator[Path]:
     """Yield a hidden folder next to `path`, which becomes `path` if the block succeeds.
 
-    Args:
-        path: the folder to create.
-        force: whether an existing folder is replaced if it holds nothing but exported files.
-        patterns: of the relative paths of exported files.
-
-    Raises:
-        RunnerError: something exists that must not be replaced.
-        StorageError: the folder cannot be written.
+    With `force` it replaces a folder that holds nothing but exported files: those whose relative paths match
+    `patterns`.
     """
     if path.exists():
         _require_replaceable(path, force, patterns)

@@ -63,11 +63,7 @@ class Measures:
 
 
 def measures(recording: Recording) -> Iterator[Measures]:
-    """Yield the reports of training, the evaluations, their exact metrics, and the values logged by a loop.
-
-    Raises:
-        RecordingError: the recording is damaged.
-    """
+    """Yield reports of training, evaluations, their exact metrics, and the values that a loop logged."""
     agents, exact_values = recording.agents, {f"exact/{name}": field for name, field in _EXACT.items()}
     for phase in PHASES:
         for row in recording.iter_metrics(phase):
@@ -93,11 +89,7 @@ def measures(recording: Recording) -> Iterator[Measures]:
 
 
 def episodes(recording: Recording, phase: str) -> Iterator[Measures]:
-    """Yield length and return of each episode of a phase, at its last step: `episode/return/AGENT`.
-
-    Raises:
-        RecordingError: the recording is damaged.
-    """
+    """Yield length and return of each episode of a phase, at its last step: `episode/return/AGENT`."""
     names = ["episode/length", *(f"episode/return/{agent}" for agent in recording.agents)]
     for block in recording.blocks(PHASES[phase][1]):
         columns = (
@@ -114,9 +106,6 @@ def wall_clock(recording: Recording) -> Callable[[int], float] | None:
     """Return a function that returns the seconds that had passed at a position; None without a clock.
 
     The clock of a run that several processes recorded is that of one of them: it does not count.
-
-    Raises:
-        RecordingError: the clock is damaged.
     """
     clock = read_clock(recording)
     if clock is None or recording.shards:
@@ -128,9 +117,6 @@ def times(recording: Recording) -> Callable[[int], float]:
     """Return a function that returns the time of a position in seconds since 1970.
 
     Where no clock was recorded, logical time is added to the time at which the run was created.
-
-    Raises:
-        RecordingError: the clock is damaged, or the recording holds no time of creation.
     """
     began = created(recording)
     passed = wall_clock(recording) or (lambda position: position * STEP_NANOSECONDS / 1e9)
@@ -138,11 +124,7 @@ def times(recording: Recording) -> Callable[[int], float]:
 
 
 def created(recording: Recording) -> float:
-    """Return when the run began, in seconds since 1970.
-
-    Raises:
-        RecordingError: the recording holds no such time.
-    """
+    """Return when the run began, in seconds since 1970."""
     try:
         return datetime.fromisoformat(recording.created).timestamp()
     except (ValueError, OverflowError) as error:

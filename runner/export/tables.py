@@ -53,20 +53,11 @@ def write_tables(
     gz: bool = False,
     report: Callable[[int], None] = lambda _: None,
 ) -> dict[str, int]:
-    """Write the tables of a recording into a folder; return the number of rows of each file.
+    """Write the tables of a recording into an empty folder; return the number of rows of each file.
 
-    Args:
-        recording: the run's.
-        folder: an empty folder.
-        form: `csv` or `parquet`.
-        phase: `train` or `eval`: only its steps and episodes; with `episodes`, train unless given.
-        episodes: ranges of episodes; all if empty. All metrics are written anyway.
-        gz: whether CSV files are compressed.
-        report: called with the number of steps written so far.
-
-    Raises:
-        RecordingError: the recording is damaged, or does not have these episodes.
-        OSError: the folder cannot be written.
+    `form` is `csv` or `parquet`. A phase, and ranges of episodes (of training unless a phase is given), leave
+    out other steps and episodes; all metrics are written anyway. `report` is called with the number of steps
+    so far.
     """
     if episodes:
         phase = phase or "train"

@@ -18,11 +18,7 @@ PATTERNS: Final = ("events.out.tfevents.*",)
 
 
 def require_packages() -> None:
-    """Check that the writer is installed.
-
-    Raises:
-        MissingExtra: it is not.
-    """
+    """Check that the writer is installed."""
     require("tensorboardX", extra="tensorboard", purpose="export tensorboard")
 
 
@@ -31,10 +27,6 @@ def write_events(recording: Recording, folder: Path) -> int:
 
     Each number is at its training step, under its name of `runner.export.scalars`; length and return of an
     episode are at its last step.
-
-    Raises:
-        RecordingError: the recording is damaged.
-        OSError: the folder cannot be written.
     """
     from tensorboardX.proto.event_pb2 import Event
     from tensorboardX.proto.summary_pb2 import Summary

@@ -23,11 +23,7 @@ _LEAST_SIDE: Final = 16
 
 
 class Values:
-    """What can be shown of the values of a space.
-
-    Args:
-        description: of the space, as the recording has it.
-        name: of a value that has no parts, such as `observation`.
+    """What can be shown of the values of a space; `name` is that of a value that has no parts.
 
     Attributes:
         names: of the numbers, in the order of `numbers_in`.
@@ -86,10 +82,7 @@ def value_in_words(value: object, limit: int = FEW) -> str:
 def action_in_words(recording: Recording, phase: str, agent: str = "") -> Callable[[Value], str]:
     """Return how to put an action of a step's record in words: `left`, or its value where it has no name.
 
-    Args:
-        recording: of a loop.
-        phase: `train` or `eval`.
-        agent: whose actions they are; of a game without one, actions are mappings by agent.
+    Actions of a game are mappings by agent, unless an agent is given.
     """
     if len(recording.agents) > 1 and not agent:
         by_agent = {each: action_in_words(recording, phase, each) for each in recording.agents}
@@ -130,10 +123,7 @@ def _count(leaf: Leaf) -> int:
 def number_names(leaf: Leaf, name: str, skip: int = 0) -> list[str]:
     """Return a name for each number of a leaf: `position[0]`; of one without a path `name`.
 
-    Args:
-        leaf: the leaf.
-        name: of the value.
-        skip: how many keys of the leaf's path are left out.
+    The first `skip` keys of the path are left out.
     """
     own = ".".join(leaf.path[skip:]) or name
     shape = leaf.dtype.shape if leaf.dtype is not None else ()

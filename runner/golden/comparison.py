@@ -46,11 +46,7 @@ class ByteDifference:
 
 
 def compare_bytes(golden: Path, recording: Path) -> ByteDifference | None:
-    """Return how the content of a recording differs from a golden one; None if it is the same.
-
-    Raises:
-        RecordingError: one of them cannot be read.
-    """
+    """Return how the content of a recording differs from a golden one; None if it is the same."""
     with open_recording(golden) as a, open_recording(recording) as b:
         difference = diff(a, b)
         if difference.same_content:
@@ -75,14 +71,7 @@ def _in_words(difference: RunDiff) -> str:
 
 
 def record_environment(make: Callable[[], Env], episodes: int, max_steps: int, recordings: Path) -> Run:
-    """Record episodes of random actions in an environment, each with its number as seed.
-
-    Args:
-        make: returns the environment.
-        episodes: number of episodes.
-        max_steps: the most steps of an episode.
-        recordings: the recordings folder.
-    """
+    """Record episodes of random actions in an environment, each with its number as seed."""
     with record(make(), recordings, name="golden", seed=0) as env:
         env.action_space.seed(0)
         for episode in range(episodes):

@@ -57,11 +57,7 @@ class Ready(BaseModel):
 
 
 def create_app(settings: Settings) -> FastAPI:
-    """Return the application.
-
-    Raises:
-        RunnerError: it would be reachable from other machines and there is no token.
-    """
+    """Return the application."""
     tokens = Tokens(settings.tokens)
     if settings.needs_token and not tokens.all():
         option = (

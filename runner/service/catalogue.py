@@ -36,12 +36,7 @@ NOTHING: Final = Version(-1, 0)
 
 
 class Catalogue:
-    """The index of recordings folders; a second or so old, and up to date after a change by the service.
-
-    Args:
-        roots: the recordings folders.
-        log: called with warnings.
-    """
+    """The index of recordings folders; a second or so old, and up to date after a change by the service."""
 
     def __init__(self, roots: Sequence[Path], log: Callable[[str], None] = lambda _: None) -> None:
         self.roots = tuple(roots)
@@ -79,11 +74,7 @@ class Catalogue:
         self._start_scan()
 
     def read(self, work: Callable[[Index], Result]) -> Result:
-        """Return the result of a function of the index.
-
-        Raises:
-            StorageError: a recordings folder cannot be read.
-        """
+        """Return the result of a function of the index."""
         if self.version() is None:
             self._start_scan().result()
         return look(self.roots, work, self._log, cached=self.version() is not None)
@@ -104,11 +95,7 @@ class Catalogue:
         return True
 
     def find(self, name: str) -> Run:
-        """Return the run with an id, the beginning of one, a name or `@latest`; never by a path.
-
-        Raises:
-            RunNotFound: no run matches the name, or several do.
-        """
+        """Return the run with an id, the beginning of one, a name or `@latest`; never by a path."""
         _refuse_path(name)
         for root in self.roots:
             known = run_of_id(name, root)
@@ -122,11 +109,7 @@ class Catalogue:
         return choose(name, candidates).run()
 
     def find_all(self, name: str) -> list[Run]:
-        """Return all runs of a name, the oldest first; else the run that `find` returns.
-
-        Raises:
-            RunNotFound: none does, or it is the beginning of several ids.
-        """
+        """Return all runs of a name, the oldest first; else the run that `find` returns."""
         _refuse_path(name)
         alike = self.read(lambda index: of_name(name, index))
         return [found.run() for found in alike] or [self.find(name)]

@@ -63,18 +63,8 @@ def curves(
 ) -> bytes:
     """Return the metrics of runs over an axis as JSON, runs that differ only in the seed as one curve.
 
-    Args:
-        paths: their recordings.
-        axis: the name of the axis.
-        metrics: their names; all if there are none.
-        start: the first position.
-        stop: the first one not included; None for all.
-        points: the maximum of a curve; longer ones are thinned. 0 for no limit.
-        lines: whether to include the single runs of a curve.
-
-    Raises:
-        RecordingError: a recording cannot be read, or does not have the axis.
-        RunnerError: there is no such axis.
+    All metrics if none are named; positions from `start` to before `stop`; curves of more than `points` are
+    thinned, 0 is no limit; `lines` adds the single runs of a curve.
     """
     series, common = [], list(AXES.values())
     for path in paths:
@@ -111,12 +101,7 @@ def run_curves(path: Path, *options: Any) -> bytes:
 
 
 def run_histograms(path: Path, axis: str) -> bytes:
-    """Return the histograms of a run's training over an axis, as JSON.
-
-    Raises:
-        RecordingError: the recording cannot be read, or does not have the axis.
-        RunnerError: there is no such axis.
-    """
+    """Return the histograms of a run's training over an axis, as JSON."""
     with open_recording(path) as recording:
         found, notes = histograms(recording, axis_of(axis))
         shown = [dataclasses.asdict(each) | {"axis": each.axis.name} for each in found]
@@ -146,12 +131,7 @@ def _shown_curve(
 
 
 def records(path: Path, kind: RecordKind, start: int, stop: int, limit: int) -> bytes:
-    """Return evaluations, reports of training or exact measures from `start` to before `stop`, as JSON.
-
-    Raises:
-        Refused: there are more than `limit`.
-        RecordingError: the recording cannot be read, or is of a loop, which has no reports of training.
-    """
+    """Return evaluations, reports of training or exact measures from `start` to before `stop`, as JSON."""
     with open_recording(path) as recording:
         if kind == "optimality":
             found = list(recording.optimality())
@@ -178,9 +158,7 @@ def too_many(found: int, limit: int) -> Refused:
 def thinned(values: NDArray[np.float64], points: int) -> NDArray[np.intp]:
     """Return the indices of the lowest and the highest value of each section, so that no extreme is lost.
 
-    Args:
-        values: float64 [n].
-        points: the maximum number of indices; 0 for all.
+    The values are float64 [n]; `points` is the maximum number of indices, 0 for all.
     """
     if points == 0 or len(values) <= points:
         return np.arange(len(values))
@@ -193,12 +171,7 @@ def thinned(values: NDArray[np.float64], points: int) -> NDArray[np.intp]:
 
 
 def q_table(path: Path, step: int | None, episode: int | None, state: int | None, form: str) -> bytes:
-    """Return the Q-table of a moment: a summary and the history of a state as `json`, or all of it as `npy`.
-
-    Raises:
-        RecordingError: there is no such moment, or the steps before it are not recorded.
-        RunnerError: there is no such state.
-    """
+    """Return the Q-table of a moment: its summary and a state's history as `json`, or all of it as `npy`."""
     with open_recording(path) as recording:
         recording.require_job("a Q-table", "A loop's arrays are in its recording.")
         replay = replay_at(recording, step, episode)
@@ -210,12 +183,7 @@ def q_table(path: Path, step: int | None, episode: int | None, state: int | None
 
 
 def when(path: Path, expression: str, every: bool, first: str | None, last: str | None) -> bytes:
-    """Return when an expression held in training, as `dualtaxi when --json` prints it.
-
-    Raises:
-        RecordingError: there is no such step, or steps are not recorded.
-        RunnerError: the expression is invalid, or the recording is of a loop.
-    """
+    """Return when an expression held in training, as `dualtaxi when --json` prints it."""
     with open_recording(path) as recording:
         return as_json(when_in(recording, expression, every, first, last).as_json())
 
@@ -223,16 +191,7 @@ def when(path: Path, expression: str, every: bool, first: str | None, last: str 
 def when_section(
     path: Path, expression: str, every: bool, first: str | None, last: str | None, intervals: int
 ) -> bytes:
-    """Return the same as sentences and tables for a page, as JSON with the addresses of replays.
-
-    Args:
-        path: the recording.
-        expression: as for `when`.
-        every: as for `when`.
-        first: as for `when`.
-        last: as for `when`.
-        intervals: the most that are listed.
-    """
+    """Return the result of `when` as sentences and tables for a page, as JSON with addresses of replays."""
     with open_recording(path) as recording:
         found = when_in(recording, expression, every, first, last)
         moments = [each.start.at.replay_address(found.run_id) for each in found.intervals[:intervals]]
@@ -242,24 +201,14 @@ def when_section(
 def why(
     path: Path, state: str | None, action: str | None, agent: str | None, at: str | None, limit: int
 ) -> bytes:
-    """Return where a Q-value comes from, as `dualtaxi why --json` prints it.
-
-    Raises:
-        RecordingError: there is no such step, or steps are not recorded.
-        RunnerError: there is no such state, action or agent, or the recording is of a loop.
-    """
+    """Return where a Q-value comes from, as `dualtaxi why --json` prints it."""
     step = StepRef.parse(at) if at else None
     with open_recording(path) as recording:
         return as_json(why_in(recording, state, action, agent, step, limit).as_json())
 
 
 def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:
-    """Return the columns of steps or episodes from `start` to before `stop` as an Arrow stream.
-
-    Raises:
-        MissingExtra: pyarrow is not installed.
-        RecordingError: the recording cannot be read.
-    """
+    """Return the columns of steps or episodes from `start` to before `stop` as an Arrow stream."""
     require("pyarrow", extra="archive", purpose="Arrow")
     import pyarrow as pa
 
@@ -279,11 +228,7 @@ def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:
 
 
 def plot(path: Path, form: str) -> bytes:
-    """Return every metric of a run over episodes in one figure, as `svg`, `png` or `pdf`.
-
-    Raises:
-        MissingExtra: Matplotlib is not installed.
-    """
+    """Return every metric of a run over episodes in one figure, as `svg`, `png` or `pdf`."""
     check_suffix(Path(f"plot.{form}"))
     groups = groups_of(_series([path]))
     with tempfile.TemporaryDirectory() as folder:
@@ -293,12 +238,7 @@ def plot(path: Path, form: str) -> bytes:
 
 
 def difference(a: Run, b: Run, ignore: Sequence[str], first: bool, targets: Sequence[str]) -> bytes:
-    """Return the differences between two runs, as `dualtaxi diff --json` prints them.
-
-    Raises:
-        RecordingError: a recording cannot be read.
-        RunnerError: a target is invalid.
-    """
+    """Return the differences between two runs, as `dualtaxi diff --json` prints them."""
     levels = dict(parse_target(target) for target in targets)
     with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
         found = differences.diff(ours, theirs, levels, first)
@@ -317,18 +257,8 @@ def comparison(
 ) -> bytes:
     """Return a comparison of groups of runs, as `dualtaxi compare --json` prints it.
 
-    Args:
-        paths: their recordings.
-        by: a setting to group by.
-        metrics: metrics; the usual ones if there are none.
-        moment: at which they are read.
-        target: a metric and its level instead.
-        axis: the name of the axis.
-        normalise: compare over environments: `minmax`, or a table of scores as CSV.
-
-    Raises:
-        MissingExtra: SciPy is not installed.
-        RunnerError: there is nothing to compare.
+    The usual metrics if none are named; `target` is a metric and its level instead of a moment; `normalise`
+    compares over environments by `minmax`, or by a table of scores as CSV.
     """
     require_scipy()
     over = axis_of(axis)
@@ -343,24 +273,13 @@ def comparison(
 
 
 def where_actions_lead(path: Path, at: StepRef, actions: tuple[str, ...]) -> bytes:
-    """Return where joint actions at a step lead as JSON, as `dualtaxi branch --json` prints it.
-
-    Raises:
-        RecordingError: there is no such step.
-        RunnerError: there is no such action, or the run was not trained here.
-    """
+    """Return where joint actions at a step lead as JSON, as `dualtaxi branch --json` prints it."""
     with open_recording(path) as recording:
         return as_json(what_if_in(recording, at, actions).as_json())
 
 
 def replay(runs: Sequence[Run], request: Request) -> bytes:
-    """Return the path of an export for the Rerun viewer, from the user's cache or new.
-
-    Raises:
-        MissingExtra: Rerun is not installed.
-        RecordingError: a recording cannot be read, or does not contain what is requested.
-        StorageError: the cache cannot be written.
-    """
+    """Return the path of an export for the Rerun viewer, from the user's cache or new."""
     require_rerun("a replay")
     return os.fsencode(cached_export(runs, request)[0])
 

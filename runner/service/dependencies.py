@@ -48,11 +48,7 @@ RunName = Annotated[
 
 
 def found_run(run: RunName, catalogue: CatalogueOf) -> Run:
-    """Return the run that the path names.
-
-    Raises:
-        RunNotFound: no run matches the name, or several do.
-    """
+    """Return the run that the path names."""
     return catalogue.find(run)
 
 
@@ -60,11 +56,7 @@ FoundRun = Annotated[Run, Depends(found_run)]
 
 
 def recorded_run(run: FoundRun) -> Run:
-    """Return the run that the path names, its recording restored if it is archived.
-
-    Raises:
-        RecordingError: it has no recording, or its archive is damaged or missing.
-    """
+    """Return the run that the path names, its recording restored if it is archived."""
     restored = at_hand(run)
     if not restored.recording.is_file():
         raise RecordingError(f"run {run.run_id} has no recording: it ended before there was one.")
@@ -75,11 +67,7 @@ RecordedRun = Annotated[Run, Depends(recorded_run)]
 
 
 def opened_recording(run: RecordedRun) -> Iterator[Recording]:
-    """Yield the opened recording of the run that the path names.
-
-    Raises:
-        RecordingError: it cannot be read.
-    """
+    """Yield the opened recording of the run that the path names."""
     with open_recording(run.recording) as recording:
         yield recording
 

@@ -64,17 +64,7 @@ _STEPS_BEFORE: Final = 1
 
 
 def episode_part(path: Path, which: tuple[int, ...], start: int, steps: int) -> bytes:
-    """Return a part of an episode as JSON for `replay.js`.
-
-    Args:
-        path: the recording.
-        which: (episode,) of training, or (training episodes before, trial) of an evaluation.
-        start: the first step.
-        steps: the largest number of steps.
-
-    Raises:
-        RecordingError: there is no such episode or step, or no steps were recorded.
-    """
+    """Return a part of an episode as JSON for `replay.js`; `which` as for `place_of`."""
     with open_recording(path) as recording:
         episode = playback_of(recording, which, steps, max(0, start - _STEPS_BEFORE))
         scene = recording.environment["scene"] if episode.grid else None
@@ -85,12 +75,7 @@ def episode_part(path: Path, which: tuple[int, ...], start: int, steps: int) -> 
 
 
 def branch_part(path: Path, at: StepRef, action: str, start: int, steps: int) -> bytes:
-    """Return a part of the episode to which a joint action leads, as `episode_part` does.
-
-    Raises:
-        RecordingError: there is no such step.
-        RunnerError: there is no such action, or the run was not trained here.
-    """
+    """Return a part of the episode to which a joint action leads, as `episode_part` does."""
     with open_recording(path) as recording:
         return _branch_part(recording, at, action, start, steps)
 
@@ -98,16 +83,7 @@ def branch_part(path: Path, at: StepRef, action: str, start: int, steps: int) ->
 def what_if_page(run: Run, at: StepRef, action: str | None, start: int, steps: int) -> bytes:
     """Return where each joint action at a step leads, as JSON for its page, and a part of one branch.
 
-    Args:
-        run: the run.
-        at: the step.
-        action: the joint action whose branch is shown; None for the recorded one.
-        start: the first step of the part.
-        steps: the largest number of steps of the part.
-
-    Raises:
-        RecordingError: there is no such step.
-        RunnerError: there is no such action, or the run was not trained here.
+    The branch is that of `action`, None for the recorded one.
     """
 
     def address(number: int) -> str:
@@ -183,12 +159,7 @@ def why(
 
 
 def distributions(path: Path, axis: str) -> bytes:
-    """Return the histograms of a run's training over an axis, as HTML.
-
-    Raises:
-        RecordingError: the recording cannot be read, or does not have the axis.
-        RunnerError: there is no such axis.
-    """
+    """Return the histograms of a run's training over an axis, as HTML."""
     with open_recording(path) as recording:
         found, notes = histograms(recording, axis_of(axis))
     if not found:
@@ -198,12 +169,7 @@ def distributions(path: Path, axis: str) -> bytes:
 
 
 def tasks(paths: Sequence[Path], axis: str, scores: str) -> bytes:
-    """Return the comparison of runs over environments as HTML; `scores` is a table as CSV, or empty.
-
-    Raises:
-        MissingExtra: SciPy is not installed.
-        RunnerError: there is nothing to compare, or the table is invalid.
-    """
+    """Return the comparison of runs over environments as HTML; `scores` is a table as CSV, or empty."""
     series = []
     for path in paths:
         with open_recording(path) as recording:
@@ -269,10 +235,7 @@ def pictures(path: Path) -> bytes:
 def console(path: Path, sought: str, stream: str) -> bytes:
     """Return the output of a run as JSON: `total` lines, those `found`, and the last of them, `lines`.
 
-    Args:
-        path: the recording.
-        sought: text that lines must have, in any case.
-        stream: `stdout`, `stderr`, or empty for both.
+    Lines must have the text that is sought, in any case; `stream` is `stdout`, `stderr`, or empty for both.
     """
     with open_recording(path) as recording:
         clock = read_clock(recording)

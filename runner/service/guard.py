@@ -51,15 +51,7 @@ _HEADERS: Final = {
 
 
 class Guard:
-    """Refuses requests before they are routed, so that no route can forget to.
-
-    Args:
-        app: the application.
-        settings: those of the service.
-        tokens: the access tokens.
-        sessions: the sessions of browsers.
-        refusal: makes the response to a request that is refused.
-    """
+    """Refuses requests before they are routed, so that no route can forget to."""
 
     def __init__(
         self,
@@ -98,11 +90,7 @@ class Guard:
         await self._app(scope, body.receive, send_with_headers)
 
     def _check(self, request: Request) -> None:
-        """Refuse a request that names another host, lacks a token, or comes from another site.
-
-        Raises:
-            RequestError: it does.
-        """
+        """Refuse a request that names another host, lacks a token, or comes from another site."""
         headers = request.headers
         hosts = headers.getlist("host")
         if len(hosts) != 1 or not is_allowed_host(hosts[0], self._settings.hosts):
@@ -133,11 +121,7 @@ class Guard:
             )
 
     def _token(self, request: Request) -> Token | None:
-        """Return the token of a request, or of its session; None if it has none.
-
-        Raises:
-            Unauthorized: it is a wrong one.
-        """
+        """Return the token of a request, or of its session; None if it has none."""
         scheme, _, secret = request.headers.get("authorization", "").partition(" ")
         if scheme:
             if scheme.lower() != "bearer" or not secret.strip():
@@ -173,11 +157,7 @@ class Body:
         self._began, self._length, self._more = time.monotonic(), 0, True
 
     async def receive(self) -> Message:
-        """Return its next part; after its end there is no limit on waiting.
-
-        Raises:
-            HTTPException: it is too long, or too slow.
-        """
+        """Return its next part; after its end there is no limit on waiting."""
         if not self._more:
             return await self._receive()
         try:

@@ -41,13 +41,7 @@ Make = Callable[[int], Generator[bytes | str, None, None]]
 
 
 class PictureStream:
-    """The pictures of an episode from a step on.
-
-    Args:
-        key: what they are of.
-        make: makes them.
-        start: the step of the first one.
-    """
+    """The pictures of an episode from a step on."""
 
     def __init__(self, key: Hashable, make: Make, start: int) -> None:
         self.key = key
@@ -146,11 +140,7 @@ class PictureStreams:
             stream.join(_JOIN_SECONDS)
 
     def open(self, key: Hashable, make: Make, start: int) -> PictureStream:
-        """Return a stream that has the picture at step `start` before it: one that was kept, or a new one.
-
-        Raises:
-            Busy: there are too many.
-        """
+        """Return a stream that has the picture at step `start` before it: one that was kept, or a new one."""
         self._streams = [stream for stream in self._streams if stream.is_alive or stream.can_continue]
         own = [stream for stream in self._streams if stream.key == key and stream.can_continue]
         for stream in own:

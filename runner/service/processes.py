@@ -109,16 +109,11 @@ class ProcessPool:
     def submit(
         self, function: Callable[Args, Result], *args: Args.args, **keywords: Args.kwargs
     ) -> Future[Result]:
-        """Return the future result of a function that is called in a child process.
+        """Return the future result of a function of a module, called in a child process.
 
-        Args:
-            function: a function of a module, not a nested one.
-            args: its arguments; they and the result are pickled, between our own processes.
-            keywords: its keyword arguments.
-
-        Raises:
-            Busy: too many calls are waiting. The future raises the function's own `RunnerError` or `OSError`,
-                or `TimedOut`, `OutOfMemory`, `ProcessDied`.
+        Arguments and result are pickled, between our own processes. The future raises the function's own
+        `RunnerError` or `OSError`, or `TimedOut`, `OutOfMemory`, `ProcessDied`; `Busy` is raised if too many
+        calls are waiting.
         """
         return self.submit_within(self._seconds, function, *args, **keywords)
 

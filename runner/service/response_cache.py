@@ -44,12 +44,9 @@ class ResponseCache:
     async def get_or_await(
         self, key: Hashable, make: Callable[[], Awaitable[bytes]], max_seconds: float = MAX_SECONDS
     ) -> bytes:
-        """Return the response of a key: cached, being made for another request, or made now.
+        """Return the response of a key: cached, not older than `max_seconds`, being made, or made now.
 
-        Args:
-            key: everything that the response depends on, as far as that is known.
-            make: starts the work.
-            max_seconds: the age limit of a cached response.
+        The key has everything that the response depends on, as far as that is known.
         """
         if (body := self.get(key, max_seconds)) is not None:
             return body

@@ -23,11 +23,7 @@ _DISCARD: Final = struct.pack("ii", 1, 0)
 
 
 def bind(settings: Settings) -> socket.socket:
-    """Return the socket that the service will listen on, so that its port is known before it starts.
-
-    Raises:
-        RunnerError: the host or port is not available.
-    """
+    """Return the socket that the service will listen on, so that its port is known before it starts."""
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     try:
         return socket.create_server((settings.host, settings.port), family=family, backlog=BACKLOG)
@@ -45,11 +41,7 @@ def url_of(listening: socket.socket) -> str:
 
 
 def serve(app: FastAPI, settings: Settings, listening: socket.socket) -> None:
-    """Serve until SIGINT or SIGTERM, then complete running requests.
-
-    Raises:
-        RunnerError: another process serves these recordings.
-    """
+    """Serve until SIGINT or SIGTERM, then complete running requests."""
     config = uvicorn.Config(
         app,
         http=_protocol(settings.limits),

@@ -79,11 +79,8 @@ class Session:
 class _RecordsFile(Generic[Record]):
     """A file `{"KEY": [record, ...]}`, readable by its owner only, that several processes may change.
 
-    Args:
-        path: the file; it need not exist.
-        key: the name of the records.
-        parse: returns a record from its JSON object; raises `ValueError`, `KeyError`, `TypeError` or
-            `AttributeError` if it is none.
+    `parse` returns a record from its JSON object; it raises `ValueError`, `KeyError`, `TypeError` or
+    `AttributeError` if it is none.
     """
 
     def __init__(self, path: Path, key: str, parse: Callable[[object], Record]) -> None:
@@ -93,11 +90,7 @@ class _RecordsFile(Generic[Record]):
         self._records: tuple[Record, ...] = ()
 
     def all(self) -> tuple[Record, ...]:
-        """Return the records; the file is read again when it has changed.
-
-        Raises:
-            StorageError: the file exists and cannot be read as one of them.
-        """
+        """Return the records; the file is read again when it has changed."""
         try:
             stat = self.path.stat()
             version = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
@@ -114,11 +107,7 @@ class _RecordsFile(Generic[Record]):
         return self._records
 
     def change(self, change: Callable[[tuple[Record, ...]], Iterable[Record]]) -> None:
-        """Replace the records by the result of a function, while no other process changes them.
-
-        Raises:
-            StorageError: the file cannot be written.
-        """
+        """Replace the records by the result of a function, while no other process changes them."""
         with storage_errors(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             with FileLock(self.path.with_suffix(".lock"), timeout=_LOCK_SECONDS):
@@ -134,11 +123,7 @@ class Tokens:
         self.path = path
 
     def all(self) -> tuple[Token, ...]:
-        """Return all tokens, the oldest first.
-
-        Raises:
-            StorageError: the file exists and cannot be read as one of tokens.
-        """
+        """Return all tokens, the oldest first."""
         return self._file.all()
 
     def find(self, secret: str) -> Token | None:
@@ -148,12 +133,7 @@ class Tokens:
         return matching[-1] if matching else None
 
     def create(self, name: str, scopes: tuple[str, ...]) -> tuple[Token, str]:
-        """Return a new token and its secret, which is not stored.
-
-        Raises:
-            RunnerError: the name is invalid or in use, or there are too many tokens.
-            StorageError: the file cannot be written.
-        """
+        """Return a new token and its secret, which is not stored."""
         if not _NAME.fullmatch(name):
             raise RunnerError(f"token: found the name {name!r}, expected 1 to 64 letters, digits, _ . @ -")
         secret = PREFIX + secrets.token_urlsafe(32)
@@ -175,12 +155,7 @@ class Tokens:
         return token, secret
 
     def revoke(self, name: str) -> Token:
-        """Remove the token with an id or a name, at once also for a running service; return it.
-
-        Raises:
-            RunnerError: there is none, or there are several of the name.
-            StorageError: the file cannot be written.
-        """
+        """Remove the token with an id or a name, at once also for a running service; return it."""
         matching = [token for token in self.all() if name in (token.id, token.name)]
         if len(matching) != 1:
             known = ", ".join(f"{token.id} ({token.name})" for token in self.all()) or "none"
@@ -197,22 +172,14 @@ class Sessions:
         self._file = _RecordsFile(tokens.path.with_name(SESSIONS_FILE), "sessions", _parse_session)
 
     def begin(self, token: Token) -> str:
-        """Return the secret of a new session of a token.
-
-        Raises:
-            StorageError: the file cannot be written.
-        """
+        """Return the secret of a new session of a token."""
         secret = secrets.token_urlsafe(32)
         session = Session(_digest(secret), token.id, time.time() + SESSION_SECONDS)
         self._file.change(lambda sessions: [*self._current(sessions), session][-MAX_SESSIONS:])
         return secret
 
     def token_of(self, secret: str) -> Token | None:
-        """Return the token of a session; None if it has ended, or its token was revoked.
-
-        Raises:
-            StorageError: a file cannot be read.
-        """
+        """Return the token of a session; None if it has ended, or its token was revoked."""
         digest = _digest(secret)  # compared as a hash, so the time it takes reveals nothing of the secret
         for session in self._current(self._file.all()):
             if session.sha256 == digest:
@@ -220,11 +187,7 @@ class Sessions:
         return None
 
     def end(self, secret: str) -> None:
-        """End a session, if it exists.
-
-        Raises:
-            StorageError: the file cannot be written.
-        """
+        """End a session, if it exists."""
         digest = _digest(secret)
         self._file.change(lambda sessions: [old for old in self._current(sessions) if old.sha256 != digest])
 

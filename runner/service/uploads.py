@@ -58,14 +58,7 @@ _STORED: Final = TypeAdapter(Upload)
 class Uploads:
     """The uploads into one recordings folder; thread-safe.
 
-    Args:
-        recordings: the recordings folder; created if it is missing.
-        limits: what is accepted.
-        on_verified: called with each upload that was verified, by another thread.
-
-    Raises:
-        StorageError: the folder cannot be written.
-        RunnerError: another server accepts uploads into it.
+    `on_verified` is called with each upload that was verified, by another thread.
     """
 
     def __init__(
@@ -109,11 +102,7 @@ class Uploads:
         return sorted(self._uploads.copy().values(), key=lambda upload: upload.created, reverse=True)
 
     def get(self, upload_id: str, owner: str) -> Upload:
-        """Return an upload of this owner.
-
-        Raises:
-            RunNotFound: there is none with this id, or it is another owner's.
-        """
+        """Return an upload of this owner."""
         upload = self._uploads.get(upload_id)
         if upload is None or upload.owner != owner:
             raise RunNotFound("no such upload: it was deleted, is long over, or belongs to another token.")
@@ -175,12 +164,7 @@ class Uploads:
         return upload, True
 
     def _checkpointed(self, announced: Announcement) -> Run | None:
-        """Return the run with a checkpoint of these bytes; None if they are a recording.
-
-        Raises:
-            RunNotFound: there is no such run.
-            UploadConflict: it has no checkpoint of this digest and size.
-        """
+        """Return the run with a checkpoint of these bytes; None if they are a recording."""
         if not announced.checkpoint_of:
             return None
         run = run_of_id(announced.checkpoint_of, self._recordings)
@@ -257,11 +241,7 @@ class Uploads:
         return upload
 
     def delete(self, upload_id: str, owner: str) -> None:
-        """Forget an upload, and remove what was received.
-
-        Raises:
-            UploadConflict: it is being verified.
-        """
+        """Forget an upload, and remove what was received."""
         with self._lock:
             upload = self.get(upload_id, owner)
             if upload.state == "verifying":

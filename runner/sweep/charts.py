@@ -83,11 +83,7 @@ class Picture:
 
 
 def picture_of(results: Results) -> Picture:
-    """Return the trials of a sweep that can be drawn.
-
-    Raises:
-        RunnerError: no trial has a result yet.
-    """
+    """Return the trials of a sweep that can be drawn."""
     drawn = tuple(trial for trial in results.ranking if _is_drawable(trial))
     if not drawn:
         raise RunnerError(_nothing_to_draw(results))
@@ -105,11 +101,7 @@ def picture_of(results: Results) -> Picture:
 
 
 def learning(results: Results, recordings: Path) -> tuple[list[Group], list[Panel]]:
-    """Return the runs of the median and of the best trial, and their metrics over episodes.
-
-    Raises:
-        RunnerError: no trial is finished yet, or a run cannot be read.
-    """
+    """Return the runs of the median and of the best trial, and their metrics over episodes."""
     finished = [trial for trial in results.ranking if trial.state == "finished"]
     if not finished:
         raise RunnerError(_nothing_to_draw(results))
@@ -154,11 +146,7 @@ def _axis(path: str, parameter: Range | list[Any], trials: Sequence[Ranked]) -> 
 def sweep_sheet(title: str, picture: Picture, groups: Sequence[Group], panel: Panel) -> Canvas:
     """Return one sheet: the objective along each parameter, parallel coordinates, and learning curves.
 
-    Args:
-        title: the heading.
-        picture: the trials.
-        groups: the runs whose curves are drawn.
-        panel: their metric.
+    The curves are those of groups of runs, in one panel.
     """
     parameters = [parameter_chart(picture, axis) for axis in picture.axes]
     columns = 2 if len(parameters) in (2, 4) else min(3, len(parameters))

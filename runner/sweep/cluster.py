@@ -23,24 +23,15 @@ T = TypeVar("T")
 
 
 def require_ray() -> Any:
-    """Return the module `ray`.
-
-    Raises:
-        MissingExtra: it is not installed.
-    """
+    """Return the module `ray`."""
     return require("ray", extra="ray", purpose="a sweep on Ray")
 
 
 def connect(address: str | None, processors: int | None = None) -> Any:
     """Return the module `ray`, connected to a cluster.
 
-    Args:
-        address: the cluster, or `auto`; None starts Ray on this machine.
-        processors: the processors of this machine that Ray may use; None for all.
-
-    Raises:
-        MissingExtra: Ray is not installed.
-        RunnerError: the cluster cannot be reached.
+    The address is that of the cluster, or `auto`; None starts Ray on this machine, which may
+    use a number of its processors, or all.
     """
     ray = require_ray()
     options = {"log_to_driver": False, "logging_level": "ERROR"}
@@ -104,14 +95,8 @@ def _run(actor: RayActor, task: Work) -> Any:
 class RayWorkers(Generic[TaskT, R]):
     """Actors of Ray, started when they are needed; each keeps what it has loaded.
 
-    Args:
-        count: the maximum number of workers; None for one per processor of the cluster.
-        address: the cluster, or `auto`; None starts Ray on this machine.
-        limit: never start more workers than this.
-
-    Raises:
-        MissingExtra: Ray is not installed.
-        RunnerError: the cluster cannot be reached.
+    There are at most `count`, None for one per processor of the cluster, and never more than `limit`; the
+    address is as for `connect`.
     """
 
     def __init__(self, count: int | None, address: str | None, limit: int) -> None:

@@ -49,13 +49,7 @@ def effects_of(
 ) -> list[Effect]:
     """Return main effects and interactions, the largest first; empty for too few trials.
 
-    Args:
-        parameters: the values tried, by path.
-        trials: the values of the parameters in each completed trial.
-        values: the objective of each trial, finite.
-
-    Raises:
-        MissingExtra: scikit-learn is not installed.
+    The parameters are the values tried, by path; the values are the objective of each trial, finite.
     """
     require("sklearn.tree", extra="sweep", purpose="the importance of a sweep's parameters")
     names = list(parameters)
@@ -80,19 +74,11 @@ def effects_of(
 def forest_prediction(
     x: NDArray[np.float64], y: NDArray[np.float64], points: NDArray[np.float64], seed: int
 ) -> NDArray[np.float64]:
-    """Return the predictions of a random forest of `TREES` trees.
+    """Return the predictions, [points], of a random forest of `TREES` trees.
 
     They equal those of `sklearn.ensemble.RandomForestRegressor` to the last bit, in two thirds of its time:
-    with the few trials of a sweep, its overhead takes longer than its trees.
-
-    Args:
-        x: [trials, columns].
-        y: [trials].
-        points: [points, columns].
-        seed: the seed of the forest.
-
-    Returns:
-        [points].
+    with the few trials of a sweep, its overhead takes longer than its trees. `x` is [trials, columns], `y`
+    [trials], `points` [points, columns].
     """
     import sklearn
     from sklearn.tree import DecisionTreeRegressor
@@ -116,10 +102,8 @@ def effects_of_grid(
 ) -> list[Effect]:
     """Return main effects and interactions of a grid whose points were all completed, without a forest.
 
-    Args:
-        parameters: the values of the grid, by path.
-        seed_values: the objective at each seed, finite, of each point; the last parameter changes fastest.
-            The interval is over resampled seeds.
+    `seed_values` is the objective at each seed, finite, of each point; the last parameter changes fastest.
+    The interval is over resampled seeds.
     """
     shape = tuple(each.steps + 1 if isinstance(each, Range) else len(each) for each in parameters.values())
     exact = shares_of_variance(np.array([np.median(own) for own in seed_values]).reshape(shape))

@@ -29,15 +29,10 @@ _MAX_COMBINATIONS: Final = 64
 
 
 def load_sweep(path: str | os.PathLike[str], name: str | None = None) -> Sweep:
-    """Return the sweep that a YAML file describes.
+    """Return the sweep that a YAML file describes, or a shipped one such as `modes`.
 
-    Args:
-        path: the file, or the name of a shipped sweep such as `modes`.
-        name: the name of the sweep, instead of the name in the file or that of the file without its ending.
-
-    Raises:
-        ConfigError: the file cannot be read, or does not describe a sweep. The message has a line for each
-            problem, with file, line, column and key.
+    The name replaces that in the file, or that of the file without its ending. Of a bad file, the
+    `ConfigError` has a line for each problem, with file, line, column and key.
     """
     file = config_path(path)
     document = read_yaml(read_text(file), str(file))
@@ -47,12 +42,7 @@ def load_sweep(path: str | os.PathLike[str], name: str | None = None) -> Sweep:
 def from_text(text: str, source: str) -> Sweep:
     """Return the sweep that the text of a file describes, which cannot name another file as its base.
 
-    Args:
-        text: the contents of the file.
-        source: the file's name, for messages and as the default name of the sweep.
-
-    Raises:
-        ConfigError: as for `load_sweep`.
+    `source` is the file's name, for messages and as the default name of the sweep; errors as of `load_sweep`.
     """
     document = read_yaml(text, source)
     return _with_checked_parameters(_sweep(document, None, Path(source).stem, None), document)
@@ -62,19 +52,12 @@ def from_values(values: Mapping[str, object]) -> Sweep:
     """Return the sweep that plain values describe, as `Sweep.to_mapping` returns them.
 
     Its parameters were checked when it was loaded; no environment is made to check them again.
-
-    Raises:
-        ConfigError: they do not describe a sweep.
     """
     return _sweep(Document(dict(values)), None, "sweep", Path())
 
 
 def self_contained_text(path: str | os.PathLike[str]) -> str:
-    """Return the text of an experiment or a sweep, with a base that is another file written out.
-
-    Raises:
-        ConfigError: the file or its base cannot be read.
-    """
+    """Return the text of an experiment or a sweep, with a base that is another file written out."""
     text = read_text(Path(path))
     values = read_yaml(text, str(path)).value
     if isinstance(values, Mapping) and isinstance(values.get("base"), str):
@@ -191,11 +174,7 @@ def _with_checked_parameters(sweep: Sweep, document: Document) -> Sweep:
 
 
 def _valid_experiment(sweep: Sweep, path: str, sample: object, document: Document) -> ExperimentConfig:
-    """Return an experiment with a value of a parameter, and the first values of the others valid with it.
-
-    Raises:
-        ConfigError: none of the combinations that were tried is valid.
-    """
+    """Return an experiment with a value of a parameter, and the first values of the others valid with it."""
     samples = {
         key: [sample] if key == path else list(_samples(each)) for key, each in sweep.file.parameters.items()
     }

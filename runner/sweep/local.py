@@ -48,11 +48,7 @@ class Workers(Protocol[T, R]):
 
 
 class LocalWorkers(Generic[T, R]):
-    """Processes, started when they are needed.
-
-    Args:
-        count: the maximum number of processes.
-    """
+    """Processes, started when they are needed."""
 
     def __init__(self, count: int) -> None:
         self._count = count

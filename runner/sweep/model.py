@@ -255,11 +255,7 @@ class Sweep:
         return self.file.base
 
     def config(self, values: JsonView) -> ExperimentConfig:
-        """Return the experiment with these values of the parameters.
-
-        Raises:
-            ConfigError: they contradict each other.
-        """
+        """Return the experiment with these values of the parameters."""
         changes = [f"{path}={json.dumps(value)}" for path, value in self.applicable(values).items()]
         return from_mapping(self.start_of_trials, changes)
 

@@ -27,11 +27,7 @@ Curve = dict[int, float]
 
 
 def curve_of(recording: Recording, metric: str) -> Curve:
-    """Return the finite readings of a metric at the evaluations of a recording.
-
-    Raises:
-        RunnerError: the metric is in none of them.
-    """
+    """Return the finite readings of a metric at the evaluations of a recording."""
     agents, events = recording.agents, recording.event_names
     exact = {measures["evaluation"]: measures for measures in recording.optimality()}
     evaluations = [
@@ -50,14 +46,7 @@ def readings(
     agents: Sequence[str],
     events: Sequence[str],
 ) -> dict[str, float]:
-    """Return the readings of an evaluation by name; `mean_return` without an agent if there is but one.
-
-    Args:
-        metrics: the recorded metrics of the evaluation.
-        exact: its exact measures, if there are any.
-        agents: the learners.
-        events: the events of the environment.
-    """
+    """Return the readings of an evaluation by name; `mean_return` without an agent if there is but one."""
     record = evaluation_record(metrics, agents, events)
     by_metric = evaluation_readings(record)
     if record.training:
@@ -111,10 +100,7 @@ def value_of(objective: Objective, curve: Curve) -> float:
 def pruning_bounds(objective: Objective, curves: Sequence[Curve], percentile: float) -> Curve:
     """Return by episode the bound that the best reading of a run so far must reach.
 
-    Args:
-        objective: states which readings are better.
-        curves: the readings of the finished trials.
-        percentile: the share of the finished trials, in percent, that a run may be worse than.
+    A run may be worse than a `percentile` of the finished trials, whose readings the curves are.
     """
     bests: dict[int, list[float]] = {}
     for curve in curves:

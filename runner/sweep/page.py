@@ -42,16 +42,7 @@ class _SweepView(View):
 
 
 def render_sweep(results: Results, recordings: Path) -> str:
-    """Return the page.
-
-    Args:
-        results: the results of the sweep.
-        recordings: the folder of its runs.
-
-    Raises:
-        MissingExtra: Jinja2 is not installed.
-        RunnerError: no trial is finished yet, or a run cannot be read.
-    """
+    """Return the page of a sweep whose runs are in a recordings folder."""
     picture = picture_of(results)
     groups, panels = learning(results, recordings)
     ranking, *others = sections(results)

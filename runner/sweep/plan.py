@@ -47,11 +47,7 @@ class Plan:
 
 
 def plan_of(sweep: Sweep) -> Plan:
-    """Return what a sweep will take, measured by its first trial with one episode.
-
-    Raises:
-        RunnerError: the environment cannot be used, or the objective is not recorded.
-    """
+    """Return what a sweep will take, measured by its first trial with one episode."""
     search = Search(sweep.file)
     is_grid = sweep.file.strategy == "grid"
     configs: list[ExperimentConfig] = []
@@ -100,16 +96,7 @@ def _estimated_bytes(config: ExperimentConfig, mdp: Mdp) -> int:
 
 
 def require_disk(plan: Plan, done: int, recordings: Path) -> None:
-    """Refuse a sweep that does not fit on the disk.
-
-    Args:
-        plan: what it will take.
-        done: the number of its runs that exist already.
-        recordings: the folder of its runs.
-
-    Raises:
-        StorageError: there is too little space.
-    """
+    """Refuse a sweep that does not fit on the disk; `done` of its runs exist already."""
     needed, free = max(0, plan.runs - done) * plan.bytes_per_run, free_bytes(recordings)
     if needed > free:
         raise StorageError(
@@ -119,13 +106,9 @@ def require_disk(plan: Plan, done: int, recordings: Path) -> None:
 
 
 def limit_of(limits: Limits, plan: Plan, recordings: Path, before: int) -> Limit:
-    """Return the function that says why a task may not be started.
+    """Return the function that gives the reason why a task may not be started, if there is one.
 
-    Args:
-        limits: the limits of the sweep.
-        plan: what a run will take.
-        recordings: the folder of the runs.
-        before: the number of runs of the sweep that existed before.
+    `before` is the number of runs of the sweep that existed before.
     """
 
     def reason(status: SweepStatus, task: Task) -> str:

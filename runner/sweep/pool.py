@@ -13,14 +13,8 @@ def worker_pool(
 ) -> AbstractContextManager[Workers[T, R], None]:
     """Return workers, at most one per task; Ray prints messages about workers that died on stdout.
 
-    Args:
-        count: the maximum number of workers; None for one per processor.
-        ray: the address of a cluster, empty for Ray on this machine; None for processes without Ray.
-        tasks: the number of tasks.
-
-    Raises:
-        MissingExtra: Ray is not installed.
-        RunnerError: the cluster cannot be reached.
+    There are at most `count`, None for one per processor. `ray` is the address of a cluster, empty for Ray on
+    this machine; None for processes without Ray.
     """
     if ray is None:
         return LocalWorkers(min(count or os.cpu_count() or 1, tasks))

@@ -78,9 +78,6 @@ class Results:
         """Shares of the variance that parameters and pairs of them explain, the largest first.
 
         Computed when first read: it takes longer than everything else here.
-
-        Raises:
-            MissingExtra: scikit-learn is not installed.
         """
         parameters = self.sweep.file.parameters
         if self.is_whole_grid:
@@ -99,12 +96,7 @@ class Results:
 
 
 def results_of(sweep: Sweep, recordings: Path) -> Results:
-    """Return the results of a sweep so far.
-
-    Raises:
-        RunnerError: a run cannot be read.
-        MissingExtra: Optuna or SciPy is not installed.
-    """
+    """Return the results of a sweep so far."""
     statistics.require_scipy()
     trials = Trials(sweep)
     suggested = list(recorded_trials(trials, recordings))
@@ -178,15 +170,7 @@ def fresh_seeds(searched: Sequence[int]) -> list[int]:
 
 
 def sections(results: Results, shown: int | None = DEFAULT_SHOWN) -> list[Section]:
-    """Return the results as sections of text.
-
-    Args:
-        results: the results of a sweep.
-        shown: the number of trials to list; None for all.
-
-    Raises:
-        MissingExtra: scikit-learn is not installed.
-    """
+    """Return the results of a sweep as sections of text, with `shown` trials; None for all."""
     return [*ranking_sections(results, shown), *effects_sections(results)]
 
 
@@ -210,9 +194,6 @@ def effects_sections(results: Results) -> list[Section]:
     """Return main effects and interactions as a table; nothing if there are too few trials.
 
     Small interactions are left out.
-
-    Raises:
-        MissingExtra: scikit-learn is not installed.
     """
     effects = results.effects
     if not effects:

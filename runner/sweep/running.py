@@ -62,19 +62,11 @@ def run_sweep(
     limit: Limit = lambda *_: "",
     accept_changes: bool = False,
 ) -> tuple[Trials, SweepStatus]:
-    """Run the rest of a sweep; return its trials and its status.
+    """Run the rest of a sweep that `state.begin` wrote to disk; return its trials and its status.
 
-    Args:
-        sweep: written to disk by `state.begin`.
-        recordings: the folder of its runs.
-        workers: the workers that execute the runs.
-        stop: called several times a second; returns whether to stop.
-        report: called with the status several times a second.
-        limit: returns why a task may not be started; empty if it may.
-        accept_changes: resume runs that other code started.
-
-    Raises:
-        RunnerError: an existing run cannot be read.
+    `stop` and `report` are called several times a second, and `stop` returns whether to; `limit` returns why
+    a task may not be started, empty if it may. Runs that other code started are resumed only if the changes
+    are accepted.
     """
     runner = _Runner(sweep, recordings, workers, stop=stop, report=report, limit=limit)
     trials, status = runner.trials, runner.status

@@ -18,25 +18,14 @@ _MAX_DRAWS: Final = 20
 
 
 def require_optuna() -> Any:
-    """Return the module `optuna`, which logs errors only.
-
-    Raises:
-        MissingExtra: it is not installed.
-    """
+    """Return the module `optuna`, which logs errors only."""
     optuna = require("optuna", extra="sweep", purpose="a sweep")
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     return optuna
 
 
 class Search:
-    """Suggests values for trials.
-
-    Args:
-        file: the sweep file.
-
-    Raises:
-        MissingExtra: Optuna is not installed.
-    """
+    """Suggests values for trials."""
 
     def __init__(self, file: SweepFile) -> None:
         self._optuna = require_optuna()

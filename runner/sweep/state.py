@@ -39,11 +39,7 @@ class SweepBusy(RunnerError):
 
 
 def read_sweep(name: str, recordings: Path) -> Sweep:
-    """Return a sweep as it was started.
-
-    Raises:
-        RunnerError: there is none of this name, or its file is damaged.
-    """
+    """Return a sweep as it was started."""
     names = sweeps_in(recordings)
     if name not in names:
         listed = f" There are {', '.join(names)}." if names else " `dualtaxi sweep run FILE` starts one."
@@ -59,15 +55,8 @@ def read_sweep(name: str, recordings: Path) -> Sweep:
 def begin(sweep: Sweep, recordings: Path, resume: bool, accept_changes: bool) -> None:
     """Write a sweep to disk, or check that it is the one on disk.
 
-    Args:
-        sweep: the sweep to run.
-        recordings: the folder of its runs.
-        resume: whether it may exist already.
-        accept_changes: whether the existing one may differ, or have been started by other code.
-
-    Raises:
-        RunnerError: a sweep of this name exists or differs, or other code started one of its unfinished runs.
-        StorageError: the folder cannot be written.
+    With `resume` it may exist already; if changes are accepted, the existing one may differ, or have been
+    started by other code.
     """
     require_startable(sweep, recordings, resume, accept_changes)
     folder = folder_of(sweep.name, recordings)
@@ -154,11 +143,7 @@ def failures_of(name: str, recordings: Path) -> dict[str, str]:
 
 
 def write_failures(name: str, recordings: Path, failures: Mapping[str, str]) -> None:
-    """Store the errors of a sweep's failed jobs.
-
-    Raises:
-        StorageError: the folder cannot be written.
-    """
+    """Store the errors of a sweep's failed jobs."""
     path = folder_of(name, recordings) / FAILED
     with storage_errors(path):
         write_object(path, failures)

@@ -85,9 +85,7 @@ class Result:
 def run_task(task: Task, stop: Callable[[], bool]) -> Result:
     """Run a task; errors that a user can fix become a failed result.
 
-    Args:
-        task: the run.
-        stop: called every few milliseconds; once it returns True, the run is interrupted.
+    `stop` is called every few milliseconds; once it returns True, the run is interrupted.
     """
     try:
         if task.on_own_disk:
@@ -122,9 +120,6 @@ def move_files(own: Path, target: Path) -> None:
 
     Each file is replaced atomically, `run.json` last: a run that was moved in part is as good as one whose
     process was killed.
-
-    Raises:
-        OSError: a file cannot be replaced.
     """
 
     def names(folder: Path) -> set[str]:
@@ -138,11 +133,7 @@ def move_files(own: Path, target: Path) -> None:
 
 
 def result_of(run: Run, objective: Objective) -> Result:
-    """Return the result of a finished or pruned run.
-
-    Raises:
-        RunnerError: its recording cannot be read, or the objective was never recorded.
-    """
+    """Return the result of a finished or pruned run."""
     path = at_hand(run).recording
     try:
         stat = path.stat()

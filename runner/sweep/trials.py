@@ -78,11 +78,7 @@ class Trial:
 
 
 class Trials:
-    """A sweep's trials; each batch depends on the results of those before.
-
-    Args:
-        sweep: the sweep.
-    """
+    """A sweep's trials; each batch depends on the results of those before."""
 
     def __init__(self, sweep: Sweep) -> None:
         self.sweep = sweep
@@ -152,11 +148,7 @@ class JobResults:
         return self._runs[identity].run_id if identity in self._runs else ""
 
     def get(self, identity: str) -> Result | None:
-        """Return the result of a job; None if its run is not over.
-
-        Raises:
-            RunnerError: its run cannot be read.
-        """
+        """Return the result of a job; None if its run is not over."""
         run = self._runs.get(identity)
         if identity not in self._results and run is not None and state.is_over(run):
             self._results[identity] = result_of(run, self._sweep.objective)
@@ -172,11 +164,7 @@ class JobResults:
 
 
 def recorded_trials(trials: Trials, recordings: Path) -> Iterator[Trial]:
-    """Yield the trials of a sweep that have been suggested so far, with the results that are recorded.
-
-    Raises:
-        RunnerError: a run cannot be read.
-    """
+    """Yield the trials of a sweep that have been suggested so far, with the results that are recorded."""
     results = JobResults(trials.sweep, recordings)
     while batch := trials.ask():
         for trial in batch:

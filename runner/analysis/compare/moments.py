@@ -133,14 +133,8 @@ def moment_of(
 ) -> tuple[Moment, Sequence[str]]:
     """Return the moment that options stand for, and the metrics: a target names its own.
 
-    Args:
-        moment: `last`, `best`, `area`, or a position: a number of training episodes, or of the axis.
-        target: a metric and its level, instead; or None.
-        chosen: metrics.
-        axis: the axis on which runs are read.
-
-    Raises:
-        RunnerError: it is none of these, or both are given.
+    A moment is `last`, `best`, `area`, or a position: a number of training episodes, or of the axis. A
+    target, a metric and its level, replaces it.
     """
     if target is not None:
         if moment != "last" or chosen:

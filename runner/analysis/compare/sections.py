@@ -63,12 +63,7 @@ def _pair_in_words(metric: MetricResult, pair: PairResult) -> str:
 
 
 def metric_section(metric: MetricResult, profile: bool = True) -> Section:
-    """Return the text of one metric.
-
-    Args:
-        metric: the result.
-        profile: also a few points of the performance profile.
-    """
+    """Return the text of one metric, with a few points of its performance profile if that is wanted."""
     better = {True: "higher is better", False: "lower is better", None: "neither is better as such"}
     line = f", {metric.line.replace('_', ' ')}" if metric.line else ""
     grids = [Grid(("", "n", "median", "IQM", "95 %"), [_group(group) for group in metric.groups])]

@@ -55,11 +55,7 @@ class Estimate:
 
 
 def require_scipy() -> Any:
-    """Return the module `scipy.stats`.
-
-    Raises:
-        MissingExtra: it is not installed.
-    """
+    """Return the module `scipy.stats`."""
     return require("scipy.stats", extra="stats", purpose="a comparison")
 
 
@@ -79,12 +75,10 @@ def interquartile_mean(values: Values) -> Estimate:
 def iqm_band(values: Values) -> tuple[Values, Values, Values]:
     """Return the IQM of runs at each position of a curve, and its interval: (IQM, low, high).
 
-    Where fewer than four runs have a value the interval is their range, as nothing can be cut off. The
-    percentile bootstrap is that of `interquartile_mean`, for hundreds of positions at once and without SciPy:
-    the IQM of a resample is a weighted mean of the sorted values, so that all positions share the weights.
-
-    Args:
-        values: float64 [runs, positions], NaN where a run has no value; at least one run at each position.
+    The values are float64 [runs, positions], NaN where a run has none; each position has at least one. Where
+    fewer than four runs have a value the interval is their range, as nothing can be cut off. The percentile
+    bootstrap is that of `interquartile_mean`, for hundreds of positions at once and without SciPy: the IQM of
+    a resample is a weighted mean of the sorted values, so that all positions share the weights.
     """
     known = ~np.isnan(values)
     result = np.empty((3, values.shape[1]))
@@ -116,12 +110,9 @@ def stratified(
 ) -> tuple[Values, Values, Values]:
     """Return a statistic of several samples and its percentile bootstrap interval: (value, low, high).
 
-    Each sample is resampled by itself; the interval is nan if no sample has two values.
-
-    Args:
-        strata: the samples, float64 [n, columns], with equal columns; the result has one value for each.
-        statistic: takes one column of all samples, [n, resamples] each, and returns [resamples].
-        cells: numbers that the statistic holds for each resample, if more than there are values.
+    Each sample, float64 [n, columns] with equal columns, is resampled by itself; the interval is nan if no
+    sample has two values. The statistic takes one column of all samples, [n, resamples] each, and returns
+    [resamples]; `cells` are the numbers that it holds for each resample, if more than there are values.
     """
     columns = strata[0].shape[1]
     value = np.array([float(statistic([own[:, k : k + 1] for own in strata])[0]) for k in range(columns)])
@@ -144,8 +135,7 @@ def stratified(
 def bootstrap_means(values: Values) -> list[Estimate]:
     """Return the mean of each row, and its percentile bootstrap interval; all rows are resampled alike.
 
-    Args:
-        values: of the same seeds in each row, [rows, seeds]; of one seed the interval is nan.
+    The values are of the same seeds in each row, [rows, seeds]; of one seed the interval is nan.
     """
     n = values.shape[1]
     low = high = np.full(len(values), np.nan)
@@ -163,10 +153,6 @@ def improvement(a: Values, b: Values) -> Estimate:
     The interval is the score interval of R. G. Newcombe, "Confidence intervals for an effect size measure
     based on the Mann-Whitney statistic, part 2", Statistics in Medicine 25 (2006), method 5. It takes the
     runs of A and B as independent; where runs of one seed are alike it is wider than it need be.
-
-    Args:
-        a: values of one configuration, one a seed.
-        b: of another.
     """
     value = 0.5 + 0.5 * float(np.sign(a[:, np.newaxis] - b).mean())
     if min(len(a), len(b)) < 2:
@@ -184,9 +170,6 @@ def simultaneous(samples: Sequence[Sequence[float]]) -> list[Estimate]:
     are wide beyond any use, because standard errors of resamples come close to 0, and percentile ones cover
     far too seldom. A sample of equal values has an interval without width; one with a level that is never
     reached, or of fewer than `FEWEST_TOGETHER` values, has none.
-
-    Args:
-        samples: of differences, one a seed.
     """
     level = 0.5 + 0.5 * CONFIDENCE ** (1 / max(1, len(samples)))
     estimates = []

@@ -114,13 +114,10 @@ class RunDiff:
 def diff(
     a: Recording, b: Recording, targets: Mapping[str, float] | None = None, first: bool = False
 ) -> RunDiff:
-    """Return how two runs differ.
+    """Return how two runs differ, finished or not.
 
-    Args:
-        a: one run, finished or not.
-        b: another.
-        targets: metric to a level, whose first crossing is reported.
-        first: compare only settings, and where and in what training first diverges, not the tables.
+    The first crossing of each target, metric to level, is reported. `first` compares only settings, and where
+    and in what training first diverges, not the tables.
     """
     jobs = a.has_tables and b.has_tables
     digests = [recording.result.content_digest for recording in (a, b)]
@@ -244,10 +241,7 @@ def with_seconds(difference: RunDiff, a: Run, b: Run) -> RunDiff:
 def without_ignored(difference: RunDiff, ignore: Sequence[str], everything: bool = False) -> RunDiff:
     """Return the difference without the paths that match a pattern; they are listed as ignored.
 
-    Args:
-        difference: of two runs.
-        ignore: patterns of paths.
-        everything: also keep what is alike.
+    With `everything`, what is alike stays.
     """
 
     def is_ignored(path: str) -> bool:

@@ -115,11 +115,7 @@ def find_cause(
 ) -> Cause:
     """Return why two runs diverge where they do, back to the update that made their tables differ.
 
-    Args:
-        divergence: where they diverge.
-        a: one run.
-        b: the other.
-        training: where and why their training diverges, if known; it spares finding it again.
+    `training` is where and why their training diverges, if known; it spares finding it again.
     """
     cause = find_kind(divergence, a, b)
     if cause.kind not in _CAUSED_BY_TABLES:

@@ -48,9 +48,6 @@ def code_changes(a: Recording, b: Recording) -> list[FileChange]:
     """Return the recorded files that differ; none if a run did not record its code.
 
     A file that one run did not load, and that it has as its commit has it, is not compared.
-
-    Raises:
-        RecordingError: the code in a recording is damaged.
     """
     ours, theirs = a.code, b.code
     if not (ours.files or ours.patch) or not (theirs.files or theirs.patch):

@@ -297,10 +297,7 @@ def _action_divergence(a: Recording, b: Recording, phase: str) -> Divergence | N
 def branch_divergence(a: Recording, b: Recording, origin: BranchOrigin) -> Divergence | None:
     """Return where a branched episode of a loop and its branch diverge; its place is that in the parent.
 
-    Args:
-        a: the parent or the branch, in the same spaces, whose steps have one size.
-        b: the other.
-        origin: of the branch.
+    Either is given first; they have the same spaces, and their steps one size.
     """
     blocks = [
         episode_blocks(one, origin.phase, origin.episode if one.run_id == origin.run else 0) for one in (a, b)

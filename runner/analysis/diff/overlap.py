@@ -67,11 +67,7 @@ class VisitsDiff:
 
 
 def training_overlap(a: Recording, b: Recording) -> tuple[Overlap, tuple[Lengths, Lengths]]:
-    """Return how far the training of two runs is the same, and the visits to each state, [S], of either.
-
-    Raises:
-        RecordingError: steps and episodes of a recording contradict each other.
-    """
+    """Return how far the training of two runs is the same, and the visits to each state, [S], of either."""
     left, right = _Steps(a), _Steps(b)
     episodes = equal_episodes = equal_steps = compared = 0
     total = np.zeros(2, np.int64)

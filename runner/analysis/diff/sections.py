@@ -20,12 +20,7 @@ _MAX_SETTINGS: Final = 4
 
 
 def sections(difference: RunDiff, everything: bool = False) -> list[Section]:
-    """Return the text of a difference.
-
-    Args:
-        difference: of two runs.
-        everything: also the sections in which nothing differs, and metrics that do not.
-    """
+    """Return the text of a difference; `everything` includes what does not differ."""
     found = [
         _runs(difference),
         _values("Configuration", difference, "config"),

@@ -47,23 +47,16 @@ class TableDiff:
 
 
 def table_diffs(a: Recording, b: Recording, visits: NDArray[np.int64] | None) -> Iterator[TableDiff]:
-    """Yield the differences of the tables that both runs have snapshots of.
+    """Yield the differences of the tables, of the same shapes, that both runs have snapshots of.
 
-    Args:
-        a: one run.
-        b: another, whose tables have the same shape.
-        visits: how often each state was acted in, [S], both runs together.
+    `visits` is how often each state was acted in, [S], both runs together.
     """
     for left, right in common_snapshots(a, b):
         yield _table_diff(a.mdp, left, right, visits)
 
 
 def common_snapshots(a: Recording, b: Recording) -> Iterator[tuple[QTable, QTable]]:
-    """Yield the tables, of one shape, that both runs have after as many episodes.
-
-    Raises:
-        RecordingError: one is not of the shape that its environment has.
-    """
+    """Yield the tables, of one shape, that both runs have after as many episodes."""
     theirs = b.snapshots()
     right = next(theirs, None)
     for left in a.snapshots():

@@ -39,11 +39,7 @@ class Update:
 
 
 def replay_to(a: Recording, b: Recording, stop: int) -> tuple[list[TableReplay], Update | None]:
-    """Return both runs' tables at a step up to which they took the same steps, and the first other update.
-
-    Raises:
-        RecordingError: the tables cannot be restored.
-    """
+    """Return both runs' tables at a step up to which they took the same steps, and the first other update."""
     start = _last_equal_snapshot(a, b, stop)
     replays = [TableReplay(recording, start) for recording in (a, b)]
     update = None

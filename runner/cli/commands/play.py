@@ -172,12 +172,7 @@ def _pictures(
 
 
 class _Screen:
-    """Shows frames in a live display.
-
-    Args:
-        live: the display.
-        image: draws pictures, a renderable of `textual_image`; None if there are none.
-    """
+    """Shows frames in a live display."""
 
     def __init__(self, live: Live, image: Any) -> None:
         self._live, self._image = live, image
@@ -204,13 +199,7 @@ class _Screen:
 
 
 class _Bounded:
-    """A renderable of at most some columns and lines.
-
-    Args:
-        inner: what is shown.
-        columns: the largest width.
-        lines: the largest height.
-    """
+    """A renderable of at most some columns and lines."""
 
     def __init__(self, inner: Any, columns: int, lines: int) -> None:
         self._inner, self._columns, self._lines = inner, columns, lines
@@ -226,11 +215,7 @@ def _play(
 ) -> None:
     """Show frames at even intervals; keys pause, step back and forward, and quit.
 
-    Args:
-        frames: the frames of the episode.
-        seconds: between two of them.
-        read_key: waits for a key; None if stdin is no terminal.
-        show: draws a frame, and a text about the keys.
+    `read_key` waits for a key, None if stdin is no terminal; `show` draws a frame, and a text about the keys.
     """
     seen = list(itertools.islice(frames, 1))
     number, paused, due = 0, False, time.monotonic() + seconds

@@ -38,11 +38,7 @@ class Server:
     token: str | None
 
     def client(self, default_url: str | None = None) -> Client:
-        """Return a client of the server.
-
-        Raises:
-            UsageError: no server was named.
-        """
+        """Return a client of the server."""
         from runner.client.client import Client
 
         url = self.url or default_url

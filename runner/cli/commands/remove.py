@@ -154,16 +154,7 @@ def _carry_out(
 ) -> None:
     """Show the removals, ask, carry them out and print what was freed.
 
-    Args:
-        removals: the removals, none of them refused.
-        kept: run id to reason, of the runs that stay; for programs.
-        foreign: also remove foreign files.
-        yes: do not ask.
-        dry_run: remove nothing.
-        as_json: print JSON.
-
-    Raises:
-        RunnerError: confirmation is needed, and there is no terminal.
+    None of the removals is refused; `kept` has the reason for each run that stays, by id, for programs.
     """
     from runner.runs.catalogue.removal import clean, contents_freed, remove
 

@@ -179,15 +179,7 @@ class Canvas:
 
 
 class Chart(Canvas):
-    """A canvas with axes.
-
-    Args:
-        x: from left to right.
-        y: from bottom to top.
-        width: of the canvas.
-        height: of the canvas.
-        title: the description for screen readers.
-    """
+    """A canvas with axes: `x` from left to right, `y` from bottom to top."""
 
     def __init__(self, x: Scale, y: Scale, width: float, height: float, title: str) -> None:
         super().__init__(width, height, title)

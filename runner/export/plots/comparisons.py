@@ -31,9 +31,7 @@ _MEASURES: Final = (
 def intervals_svg(metric: MetricResult, labels: list[str]) -> str:
     """Return each group's seeds as points, its median as a tick, and its IQM with the 95 % interval.
 
-    Args:
-        metric: the metric that is drawn.
-        labels: the labels of all groups, in the order of their colours.
+    The labels are those of all groups, in the order of their colours.
     """
     bottom = 12.0 + max(100.0, 30.0 * len(metric.groups))
     drawn = [
@@ -70,16 +68,11 @@ def profile_chart(
     labels: Sequence[str],
     is_lower_better: bool = False,
 ) -> Chart:
-    """Return performance profiles with their bands.
+    """Return performance profiles over levels in a unit, with their bands.
 
-    Args:
-        heading: above the chart; may be empty.
-        title: the description for screen readers.
-        unit: of the levels.
-        thresholds: the levels.
-        groups: whose profiles are drawn.
-        labels: the labels of all groups, in the order of their colours.
-        is_lower_better: whether a run reaches a level by being lower.
+    `heading`, above the chart, may be empty; `title` is the description for screen readers; `labels` are
+    those of all groups, in the order of their colours. Where lower is better, a run reaches a level by being
+    lower.
     """
     levels = np.array(thresholds)
     x, y = Scale.around(levels, 50.0, WIDTH - 10), Scale(0, 103, 146.0, 16.0 if not heading else 32.0)

@@ -66,10 +66,7 @@ def panel_plots(panels: Sequence[Panel], groups: int) -> list[Plot]:
 def curves_sheet(groups: Sequence[Group], panels: Sequence[Panel], single_runs: bool = False) -> Canvas:
     """Return all panels on one sheet, with a legend of the groups above and notes below.
 
-    Args:
-        groups: of runs.
-        panels: of these groups.
-        single_runs: whether to draw each run as a thin line too.
+    With `single_runs` each run is a thin line too.
     """
     columns = min(3, len(panels))
     narrow = [panel for panel in panels if panel.metric != SHARES]

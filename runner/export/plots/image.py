@@ -15,12 +15,7 @@ _DPI: Final = 160
 
 
 def check_suffix(path: Path) -> None:
-    """Check that a file can be written as what its suffix says.
-
-    Raises:
-        RunnerError: the suffix is not in `SUFFIXES`.
-        MissingExtra: Matplotlib, which writes PNG and PDF, is not installed.
-    """
+    """Check that a file can be written as what its suffix says."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise RunnerError(f"{path}: found the ending {path.suffix!r}, expected one of {', '.join(SUFFIXES)}.")
@@ -29,12 +24,7 @@ def check_suffix(path: Path) -> None:
 
 
 def save(canvas: Canvas, path: Path) -> None:
-    """Write a canvas to a file, in the format of its suffix.
-
-    Raises:
-        MissingExtra: Matplotlib, which writes PNG and PDF, is not installed.
-        OSError: the file cannot be written.
-    """
+    """Write a canvas to a file, in the format of its suffix."""
     if path.suffix.lower() == ".svg":
         path.write_text('<?xml version="1.0" encoding="utf-8"?>\n' + canvas.svg(for_page=False), "utf-8")
     else:
@@ -42,12 +32,7 @@ def save(canvas: Canvas, path: Path) -> None:
 
 
 def write_image(canvas: Canvas, target: Path | IO[bytes], form: str, dpi: int = _DPI) -> None:
-    """Write a canvas as `png` or `pdf`.
-
-    Raises:
-        MissingExtra: Matplotlib is not installed.
-        OSError: the file cannot be written.
-    """
+    """Write a canvas as `png` or `pdf`."""
     parts = ("figure", "lines", "patches", "patheffects", "transforms")
     modules = [f"matplotlib.{part}" for part in parts]
     mpl = require("matplotlib", *modules, extra="plots", purpose="a plot")

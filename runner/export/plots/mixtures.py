@@ -50,13 +50,7 @@ def bars_chart(title: str, rows: list[tuple[str, Estimate]]) -> Chart:
 
 
 def mixtures_chart(title: str, names: Sequence[str], columns: Sequence[Column]) -> Chart:
-    """Return each mixture as a column: its values and their mean, and below a filled dot for what is changed.
-
-    Args:
-        title: the heading.
-        names: the settings.
-        columns: the mixtures, from left to right.
-    """
+    """Return each mixture as a column: its values and their mean, and below a dot for what is changed."""
     values = np.array([value for one in columns for value in one.values])
     bottom, last = 170.0, 184.0 + 16 * len(names)
     x = Scale(-0.6, len(columns) - 0.4, _NAMES, _WIDTH - 10)

@@ -55,15 +55,7 @@ class _ComparisonView(View):
 
 
 def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
-    """Return the page.
-
-    Args:
-        comparison: the comparison of these groups.
-        groups: the groups, for their learning curves.
-
-    Raises:
-        MissingExtra: Jinja2 is not installed.
-    """
+    """Return the page of a comparison, with the learning curves of its groups."""
     labels = [group.label for group in groups]
     rows = [
         (
@@ -115,11 +107,7 @@ class _TasksView(View):
 
 
 def render_tasks(comparison: TaskComparison) -> str:
-    """Return the page.
-
-    Raises:
-        MissingExtra: Jinja2 is not installed.
-    """
+    """Return the page of a comparison over environments."""
     labels = [result.label for result in comparison.algorithms]
     return render(
         _TasksView(

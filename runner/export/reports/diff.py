@@ -96,16 +96,7 @@ class DifferenceView(View):
 
 
 def render_diff(difference: RunDiff, a: Recording, b: Recording) -> str:
-    """Return the page.
-
-    Args:
-        difference: the difference of these recordings.
-        a: one run.
-        b: the other.
-
-    Raises:
-        MissingExtra: Jinja2 is not installed.
-    """
+    """Return the page of a difference of two recordings."""
     groups = [Group(name, (read_series(recording),)) for name, recording in (("A", a), ("B", b))]
     return render(difference_view(difference, a, b, plots_of(groups)))
 
@@ -113,14 +104,7 @@ def render_diff(difference: RunDiff, a: Recording, b: Recording) -> str:
 def difference_view(
     difference: RunDiff, a: Recording, b: Recording, plots: Sequence[Plot] = ()
 ) -> DifferenceView:
-    """Return what the page of a difference shows.
-
-    Args:
-        difference: the difference of these recordings.
-        a: one run.
-        b: the other.
-        plots: their learning curves.
-    """
+    """Return what the page of a difference shows, with plots of the learning curves of both runs."""
     parts = {section.title: section for section in sections(difference, everything=True)}
     sides = (difference.a, difference.b)
     pairs = (

@@ -61,27 +61,12 @@ def outcome_in_words(length: int, ended: str, total: float | None) -> str:
 
 
 def trial(recording: Recording, after: int, number: int, limit: int = MAX_STEPS, first: int = 0) -> Episode:
-    """Return at most `limit` steps of a trial, counted from 0.
-
-    Args:
-        recording: the run.
-        after: training episodes before the evaluation.
-        number: the trial.
-        limit: the largest number of steps.
-        first: the first step.
-
-    Raises:
-        RecordingError: there is no such evaluation or trial, or no steps.
-    """
+    """Return at most `limit` steps of a trial, counted from 0."""
     return episode_at(recording, place_of(recording, (after, number)), limit, first)
 
 
 def episode_at(recording: Recording, place: EpisodePlace, limit: int = MAX_STEPS, first: int = 0) -> Episode:
-    """Return at most `limit` steps of an episode from step `first` on, even if it never ended.
-
-    Raises:
-        RecordingError: there is no such episode or step, or no steps.
-    """
+    """Return at most `limit` steps of an episode from step `first` on, even if it never ended."""
     require_steps(recording, "show", may_redo=True)
     steps, ended = (
         steps_of(recording, place.phase, place.number),
@@ -107,16 +92,10 @@ def episode_of(
     first: int = 0,
     limit: int = MAX_STEPS,
 ) -> Episode:
-    """Return a part of an episode from its steps, which the environment can have.
+    """Return a part of an episode from all of its steps, which the environment can have.
 
-    Args:
-        place: where the episode stands.
-        mdp: the environment.
-        steps: all of its steps.
-        ended: a key of `ENDINGS`.
-        values: for each learner the Q-values in the states of the part, [T, actions].
-        first: the first step of the part.
-        limit: the largest number of steps of the part.
+    `ended` is a key of `ENDINGS`; `values` are for each learner the Q-values in the states of the part, [T,
+    actions].
     """
     shown = steps[first : first + limit]
     return Episode(

@@ -83,11 +83,7 @@ class _Steps:
 
 
 def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: int) -> Playback:
-    """Return what a page plays of an episode: at most `limit` steps from step `first` on.
-
-    Raises:
-        RecordingError: there is no such episode or step, or steps were lost.
-    """
+    """Return what a page plays of an episode: at most `limit` steps from step `first` on."""
     span = recording.episode_span(place.phase, place.number)
     if not 0 <= first < len(span):
         raise RecordingError(

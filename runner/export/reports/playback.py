@@ -44,14 +44,7 @@ def playback_of(
 ) -> Playback:
     """Return what a page plays of an episode: at most `limit` steps from step `first` on.
 
-    Args:
-        recording: the run.
-        which: (episode,) of training, or (training episodes before, trial) of an evaluation.
-        limit: the largest number of steps.
-        first: the first step.
-
-    Raises:
-        RecordingError: there is no such episode or step, or no steps were recorded.
+    Which episode is given as for `place_of`.
     """
     require_steps(recording, "show", may_redo=True)
     place = place_of(recording, which)

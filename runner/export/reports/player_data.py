@@ -132,10 +132,7 @@ def frame_times(after: NDArray[np.int64]) -> list[int]:
 def logged_near(recording: Recording, phase: str, time: Sequence[int]) -> list[Logged]:
     """Return what was logged near frames: a loop's numbers and texts, or a job's reports of training.
 
-    Args:
-        recording: the run.
-        phase: of the frames; values logged in the other one are marked.
-        time: of the frames, as `Playback.time`.
+    `time` is that of the frames, as `Playback.time`; values logged in another phase than theirs are marked.
     """
     tick = schema.STEP_NANOSECONDS
     times = range(max(0, time[0] - _NEAR) * tick, (time[-1] + _NEAR) * tick + 1)

@@ -46,20 +46,12 @@ class Link(NamedTuple):
 
 
 def partials() -> Any:
-    """Return the macros of `parts.html`, which reports and pages share, as functions that return HTML.
-
-    Raises:
-        MissingExtra: Jinja2 is not installed.
-    """
+    """Return the macros of `parts.html`, which reports and pages share, as functions that return HTML."""
     return templates().get_template("parts.html").module
 
 
 def render(view: View) -> str:
-    """Return the page of a report.
-
-    Raises:
-        MissingExtra: Jinja2 is not installed.
-    """
+    """Return the page of a report."""
     return fill(templates(), view)
 
 
@@ -71,22 +63,14 @@ def fill(environment: Environment, view: View, **shared: object) -> str:
 
 @functools.cache
 def templates() -> Environment:
-    """Return the templates of reports.
-
-    Raises:
-        MissingExtra: Jinja2 is not installed.
-    """
+    """Return the templates of reports."""
     environment = environment_of((TEMPLATES,))
     environment.globals |= {"style": page_style, "script": (TEMPLATES / "replay.js").read_text}
     return environment
 
 
 def environment_of(folders: Sequence[Traversable]) -> Environment:
-    """Return an environment of templates, which are looked for in folders in their order.
-
-    Raises:
-        MissingExtra: Jinja2 is not installed.
-    """
+    """Return an environment of templates, which are looked for in folders in their order."""
     require("jinja2", extra="plots", purpose="a report")
     import jinja2
 

@@ -105,17 +105,8 @@ def write_report(
 ) -> list[str]:
     """Write the page about some recordings, and return what is missing from it, a sentence each.
 
-    Args:
-        path: the file to write.
-        recordings: the MCAP files.
-        chosen: episodes to show in addition to those that are always shown.
-        progress: called with the next stage of the work.
-        axis: of the plots.
-
-    Raises:
-        MissingExtra: Jinja2 is not installed.
-        RecordingError: a recording cannot be read, has no such episode, or does not have the axis.
-        OSError: the page cannot be written.
+    The chosen episodes are shown in addition to those that are always shown; `progress` is called with the
+    next stage of the work; the axis is that of the plots.
     """
     page, missing = render_report(recordings, chosen, progress, axis)
     path.write_text(page, encoding="utf-8")
@@ -123,11 +114,7 @@ def write_report(
 
 
 def require_packages() -> None:
-    """Check that the packages that a report needs are installed.
-
-    Raises:
-        MissingExtra: one is not.
-    """
+    """Check that the packages that a report needs are installed."""
     templates()
 
 

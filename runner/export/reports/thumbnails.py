@@ -33,17 +33,7 @@ class Thumbnails:
 
 
 def thumbnails(path: Path, phase: str, episode: int, frames: int) -> Thumbnails:
-    """Return pictures of the first frames of an episode.
-
-    Args:
-        path: the recording.
-        phase: `train` or `eval`.
-        episode: counted over the phase.
-        frames: how many frames there are to show.
-
-    Raises:
-        MissingExtra: Pillow is not installed.
-    """
+    """Return pictures of the first frames of an episode."""
     require("PIL.Image", extra="plots", purpose="the pictures of a report")
     found, every = Thumbnails(), -(-frames // MAX_PICTURES)
     latest = b""
@@ -69,11 +59,7 @@ def thumbnails(path: Path, phase: str, episode: int, frames: int) -> Thumbnails:
 
 
 def _small(data: bytes) -> str:
-    """Return a picture as an address that contains it, made small.
-
-    Raises:
-        RunnerError: it is no picture, or too large.
-    """
+    """Return a picture as an address that contains it, made small."""
     from PIL import Image, UnidentifiedImageError
 
     try:

@@ -25,10 +25,6 @@ def cached_export(
     """Return the export of these runs in the user's cache, made now if missing, and the selection of each.
 
     Rerun, which takes a second to load, is loaded only to make an export. `stage` is as for `export`.
-
-    Raises:
-        RecordingError: a recording cannot be read, or does not have what is requested.
-        StorageError: the cache cannot be written.
     """
     folder = files.cache_folder() / EXPORTS
     path = folder / f"{RUN_SEPARATOR.join(run.run_id for run in runs)}-{_cache_key(runs, request)}.rrd"

@@ -103,11 +103,9 @@ class Column(NamedTuple):
 
 
 def instances(archetype: object, **parts: Array) -> list[Column]:
-    """Return the columns of n rows with equally many instances each.
+    """Return the columns of n rows with equally many instances each, of a class such as `rerun.Points2D`.
 
-    Args:
-        archetype: a class of Rerun, such as `rerun.Points2D`.
-        parts: by component, text or numbers [n, instances], or points [n, instances, 2].
+    The parts are, by component, text or numbers [n, instances], or points [n, instances, 2].
     """
     return [
         _column(archetype, name, _offsets(*part.shape[:2]), part.reshape(-1, *part.shape[2:]))

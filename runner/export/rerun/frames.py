@@ -24,14 +24,7 @@ from runner.util.extras import require
 
 
 class FrameSender:
-    """Sends pictures of the environments of a loop.
-
-    Args:
-        stream: where to.
-        root: the entity path of everything of the run.
-        recording: the loop.
-        names: of its environments, as parts of entities; empty for a single one.
-    """
+    """Sends pictures of the environments of a loop; their names are parts of entities, empty for one."""
 
     def __init__(
         self, stream: rr.RecordingStream, root: str, recording: Recording, names: Sequence[str]
@@ -67,12 +60,6 @@ class FrameSender:
         self, phase: str, episodes: Sequence[int], trust: bool, stage: Callable[[str], None]
     ) -> Iterator[str]:
         """Send the pictures of episodes that the environment draws, as far as it does what was recorded.
-
-        Args:
-            phase: `train` or `eval`.
-            episodes: their numbers, ascending.
-            trust: whether what the recording names may be imported.
-            stage: called with the progress.
 
         Yields:
             what is not shown, and why, as text.

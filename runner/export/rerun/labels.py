@@ -32,11 +32,7 @@ GOOD_SIGN: Final = "✓"
 class Labels:
     """Texts and colours, numbered, and the numbers of what is shown at each step.
 
-    Args:
-        mdp: the environment.
-        scene: its scene; None if it has none.
-        learners: the names of the learners.
-        value_range: the lowest and the highest value of the tables.
+    `value_range` is the lowest and the highest value of the tables.
     """
 
     def __init__(

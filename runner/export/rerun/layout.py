@@ -121,9 +121,7 @@ class RunView:
 def runs_view(runs: Sequence[RunView], entities: set[str] | None) -> rrb.Container:
     """Return the arrangement of one run with tables, or of several side by side.
 
-    Args:
-        runs: the runs.
-        entities: the entities of recorded metrics; None if not known yet.
+    `entities` are those of recorded metrics; None if they are not known yet.
     """
     plots = _plots(runs, entities)
     body: rrb.Container

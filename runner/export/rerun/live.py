@@ -50,11 +50,8 @@ class Piece(NamedTuple):
 class LiveView:
     """Shows a run in a viewer while it trains: an observer for `run_job`, and a context manager.
 
-    Args:
-        title: the title of the run.
-        run_id: the id of the run.
-        every: N, to show every Nth training episode and trial.
-        url: the address of the viewer, such as `rerun+http://127.0.0.1:9876/proxy`.
+    It shows every Nth training episode and trial, in the viewer at an address such as
+    `rerun+http://127.0.0.1:9876/proxy`.
     """
 
     def __init__(self, title: str, run_id: str, every: int, url: str) -> None:

@@ -23,15 +23,7 @@ FLUSH_SECONDS: Final = 5.0
 
 
 class LiveStream:
-    """Sends a run to a viewer while it trains.
-
-    Args:
-        title: the title of the run.
-        run_id: the id of the run.
-        mdp: the environment.
-        learners: the names of the learners.
-        url: the address of the viewer.
-    """
+    """Sends a run to a viewer while it trains."""
 
     def __init__(self, title: str, run_id: str, mdp: Mdp, learners: tuple[str, ...], url: str) -> None:
         view = RunView("", title, mdp, scene_of(mdp), learners)

@@ -29,16 +29,10 @@ class Location:
 
 
 def locate(run: Run, request: Request, step: StepRef | None) -> Location:
-    """Return where a step is on the timeline.
+    """Return where a step is on the timeline, and a request that adds it to what is exported anyway.
 
-    Args:
-        run: the run.
-        request: what is exported anyway.
-        step: the step; None for the first step of the last evaluation exported, or of the last training
-            episode if there is none.
-
-    Raises:
-        RecordingError: there is no such step, or none at all.
+    Without a step it is the first one of the last evaluation exported, or of the last training episode if
+    there is none.
     """
     with open_recording(run.recording) as recording:
         if step is None:

@@ -123,12 +123,7 @@ class LoopExporter:
                 self._send_steps(phase, spans[phase], labels)
 
     def draw_frames(self, trust: bool, stage: Callable[[str], None]) -> None:
-        """Send pictures of the chosen episodes that the environment draws; report what is missing.
-
-        Args:
-            trust: whether what the recording names may be imported.
-            stage: called with the progress.
-        """
+        """Send pictures of the chosen episodes that the environment draws; report what is missing."""
         for phase, episodes in self._selection.drawn.items():
             for note in self._frames.draw(phase, episodes, trust, stage):
                 self._selection.warnings.append(note)

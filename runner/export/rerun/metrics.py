@@ -28,15 +28,9 @@ Colour = tuple[int, int, int]
 
 
 class MetricWriter:
-    """Sends the metrics of a run.
+    """Sends the metrics of a run below an entity path.
 
-    Args:
-        stream: the stream to send to.
-        root: entity path of the run; empty for the root.
-        learners: the names of the learners.
-        event_names: the events of the environment.
-        tint: the base colour of the run's lines, where runs are compared.
-        label: the name of the run, where runs are compared.
+    `tint` and `label`, a base colour and a name, tell the lines of runs apart where several are compared.
     """
 
     def __init__(
@@ -135,9 +129,8 @@ class MetricWriter:
     def _send_training_means(self, rows: Rows, sums: NDArray[np.float64]) -> None:
         """Send means over the training episodes that ended between reports.
 
-        Args:
-            rows: the reports.
-            sums: [reports, 2 + learners + events]: penalties, episodes, returns and events of those episodes.
+        The sums are the penalties, number, returns and events of those episodes, [reports, 2 + learners +
+        events].
         """
         some = np.flatnonzero(sums[:, 1] > 0)
         if not len(some):
@@ -187,12 +180,7 @@ class MetricWriter:
 
 
 def line_colours(count: int, tint: str | None = None) -> list[Colour]:
-    """Return distinct colours for the lines of a view.
-
-    Args:
-        count: number of lines.
-        tint: the colour whose shades they are, where runs are compared; None for different hues.
-    """
+    """Return distinct colours for the lines of a view: shades of a tint if runs are compared, else hues."""
     if tint is not None and count == 1:
         return [palette.rgb(tint)]
     if tint is None and count <= len(palette.SERIES):

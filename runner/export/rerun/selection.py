@@ -102,11 +102,7 @@ class Selection:
 
 
 def select(recording: Recording, request: Request) -> Selection:
-    """Return the steps of a request.
-
-    Raises:
-        RecordingError: an episode or evaluation does not exist, or steps are requested and not recorded.
-    """
+    """Return the steps of a request."""
     selection = Selection(warnings=shortcomings(recording))
     if not recording.has_tables:
         return _select_loop(recording, request, selection)
@@ -246,11 +242,7 @@ def _describe_evaluations(
 
 
 def _select_loop(recording: Recording, request: Request, selection: Selection) -> Selection:
-    """Return the steps of a loop in a request; by default all of them unless there are too many.
-
-    Raises:
-        RecordingError: an episode does not exist, or an evaluation is requested, of which a loop has none.
-    """
+    """Return the steps of a loop in a request; by default all of them unless there are too many."""
     if request.evaluations:
         raise RecordingError(
             f"{recording.path}: a loop has no numbered evaluations; --all exports all steps."

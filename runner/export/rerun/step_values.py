@@ -51,12 +51,7 @@ class StepValues:
 
 
 class StepValueReader:
-    """Reads the Q-values at the steps of a recorded run.
-
-    Args:
-        recording: the run.
-        placements: the states of each map; None for no maps.
-    """
+    """Reads the Q-values at the steps of a recorded run, with maps of placements if there are any."""
 
     def __init__(self, recording: Recording, placements: Placements | None) -> None:
         self._recording = recording
@@ -78,11 +73,7 @@ class StepValueReader:
         yield from np.split(block, [edge - first for edge in edges if 0 < edge - first < len(block)])
 
     def training(self, block: NDArray[np.void]) -> StepValues | None:
-        """Return the values before the update of each step of a part; None if they are unknown.
-
-        Raises:
-            RecordingError: the environment cannot have such steps.
-        """
+        """Return the values before the update of each step of a part; None if they are unknown."""
         replay = self._replay_at(int(block["step"][0]))
         if replay is None:
             return None

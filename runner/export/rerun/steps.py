@@ -32,16 +32,9 @@ PASSENGER_LABEL_Y: Final = 0.12
 
 
 class StepWriter(Sender):
-    """Sends the steps of one phase of a tabular run.
+    """Sends the steps of a phase of a tabular run: the grid, or without a scene states and actions as lines.
 
-    Args:
-        stream: the stream to send to.
-        root: the entity path of the run.
-        phase: `train` or `eval`.
-        mdp: the environment.
-        scene: the scene of the environment; None to send states and actions as series instead of a grid.
-        labels: the labels of the run.
-        learners: the names of the learners whose rewards are sent; empty for none.
+    The learners are those whose rewards are sent.
     """
 
     def __init__(

@@ -43,21 +43,13 @@ class ViewerError(RunnerError):
 
 
 def require_rerun(purpose: str) -> None:
-    """Check that Rerun is installed.
-
-    Raises:
-        MissingExtra: it is not.
-    """
+    """Check that Rerun is installed."""
     if importlib.util.find_spec("rerun") is None:
         raise missing("rerun", "all", purpose)
 
 
 def viewer_program() -> Path:
-    """Return the viewer's executable, which comes with the package.
-
-    Raises:
-        ViewerError: it is missing.
-    """
+    """Return the viewer's executable, which comes with the package."""
     import rerun_cli  # type: ignore[import-untyped,unused-ignore]
 
     folder = Path(rerun_cli.__file__).parent
@@ -73,11 +65,7 @@ def free_port() -> int:
 
 
 def check_port(port: int) -> int:
-    """Return the port if it is free, or any free port for 0.
-
-    Raises:
-        ViewerError: something listens on it.
-    """
+    """Return the port if it is free, or any free port for 0."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -90,12 +78,7 @@ def check_port(port: int) -> int:
 
 
 def check_address(url: str) -> str:
-    """Return the address of a viewer if something listens there.
-
-    Raises:
-        RunnerError: it is no address of a viewer.
-        ViewerError: nothing listens there.
-    """
+    """Return the address of a viewer if something listens there."""
     parts = urlsplit(url)
     try:
         if not parts.scheme.startswith("rerun") or parts.hostname is None:
@@ -116,16 +99,9 @@ def check_address(url: str) -> str:
 
 
 class Viewer:
-    """A viewer that listens on loopback.
+    """A viewer that listens on a port of loopback, and writes to a log; detached, it survives this program.
 
-    Args:
-        log: the file for its output.
-        port: the port it listens on.
-        options: more arguments of its command line.
-        detached: whether it survives the end of this program.
-
-    Raises:
-        ViewerError: it ended at once, or took too long to start.
+    The options are more arguments of its command line.
     """
 
     def __init__(self, log: Path, port: int, *options: str, detached: bool = False) -> None:
@@ -148,11 +124,7 @@ class Viewer:
             raise
 
     def wait_for(self, port: int) -> None:
-        """Wait until it listens on a port.
-
-        Raises:
-            ViewerError: it ended, or took too long.
-        """
+        """Wait until it listens on a port."""
         deadline = time.monotonic() + START_SECONDS
         while time.monotonic() < deadline and self.process.poll() is None:
             with contextlib.suppress(OSError), socket.create_connection((LOOPBACK, port), timeout=1):
@@ -161,11 +133,7 @@ class Viewer:
         raise self.error("does not start")
 
     def show(self, path: Path, step: int) -> ViewerClient:
-        """Open a file at a step, and return a client of the viewer.
-
-        Raises:
-            ViewerError: it does not answer.
-        """
+        """Open a file at a step, and return a client of the viewer."""
         from rerun.experimental import ViewerClient
 
         try:
@@ -200,11 +168,7 @@ class Viewer:
 
 @contextlib.contextmanager
 def viewer(port: int, *options: str) -> Iterator[Viewer]:
-    """Start a viewer that ends with the block.
-
-    Raises:
-        ViewerError: it cannot be started.
-    """
+    """Start a viewer that ends with the block."""
     with tempfile.TemporaryDirectory() as folder:
         started = Viewer(Path(folder) / "viewer.log", port, *options)
         try:
@@ -215,11 +179,7 @@ def viewer(port: int, *options: str) -> Iterator[Viewer]:
 
 @contextlib.contextmanager
 def headless(path: Path, step: int, size: str = "1600x900") -> Iterator[ViewerClient]:
-    """Start a viewer without a screen, and yield its client when it has drawn a file at a step.
-
-    Raises:
-        ViewerError: it cannot be started.
-    """
+    """Start a viewer without a screen, and yield its client when it has drawn a file at a step."""
     with viewer(free_port(), "--headless", "--hide-welcome-screen", "--window-size", size) as started:
         client = started.show(path, step)
         time.sleep(DRAW_SECONDS)
@@ -229,12 +189,7 @@ def headless(path: Path, step: int, size: str = "1600x900") -> Iterator[ViewerCl
 
 
 def screenshot(path: Path, step: int, picture: Path, size: str = "1600x900") -> None:
-    """Draw a file at a step into a PNG.
-
-    Raises:
-        ViewerError: the viewer cannot be started, or draws nothing.
-        StorageError: the picture cannot be written.
-    """
+    """Draw a file at a step into a PNG."""
     with tempfile.TemporaryDirectory() as folder:
         drawn = Path(folder) / "screenshot.png"
         with headless(path, step, size) as client:
@@ -246,11 +201,7 @@ def screenshot(path: Path, step: int, picture: Path, size: str = "1600x900") -> 
 
 
 def live_window(port: int) -> str:
-    """Open a window that stays when this program ends; return the address that runs can be sent to.
-
-    Raises:
-        ViewerError: it cannot be started.
-    """
+    """Open a window that stays when this program ends; return the address that runs can be sent to."""
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "viewer.log"
         started = Viewer(log, port, "--hide-welcome-screen", detached=True)
@@ -261,11 +212,7 @@ def live_window(port: int) -> str:
 
 
 def open_window(path: Path, step: int, port: int) -> None:
-    """Show a file at a step in a window, until it is closed.
-
-    Raises:
-        ViewerError: the viewer cannot be started.
-    """
+    """Show a file at a step in a window, until it is closed."""
     with viewer(port, "--hide-welcome-screen") as started:
         started.show(path, step)
         if code := started.process.wait():
@@ -274,11 +221,7 @@ def open_window(path: Path, step: int, port: int) -> None:
 
 @contextlib.contextmanager
 def web_viewer(port: int, path: Path | None = None) -> Iterator[tuple[Viewer, str]]:
-    """Serve the web viewer on loopback, and a file; yield the viewer and the address to open.
-
-    Raises:
-        ViewerError: it cannot be started.
-    """
+    """Serve the web viewer on loopback, and a file; yield the viewer and the address to open."""
     data = free_port()
     files = [str(path.resolve())] if path else []
     with viewer(data, "--serve-web", "--web-viewer-port", str(port), *files) as started:

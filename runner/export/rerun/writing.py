@@ -25,18 +25,7 @@ from runner.util.files import storage_errors
 def export(
     sources: Sequence[Source], request: Request, path: Path, stage: Callable[[str], None] = lambda _: None
 ) -> list[Selection]:
-    """Write runs to an `.rrd` file; return the selection of each.
-
-    Args:
-        sources: the runs.
-        request: the steps to export.
-        path: the file.
-        stage: called with what is being done, where that takes long.
-
-    Raises:
-        RecordingError: a recording cannot be read, or does not have what is requested.
-        StorageError: the file cannot be written.
-    """
+    """Write runs to an `.rrd` file; return the selection of each. `stage` is called with what takes long."""
     selections = [select(source.recording, request) for source in sources]
     stream = new_stream("-".join(source.recording.run_id for source in sources))
     with _saved(stream, path):

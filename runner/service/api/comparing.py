@@ -63,12 +63,7 @@ def explanation(pair: Part, metric: Part, settings: SettingsOf) -> dict[str, obj
 
 
 def found_explanation(pair: str, metric: str, settings: Settings) -> Explanation:
-    """Return an explanation in the recordings folders.
-
-    Raises:
-        RunNotFound: there is none.
-        RunnerError: its file is damaged.
-    """
+    """Return an explanation in the recordings folders."""
     name = f"{pair}/{metric}"
     folder = next((folder for folder in settings.recordings if name in explanations_in(folder)), None)
     if folder is None:
@@ -153,14 +148,7 @@ async def compare(
 async def found_runs(catalogue: Catalogue, names: list[str], several: bool = False) -> list[Run]:
     """Return the runs of some names, their recordings restored if they are archived.
 
-    Args:
-        catalogue: the catalogue.
-        names: the names of runs.
-        several: whether a name means all runs of that name, each once.
-
-    Raises:
-        RunNotFound: a name matches no run, or several and may not.
-        RecordingError: a run has no recording.
+    With `several`, a name means all runs of that name, each once.
     """
 
     def find() -> list[Run]:

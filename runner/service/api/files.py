@@ -131,12 +131,7 @@ async def replay_of(
     evaluations: tuple[int, ...] = (),
     every: int = 0,
 ) -> pathlib.Path:
-    """Return the export of some runs, made in a child process, once for all concurrent requests.
-
-    Raises:
-        Refused: a range of episodes is invalid.
-        RecordingError: a recording does not contain what is requested.
-    """
+    """Return the export of some runs, made in a child process, once for all concurrent requests."""
     request = Request(_ranges(episodes), evaluations, every)
     key = ("replay", *map(recording_state, runs), request)
     path = await cache.get_or_await(key, lambda: processes(computed.replay, runs, request), max_seconds=0)

@@ -94,11 +94,7 @@ _YAML: Final[dict[str, object]] = {
 
 
 async def text_of(request: Request) -> str:
-    """Return the text in the body of a request, whatever its media type.
-
-    Raises:
-        Refused: it is not UTF-8.
-    """
+    """Return the text in the body of a request, whatever its media type."""
     content = await request.body()
     try:
         return content.decode("utf-8-sig")

@@ -354,11 +354,7 @@ def _refuse_both(step: int | None, episode: int | None) -> None:
 
 
 def _stop(start: int, stop: int | None, total: int, limit: int) -> int:
-    """Return the end of a range.
-
-    Raises:
-        Refused: the range is too long.
-    """
+    """Return the end of a range."""
     stop = min(start + DEFAULT_RECORDS if stop is None else stop, total)
     if stop - start > limit:
         raise too_many(stop - start, limit)

@@ -168,19 +168,7 @@ def _pictured_episode(run: Run, which: tuple[int, ...]) -> _PicturedEpisode:
 async def part_of(
     run: Run, cache: CacheOf, processes: ProcessesOf, which: tuple[int, ...], start: int, steps: int = STEPS
 ) -> bytes:
-    """Return a part of an episode as JSON.
-
-    Args:
-        run: the run.
-        cache: the cached responses.
-        processes: the pool that does the work.
-        which: (episode,) of training, or (training episodes before, trial) of an evaluation.
-        start: the first step.
-        steps: the largest number of steps.
-
-    Raises:
-        RecordingError: there is no such episode or step.
-    """
+    """Return a part of an episode as JSON; `which` as for `place_of`."""
     key = ("replay part", recording_state(run), which, start, steps)
     return await cache.get_or_await(
         key, lambda: processes(fragments.episode_part, run.recording, which, start, steps), LONG

@@ -58,15 +58,9 @@ class CheckedJob:
 
 
 def check(text: str, source: str, recordings: Path) -> CheckedJob:
-    """Return the meaning of the text of a configuration or a sweep.
+    """Return the meaning of the text of a YAML file, a configuration or a sweep.
 
-    Args:
-        text: the text of a YAML file.
-        source: the file's name, for messages; the default name of the job.
-        recordings: the folder that its runs would be stored in.
-
-    Raises:
-        ConfigError: it cannot be used; a line for each problem, with line, column and key.
+    `source` is the file's name, for messages and as the default name of the job.
     """
     document = read_yaml(text, source)
     is_sweep = isinstance(document.value, Mapping) and not document.value.keys().isdisjoint(SWEEP_KEYS)
@@ -116,11 +110,7 @@ def _check_sweep(text: str, source: str, document: Document, recordings: Path) -
 
 
 def _refuse_paths(starts: Mapping[tuple[str | int, ...], object], document: Document) -> None:
-    """Refuse an initial Q-table that is named by the path of its recording.
-
-    Raises:
-        ConfigError: one is.
-    """
+    """Refuse an initial Q-table that is named by the path of its recording."""
     problems = []
     for where, start in starts.items():
         run = start.get("run") if isinstance(start, Mapping) else start
@@ -132,11 +122,7 @@ def _refuse_paths(starts: Mapping[tuple[str | int, ...], object], document: Docu
 
 
 class JobChecker:
-    """Checks texts in a few child processes; thread-safe.
-
-    Args:
-        recordings: the folder that runs would be stored in.
-    """
+    """Checks texts in a few child processes; thread-safe."""
 
     def __init__(self, recordings: Path) -> None:
         self._recordings = recordings
@@ -144,12 +130,7 @@ class JobChecker:
         self.close = self._pool.close
 
     async def check(self, text: str, source: str = DEFAULT_SOURCE) -> CheckedJob:
-        """Return the meaning of a text, without blocking a thread of the server; see the function `check`.
-
-        Raises:
-            ConfigError: as for `check`, or it is too large, or its check took too much time or memory.
-            Busy: other texts were being checked all the time.
-        """
+        """Return the meaning of a text, without blocking a thread of the server; see the function `check`."""
         if len(text) > MAX_BYTES or len(text.encode()) > MAX_BYTES:
             raise ConfigError(f"{source}: larger than 1 MiB, expected a configuration of a few kilobytes")
         future = self._pool.submit(_check_as_config_errors, text, source, self._recordings)

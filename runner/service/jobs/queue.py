@@ -30,18 +30,7 @@ class QueueStatus:
 
 
 class JobQueue:
-    """The jobs of a recordings folder; thread-safe.
-
-    Args:
-        recordings: the folder; created if it is missing.
-        workers: how many processes train at once.
-        max_unfinished: the maximum number of unfinished jobs.
-        ray: the address of a Ray cluster that does the work instead.
-
-    Raises:
-        RunnerError: another process serves the folder, or Ray is not installed.
-        StorageError: the folder cannot be written.
-    """
+    """The jobs of a recordings folder, done by worker processes or on a Ray cluster; thread-safe."""
 
     def __init__(
         self, recordings: Path, workers: int, *, max_unfinished: int = 1000, ray: str | None = None
@@ -70,13 +59,7 @@ class JobQueue:
         self.store.close()
 
     def add(self, text: str, checked: CheckedJob) -> Job:
-        """Queue a text that was checked.
-
-        Raises:
-            QueueFull: there are too many unfinished jobs.
-            StorageError: the disk would not hold its recordings.
-            JobStateConflict: a sweep of this name is unfinished.
-        """
+        """Queue a text that was checked."""
         free = free_bytes(self.recordings)
         if checked.bytes > free:
             raise StorageError(
@@ -91,12 +74,7 @@ class JobQueue:
             )
 
     def cancel(self, number: int) -> Job:
-        """Cancel a job; its worker closes its recording, which stays.
-
-        Raises:
-            JobNotFound: there is none.
-            JobStateConflict: it is over.
-        """
+        """Cancel a job; its worker closes its recording, which stays."""
         with self.store.lock:
             job = self.store.job(number)
             if job.is_over:
@@ -108,13 +86,7 @@ class JobQueue:
     def resume(self, number: int, accept_changes: bool = False) -> Job:
         """Queue a failed or cancelled job again; it continues where it stopped.
 
-        Args:
-            number: the job's number.
-            accept_changes: resume runs that were started by other code.
-
-        Raises:
-            JobNotFound: there is none.
-            JobStateConflict: it is finished, or not over yet.
+        Runs that other code started are resumed only if the changes are accepted.
         """
         with self.store.lock:
             job = self.store.job(number)

@@ -127,16 +127,7 @@ class JobStore:
     """The jobs of a recordings folder; thread-safe. One process at a time has it.
 
     The jobs themselves are held in memory too: the scheduler reads them several times a second, and a full
-    disk does not stop it.
-
-    Args:
-        recordings: the recordings folder.
-        max_unfinished: the maximum number of unfinished jobs.
-        max_over: how many jobs that are over to remember.
-
-    Raises:
-        RunnerError: another process has it.
-        StorageError: the folder or the database cannot be used.
+    disk does not stop it. Of jobs that are over, `max_over` are remembered.
     """
 
     def __init__(self, recordings: Path, max_unfinished: int = 1000, max_over: int = 1000) -> None:
@@ -181,11 +172,7 @@ class JobStore:
             return list(self._jobs.values())
 
     def job(self, number: int) -> Job:
-        """Return a job.
-
-        Raises:
-            JobNotFound: there is none.
-        """
+        """Return a job."""
         with self.lock:
             if number not in self._jobs:
                 raise JobNotFound(f"no job {number}; `dualtaxi remote jobs` and the page /queue list them.")
@@ -202,17 +189,8 @@ class JobStore:
     ) -> Job:
         """Append a job to the queue, on disk, and return it.
 
-        Args:
-            kind: a configuration or a sweep.
-            name: its name.
-            runs: the number of its runs.
-            submitted: the text as it was submitted.
-            values: the configuration or sweep, every value present.
-            keep: numbers of jobs not to forget although they are over: a worker is still closing them.
-
-        Raises:
-            QueueFull: there are too many unfinished jobs.
-            StorageError: it cannot be written; then it is not in the queue.
+        The text is `submitted`, `values` what it means, every value present; jobs of the numbers in `keep`
+        are not forgotten although they are over: a worker is still closing them.
         """
         with self.lock:
             unfinished = sum(not job.is_over for job in self._jobs.values())
@@ -269,12 +247,7 @@ class JobStore:
     def events(self, number: int, after: int = 0) -> tuple[list[JobEvent], int]:
         """Return a job's next events, not all if there are many, and the id of the last one.
 
-        Args:
-            number: the job's number.
-            after: the id of the last event seen; 0, or what is no event of the job, for the first ones.
-
-        Raises:
-            JobNotFound: there is no such job.
+        They follow the event of the id `after`; 0, or what is no event of the job, is before the first ones.
         """
         with self.lock:
             self.job(number)
@@ -288,11 +261,7 @@ class JobStore:
             return events, rows[-1][0] if rows else after
 
     def last_events(self, number: int, limit: int) -> tuple[list[JobEvent], int]:
-        """Return the last events of a job, and the id of the last one.
-
-        Raises:
-            JobNotFound: there is no such job.
-        """
+        """Return the last events of a job, and the id of the last one."""
         with self.lock:
             self.job(number)
             query = _EventRow.select(_EventRow.id).where(_EventRow.job == number)
@@ -307,11 +276,7 @@ class JobStore:
             return dict(sorted((int(seed), run_id) for seed, run_id in self._tuples(query)))
 
     def reserve_runs(self, number: int, run_ids: Mapping[int, str]) -> None:
-        """Store the ids of runs by seed before they are made, so that no run is started twice.
-
-        Raises:
-            StorageError: they cannot be written.
-        """
+        """Store the ids of runs by seed before they are made, so that no run is started twice."""
         with self.lock, self._transaction("free some disk"):
             for seed, run_id in run_ids.items():
                 self._insert_run(number, seed, run_id, started=False)
@@ -323,11 +288,7 @@ class JobStore:
             self._insert_events(number, [RunEvent(run_id, seed, now())])
 
     def submitted(self, number: int) -> str:
-        """Return the text of a job as it was submitted.
-
-        Raises:
-            JobNotFound: there is no such job.
-        """
+        """Return the text of a job as it was submitted."""
         self.job(number)
         return self._column(number, _JobRow.submitted)
 
@@ -369,13 +330,7 @@ class JobStore:
 def lock_folder(recordings: Path, lock_file: str) -> FileLock:
     """Lock a part of a recordings folder against other processes, until it is released or this one ends.
 
-    Args:
-        recordings: the recordings folder; created if it is missing.
-        lock_file: the lock file of the part, relative to the folder.
-
-    Raises:
-        RunnerError: another process has it.
-        StorageError: the folder cannot be written.
+    The lock file is relative to the folder, which is created if it is missing.
     """
     busy = f"{recordings} is served by another process already; stop it, or choose another --recordings."
     return acquired(recordings / lock_file, RunnerError(busy))

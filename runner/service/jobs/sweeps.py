@@ -27,11 +27,7 @@ from runner.sweep.task import Result, Task
 
 
 def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
-    """Run what is left of a sweep.
-
-    Raises:
-        RunnerError: it cannot be run, or another process runs it.
-    """
+    """Run what is left of a sweep."""
     sweep = from_values(spec.values)
     with _locked_sweep(spec, channel.stop):
         exists = spec.name in sweeps_in(spec.recordings)
@@ -65,11 +61,7 @@ def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
 
 @contextlib.contextmanager
 def _locked_sweep(spec: JobSpec, stop: Callable[[], bool]) -> Iterator[None]:
-    """Keep every other process from running the sweep; wait for one that is about to stop.
-
-    Raises:
-        RunnerError: one still runs it after a minute.
-    """
+    """Keep every other process from running the sweep; wait for one that is about to stop."""
     deadline = time.monotonic() + OTHER_OWNER_SECONDS
     with contextlib.ExitStack() as stack:
         while True:
@@ -95,12 +87,7 @@ def _workers(spec: JobSpec, channel: PipeChannel, runs: int) -> Iterator[Workers
 
 
 class SlottedWorkers:
-    """Workers of which at most as many are busy as the server grants slots at the moment.
-
-    Args:
-        workers: the workers.
-        channel: the source of the number of slots; receives how many are in use.
-    """
+    """Workers of which at most as many are busy as the server grants slots at the moment."""
 
     def __init__(self, workers: Workers[Task, Result], channel: PipeChannel) -> None:
         self._workers, self._channel = workers, channel

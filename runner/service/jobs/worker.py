@@ -53,11 +53,7 @@ def work(pipe: Connection, spec: JobSpec) -> None:
 
 
 def run_config_job(spec: JobSpec, channel: JobChannel) -> Outcome:
-    """Run what is left of a configuration's seeds, one after the other.
-
-    Raises:
-        RunnerError: a run failed or cannot be resumed.
-    """
+    """Run what is left of a configuration's seeds, one after the other."""
     config = from_mapping(spec.values)
     run = run_seed if spec.ray is None else run_seed_on_ray
     for seed in config.seeds:
@@ -92,14 +88,7 @@ def _existing_run(folder: Path) -> Run | None:
 
 
 class Reporter:
-    """Sends a run's progress, a few times a second, and each line of its log.
-
-    Args:
-        channel: where to send it.
-        run_id: the run's id.
-        config: the job's configuration.
-        seed: the run's seed.
-    """
+    """Sends a run's progress, a few times a second, and each line of its log."""
 
     def __init__(self, channel: JobChannel, run_id: str, config: ExperimentConfig, seed: int) -> None:
         self._channel = channel
@@ -138,11 +127,7 @@ class Reporter:
 
 
 def run_seed_on_ray(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed: int) -> str:
-    """Run a seed in a Ray actor, and forward its messages; return the run's status.
-
-    Raises:
-        RunnerError: the cluster cannot be reached, the run fails, or the actor dies.
-    """
+    """Run a seed in a Ray actor, and forward its messages; return the run's status."""
     ray = connect(spec.ray)
     try:
         actor = start_actor(ray)

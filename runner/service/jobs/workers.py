@@ -57,14 +57,9 @@ class _Worker:
 
 
 class WorkerPool:
-    """Runs the queued jobs of a store, each in a worker process.
+    """Runs the queued jobs of a store, each in a worker process, or on a Ray cluster.
 
     One thread starts the workers and receives their messages; the other methods read, or send a request.
-
-    Args:
-        store: the jobs.
-        size: how many processes train at once.
-        ray: the address of a Ray cluster that does the work instead.
     """
 
     def __init__(self, store: JobStore, size: int, ray: str | None) -> None:
@@ -156,12 +151,7 @@ class WorkerPool:
         self._store.set_state(job.number, "running", started=job.started or now())
 
     def _start_worker(self, job: Job) -> _Worker:
-        """Start the worker process of a job.
-
-        Raises:
-            OSError: the system has no process, pipe or memory for it.
-            StorageError: the ids of its runs cannot be stored.
-        """
+        """Start the worker process of a job."""
         values = self._store.values(job.number)
         spec = JobSpec(
             number=job.number,

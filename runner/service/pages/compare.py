@@ -279,11 +279,7 @@ async def replay(
 
 
 async def _chosen(catalogue: CatalogueOf, names: list[str] | None) -> list[Run]:
-    """Return the runs to compare.
-
-    Raises:
-        RunnerError: there are fewer than two of them, or too many.
-    """
+    """Return the runs to compare."""
     names = list(dict.fromkeys(names or []))
     if not 2 <= len(names) <= MAX_RUNS:
         raise RunnerError(

@@ -52,11 +52,7 @@ def trial_environments(
 
 
 def _environments(run: Run, at: StepRef) -> _EnvironmentsView:
-    """Return the page of an episode and those of the other environments at its first step.
-
-    Raises:
-        RecordingError: there is no such episode.
-    """
+    """Return the page of an episode and those of the other environments at its first step."""
     base = f"/runs/{run.run_id}/replay"
     with open_recording(run.recording) as recording:
         place = place_of(recording, (at.episode,) if at.after is None else (at.after, at.episode))

@@ -100,11 +100,7 @@ def _age(moment: datetime | str) -> str:
 
 
 async def form_of(request: Request) -> dict[str, str]:
-    """Return the fields of a form as text, with the line ends of files.
-
-    Raises:
-        RunnerError: the body is not a form.
-    """
+    """Return the fields of a form as text, with the line ends of files."""
     body = await request.body()
     try:
         pairs = parse_qsl(

@@ -109,11 +109,7 @@ def viewer_file(number: str, name: str) -> Response:
 
 
 def version() -> str:
-    """Return the version of the installed viewer.
-
-    Raises:
-        MissingExtra: it is not installed.
-    """
+    """Return the version of the installed viewer."""
     try:
         return metadata.version("rerun-sdk")
     except metadata.PackageNotFoundError as error:
@@ -121,12 +117,7 @@ def version() -> str:
 
 
 def viewer_files() -> Path:
-    """Return the folder of the viewer's files, which are fetched from the package on first use.
-
-    Raises:
-        ViewerError: the viewer cannot be started.
-        StorageError: the cache cannot be written.
-    """
+    """Return the folder of the viewer's files, which are fetched from the package on first use."""
     folder = cache_folder() / "viewer" / version()
     if all((folder / name).is_file() for name in FILES):
         return folder

@@ -68,11 +68,7 @@ def version() -> str:
 
 
 def address(name: str) -> str:
-    """Return the address of a file.
-
-    Raises:
-        KeyError: there is no file of that name.
-    """
+    """Return the address of a file."""
     assets()[name]
     return f"/static/{version()}/{name}"
 
