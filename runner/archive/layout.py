@@ -141,10 +141,7 @@ SCHEMAS: Final = {
         ]
     ),
     FRAMES: pa.schema(
-        [
-            *(*PLACED_IN_PHASE, ("format", pa.string()), ("data", pa.binary())),
-            (FRAME_ID, pa.string()),
-        ]
+        [*(*PLACED_IN_PHASE, ("format", pa.string()), ("data", pa.binary())), (FRAME_ID, pa.string())]
     ),
 }
 """The columns of the tables that are the same in every archive."""

@@ -105,8 +105,7 @@ class Settings(Section):
         default=None, description="One table over joint actions, or one for each agent. Follows `rewards`."
     )
     rewards: Optional[Rewards] = Field(
-        default=None,
-        description="The team's summed reward for all, or each agent's own. Follows `tables`.",
+        default=None, description="The team's summed reward for all, or each agent's own. Follows `tables`."
     )
     algorithm: Algorithm = Field(
         default="q_learning",

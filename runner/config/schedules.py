@@ -17,14 +17,12 @@ from runner.errors import nearest
 from runner.util.values import Json
 
 By = Annotated[
-    Literal["episode", "step"],
-    Field(description="What n counts: training episodes, or training steps."),
+    Literal["episode", "step"], Field(description="What n counts: training episodes, or training steps.")
 ]
 Floor = Annotated[Fraction, Field(description="The value never falls below this.")]
 Start = Annotated[Fraction, Field(description="The value at n = 0.")]
 Point = Annotated[
-    tuple[Annotated[int, Field(ge=0, le=10**12)], Fraction],
-    Field(strict=False, description="[n, value]"),
+    tuple[Annotated[int, Field(ge=0, le=10**12)], Fraction], Field(strict=False, description="[n, value]")
 ]
 
 

@@ -107,8 +107,7 @@ _InitialTable = Annotated[
     Discriminator(_table_kind),
 ]
 InitialTable = Annotated[
-    _InitialTable,
-    BeforeValidator(_spelled_out, json_schema_input_type=Literal["random"] | _InitialTable),
+    _InitialTable, BeforeValidator(_spelled_out, json_schema_input_type=Literal["random"] | _InitialTable)
 ]
 
 
@@ -271,8 +270,7 @@ class WolfPhc(AlgorithmSection):
     algorithm = "wolf_phc"
 
     win: StepSize = Field(
-        default=0.05,
-        description="Probability that an update moves while the policy wins; at most `lose`.",
+        default=0.05, description="Probability that an update moves while the policy wins; at most `lose`."
     )
     lose: StepSize = Field(
         default=0.2, description="Probability that an update moves while the policy loses."

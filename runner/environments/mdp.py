@@ -132,11 +132,7 @@ class Mdp:
 
 
 def step_counts(
-    mdp: Mdp,
-    rewards: NDArray[np.float64],
-    state: Indices,
-    action: Indices,
-    next_state: Indices,
+    mdp: Mdp, rewards: NDArray[np.float64], state: Indices, action: Indices, next_state: Indices
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return events and penalties of steps, [N, events + 1], and which rewards the table excludes, [N].
 

@@ -125,10 +125,7 @@ def _frozen_lake(_: str, base: Any, arrays: Arrays) -> GridWorld:
             actions=("left", "down", "right", "up"),
         ),
         **_one_player(len(tiles)),
-        happens={
-            "goal": _arrives(arrays, tiles == b"G"),
-            "hole": _arrives(arrays, tiles == b"H"),
-        },
+        happens={"goal": _arrives(arrays, tiles == b"G"), "hole": _arrives(arrays, tiles == b"H")},
         success_events=("goal",),
         agents=("player",),
     )
@@ -145,10 +142,7 @@ def _cliff(_: str, base: Any, arrays: Arrays) -> GridWorld:
             actions=("up", "right", "down", "left"),
         ),
         **_one_player(tiles.size),
-        happens={
-            "goal": _arrives(arrays, tiles.ravel() == b"G"),
-            "fall": arrays["rewards"][..., 0] <= _FALL,
-        },
+        happens={"goal": _arrives(arrays, tiles.ravel() == b"G"), "fall": arrays["rewards"][..., 0] <= _FALL},
         success_events=("goal",),
         penalty_below=-1.0,
         agents=("player",),

@@ -24,15 +24,7 @@ from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.errors import ConfigError, Diverged, RecordingError, RunnerError, truncated_message
 from runner.execution.initial_tables import configured_tables, recorded_tables, resolve_job
-from runner.execution.session import (
-    Report,
-    Session,
-    Stop,
-    describe,
-    evaluation_brief,
-    execute,
-    recorder_for,
-)
+from runner.execution.session import Report, Session, Stop, describe, evaluation_brief, execute, recorder_for
 from runner.execution.verify import differing_environment
 from runner.learning.learner import Held, Learner
 from runner.recording import schema
@@ -127,10 +119,7 @@ def _resume(run: Run, accept_changes: bool, report: Report, stop: Stop) -> Run:
     proof = run.summary.content_digest if run.status == "finished" else run.file.proof
     run = run.update(status="running", owner=owner(), summary={}, proof=str(proof) if proof else None)
     try:
-        with (
-            _opened(path, contents, job, run, learner, changes) as file,
-            open_recording(path) as recording,
-        ):
+        with _opened(path, contents, job, run, learner, changes) as file, open_recording(path) as recording:
             reference = Reference(recording, without_steps=job.config.recording.steps == "none")
             is_recorded = any(entry.name == CODE_RECORD for entry in contents.metadata)
             code = CodeCollector(run.folder.parent, job.config.recording.code and not is_recorded)

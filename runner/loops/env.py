@@ -30,11 +30,7 @@ class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
     env: Env
 
     def __init__(
-        self,
-        env: Env,
-        loop: Loop[Rows],
-        phase: str = "train",
-        owner: RecordedEnv | None = None,
+        self, env: Env, loop: Loop[Rows], phase: str = "train", owner: RecordedEnv | None = None
     ) -> None:
         gymnasium.Wrapper.__init__(self, env)
         self._owner = owner

@@ -242,10 +242,7 @@ class Extras:
         self._partial = {row - n: names for row, names in self._partial.items() if row >= n}
 
     def _send(
-        self,
-        steps: NDArray[np.int64],
-        columns: Mapping[str, Array],
-        given: Mapping[str, NDArray[np.bool_]],
+        self, steps: NDArray[np.int64], columns: Mapping[str, Array], given: Mapping[str, NDArray[np.bool_]]
     ) -> None:
         """Hand the values with these steps, and whether each was given, to the recorder."""
         topic, recorder = _TOPICS[self._phase], self._recorder

@@ -16,12 +16,7 @@ from runner.planning.evaluation import (
     random_policy,
 )
 from runner.planning.optimality import ExactEvaluator
-from runner.planning.optimum import (
-    best_response,
-    best_response_to_stochastic,
-    greedy_policy,
-    optimal_values,
-)
+from runner.planning.optimum import best_response, best_response_to_stochastic, greedy_policy, optimal_values
 
 __all__ = [
     "Cycle",

@@ -122,10 +122,7 @@ class _Compaction:
 
 
 def compacted(
-    file: RecordingFile,
-    packing: Packing,
-    steps: Mapping[Topic, np.dtype[np.void]],
-    environments: int,
+    file: RecordingFile, packing: Packing, steps: Mapping[Topic, np.dtype[np.void]], environments: int
 ) -> tuple[RecordingFile, dict[str, int]]:
     """Return a recording in place of one that is complete but for its result, and its messages with actions.
 

@@ -275,13 +275,7 @@ class _Phase:
         return sums + np.where(b.continues[:, np.newaxis], self._state.counts[b.owner], 0)
 
     def _check_episodes(
-        self,
-        b: Block,
-        lengths: Ints,
-        returns: Floats,
-        counts: Ints | None,
-        ended: Bools,
-        interrupted: Bools,
+        self, b: Block, lengths: Ints, returns: Floats, counts: Ints | None, ended: Bools, interrupted: Bools
     ) -> None:
         """Compare the records of the episodes that ended in a block with its steps.
 

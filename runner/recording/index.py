@@ -17,15 +17,7 @@ import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import (
-    AttachmentIndex,
-    Channel,
-    Footer,
-    Header,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
+from mcap.records import AttachmentIndex, Channel, Footer, Header, MetadataIndex, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import RecordingError

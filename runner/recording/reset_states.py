@@ -85,12 +85,7 @@ def decode_reset_state(payload: bytes) -> ResetState:
         inner = {"state": int.from_bytes(state, "little"), "inc": int.from_bytes(increment, "little")}
         if not inner["inc"] % 2 or has_uint32 > 1:
             raise RecordingError("found the state of a random generator that no PCG64 has")
-        generator = {
-            "bit_generator": "PCG64",
-            "state": inner,
-            "has_uint32": has_uint32,
-            "uinteger": uinteger,
-        }
+        generator = {"bit_generator": "PCG64", "state": inner, "has_uint32": has_uint32, "uinteger": uinteger}
     return ResetState(
         reset=fields["reset"],
         environment=fields["environment"],

@@ -53,10 +53,7 @@ def _probe(
 
 
 def _with_inferred(
-    index: Index,
-    store: RecordStore,
-    dtypes: Mapping[Topic, np.dtype[np.void]],
-    channels: NDArray[np.uint16],
+    index: Index, store: RecordStore, dtypes: Mapping[Topic, np.dtype[np.void]], channels: NDArray[np.uint16]
 ) -> NDArray[np.uint16]:
     """Return the channels of all chunks, those of full chunks inferred; as they were if the counts disagree.
 

@@ -137,10 +137,7 @@ def _made_vector(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
     assert maker.vector is not None
     if maker.vector.mode == "custom":
         spec, registered = _registered(maker, trust)
-        settings = spec.kwargs | {
-            "num_envs": maker.vector.number,
-            "vectorization_mode": "vector_entry_point",
-        }
+        settings = spec.kwargs | {"num_envs": maker.vector.number, "vectorization_mode": "vector_entry_point"}
         settings |= {"render_mode": "rgb_array"} if render else {}
         limit = spec.kwargs.get("max_episode_steps", spec.max_episode_steps)
         envs = gymnasium.make_vec(dataclasses.replace(registered, kwargs=settings, max_episode_steps=limit))

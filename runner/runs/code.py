@@ -38,10 +38,7 @@ _FRESH_SECONDS: Final = 10.0
 _SETTINGS: Final = frozenset({".toml", ".yaml", ".yml", ".json", ".cfg", ".ini", ".xml"})
 """Suffixes of untracked files that are recorded, unless they have the name of a secret."""
 _SOURCES: Final = _SETTINGS | frozenset(
-    {
-        *(".py", ".pyx", ".pyi", ".c", ".cc", ".cpp", ".cu", ".h", ".hpp"),
-        *(".rs", ".jl", ".sh", ".gin"),
-    }
+    {*(".py", ".pyx", ".pyi", ".c", ".cc", ".cpp", ".cu", ".h", ".hpp"), *(".rs", ".jl", ".sh", ".gin")}
 )
 """Suffixes of all untracked files that are recorded."""
 _CELLS: Final = "notebook-cells.py"

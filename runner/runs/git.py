@@ -69,9 +69,7 @@ class Repository:
 
 
 def read_repository(
-    folder: Path,
-    used: Callable[[Path], Sequence[str]] = lambda _: (),
-    seconds: float = GIT_SECONDS,
+    folder: Path, used: Callable[[Path], Sequence[str]] = lambda _: (), seconds: float = GIT_SECONDS
 ) -> Repository:
     """Return the state of the repository that a folder is in.
 

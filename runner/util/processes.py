@@ -88,10 +88,7 @@ class ChildProcess:
     """
 
     def __init__(
-        self,
-        memory_bytes: int,
-        context: Any = None,
-        on_progress: Callable[[Any], None] = lambda _: None,
+        self, memory_bytes: int, context: Any = None, on_progress: Callable[[Any], None] = lambda _: None
     ) -> None:
         self._memory_bytes = memory_bytes
         self._on_progress = on_progress
