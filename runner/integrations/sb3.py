@@ -29,7 +29,6 @@ require_tested("stable_baselines3", "sb3", ("2.9", "2.9"))
 from stable_baselines3.common.base_class import BaseAlgorithm  # noqa: E402
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback  # noqa: E402
 from stable_baselines3.common.logger import KVWriter  # noqa: E402
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm  # noqa: E402
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv  # noqa: E402
 
 from runner.loops.recorded_vec_env import RecordedVecEnv  # noqa: E402
@@ -185,15 +184,16 @@ class Recording(BaseCallback):  # type: ignore[misc]
             )
         formats = self.logger.output_formats
         formats[:] = [one for one in formats if not isinstance(one, _LogWriter)]
-        formats.append(_LogWriter(self.recorded))
+        self._writer = _LogWriter(self.recorded)
+        formats.append(self._writer)
 
     def _on_training_start(self) -> None:
         self._next_checkpoint = self.num_timesteps + self._checkpoint_every
+        self._updates = self.model._n_updates
 
     def _on_rollout_start(self) -> None:
-        if isinstance(self.model, OnPolicyAlgorithm):
-            for writer in [one for one in self.logger.output_formats if isinstance(one, _LogWriter)]:
-                writer.write_update(self.logger.name_to_value)
+        self._writer.write_update(self.logger.name_to_value)
+        self._updates = self.model._n_updates
 
     def _on_step(self) -> bool:
         if self._checkpoint_every and self.num_timesteps >= self._next_checkpoint:
@@ -203,10 +203,9 @@ class Recording(BaseCallback):  # type: ignore[misc]
         return not self.recorded.should_stop
 
     def _on_training_end(self) -> None:
-        logger = self.logger
-        for writer in [one for one in logger.output_formats if isinstance(one, _LogWriter)]:
-            writer.log(logger.name_to_value)  # of the last update, which the library does not write
-            logger.output_formats.remove(writer)
+        has_updated = self.model._n_updates != self._updates
+        self._writer.write_rest(self.logger.name_to_value, has_updated)
+        self.logger.output_formats.remove(self._writer)
         if self._checkpoint_every:
             self._checkpoint()
         if not self._stays_open:
@@ -240,14 +239,14 @@ class Recording(BaseCallback):  # type: ignore[misc]
 class _LogWriter(KVWriter):  # type: ignore[misc]
     """Records what the library's logger writes: numbers and texts.
 
-    An on-policy model writes the numbers of an update one rollout later, with those of the rollout. Here they
-    are recorded at the step of the update.
+    A model writes the numbers of an update later, with those of the next rollout or episode. Here those of
+    the first update after each time that it writes are recorded, and those of the last, at their own steps.
     """
 
     def __init__(self, recorded: RecordedVector) -> None:
         self._recorded = recorded
         self._of_updates: set[str] = set()
-        """The names that are recorded at the step of the update."""
+        """The names of the numbers of updates."""
         self._is_update_due = False
         """Whether the library wrote, so that the next update is recorded."""
 
@@ -257,12 +256,22 @@ class _LogWriter(KVWriter):  # type: ignore[misc]
         self._is_update_due = True
 
     def write_update(self, key_values: Mapping[str, object]) -> None:
-        """Record the numbers of an update, after each time that the library writes."""
+        """Record the numbers of the update that was just done, if the library wrote since the last one."""
         if not self._of_updates:
             self._of_updates = {name for name in key_values if name.startswith("train/")}
-        if self._is_update_due:
+        if self._is_update_due and not self._of_updates.isdisjoint(key_values):
             self.log({name: value for name, value in key_values.items() if name in self._of_updates})
             self._is_update_due = False
+
+    def write_rest(self, key_values: Mapping[str, object], has_updated: bool) -> None:
+        """Record at the end what the library does not write any more.
+
+        Args:
+            key_values: numbers and texts by name.
+            has_updated: whether an update followed the last steps; else its numbers are of an earlier one.
+        """
+        names = set(key_values) if has_updated else key_values.keys() - self._of_updates
+        self.log({name: value for name, value in key_values.items() if name in names})
 
     def log(self, key_values: Mapping[str, Any]) -> None:
         """Record numbers and texts by name; figures, pictures, films and histograms are left out."""

@@ -145,28 +145,49 @@ def test_the_logger_and_the_settings_are_recorded(recordings):
     assert callback.run.facts["seed"] == 4
 
 
+@pytest.mark.parametrize(
+    ("algorithm", "env_id", "total", "stops_at", "settings"),
+    [
+        (PPO, "CartPole-v1", 256, None, SMALL),
+        (A2C, "CartPole-v1", 100, 52, {"device": "cpu"}),
+        (DQN, "CartPole-v1", 700, None, {"learning_starts": 100}),
+        (DQN, "CartPole-v1", 701, 402, {"learning_starts": 100, "train_freq": (1, "episode")}),
+        (SAC, "Pendulum-v1", 450, None, {"learning_starts": 100, "gradient_steps": 2}),
+    ],
+)
 @pytest.mark.parametrize("log_interval", [1, 2])
-def test_the_numbers_of_an_update_stand_at_its_step_once(recordings, log_interval):
-    losses: dict[int, float] = {}
+def test_the_numbers_of_an_update_stand_at_its_step_once(
+    recordings, algorithm, env_id, total, stops_at, settings, log_interval
+):
+    model = algorithm("MlpPolicy", env_id, seed=4, **settings)
+    updates: dict[int, dict[str, float]] = {}
+    train = model.train
 
-    class Updates(BaseCallback):
+    def watched(*arguments, **named):
+        train(*arguments, **named)
+        numbers = model.logger.name_to_value.items()
+        updates[model.num_timesteps] = {name: value for name, value in numbers if name.startswith("train/")}
+
+    class Stop(BaseCallback):
         def _on_step(self):
-            return True
+            return self.num_timesteps != stops_at
 
-        def note(self):
-            if "train/loss" in self.logger.name_to_value:
-                losses[self.num_timesteps] = self.logger.name_to_value["train/loss"]
-
-        _on_rollout_start = _on_training_end = note
-
+    model.train = watched
     callback = Recording()
-    model = PPO("MlpPolicy", "CartPole-v1", seed=4, **SMALL)
-    model.learn(256, callback=[Updates(), callback], log_interval=log_interval)
+    model.learn(total, callback=[Stop(), callback], log_interval=log_interval)
+    found: dict[int, dict[str, float]] = {}
     with runner.open_recording(callback.run.recording) as recording:
-        scalars = list(recording.decoded(recording.topic("/scalar")))
-    found = [(one["step"], one["value"]) for one in scalars if one["name"] == "train/loss"]
-    steps = range(64 * log_interval, 257, 64 * log_interval)
-    assert found == [(step, losses[step]) for step in steps]
+        for one in recording.decoded(recording.topic("/scalar")):
+            if one["name"].startswith("train/"):
+                own = found.setdefault(one["step"], {})
+                assert one["name"] not in own
+                own[one["name"]] = one["value"]
+    assert len(found) > 1
+    assert all(updates[step] == pytest.approx(numbers) for step, numbers in found.items())
+    if stops_at is None:
+        assert max(found) == max(updates)  # the library itself writes nothing of the last update
+    if algorithm is PPO:
+        assert list(found) == [*range(64 * log_interval, 257, 64 * log_interval)]
 
 
 def test_the_last_checkpoint_is_the_only_one_of_its_step(recordings):
