@@ -12,7 +12,7 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Self
 
-from runner.errors import RecordingError, RunnerError
+from runner.errors import NotInRecording, RunnerError
 from runner.recording import schema
 from runner.replay.steps import step_of_episode
 
@@ -69,6 +69,11 @@ class StepRef:
         return f"Trial {self.episode} of the evaluation after {self.after:,} episodes"
 
     @property
+    def which(self) -> tuple[int, ...]:
+        """The episode: (episode,) of training, or (training episodes before, trial) of an evaluation."""
+        return (self.episode,) if self.after is None else (self.after, self.episode)
+
+    @property
     def outcome(self) -> StepRef:
         """The frame after the step, which shows its outcome."""
         return dataclasses.replace(self, t=self.t + 1)
@@ -98,7 +103,7 @@ def training_step(recording: Recording, at: int | StepRef) -> int:
     taken = training_steps(recording)
     if isinstance(at, int):
         if not 0 <= at < taken:
-            raise RecordingError(
+            raise NotInRecording(
                 f"{recording.path}: found no training step {at:,}; there are {taken:,}, from 0 to "
                 f"{taken - 1:,}."
             )
@@ -109,11 +114,11 @@ def training_step(recording: Recording, at: int | StepRef) -> int:
     start = step_of_episode(recording, min(at.episode, ended))
     stop = taken if at.episode >= ended else step_of_episode(recording, at.episode + 1)
     if at.episode > ended or start == stop:
-        raise RecordingError(
+        raise NotInRecording(
             f"{recording.path}: found no training episode {at.episode:,}; there are {ended:,}, from 0."
         )
     if start + at.t >= stop:
-        raise RecordingError(
+        raise NotInRecording(
             f"{recording.path}: found no step {at.t:,} of training episode {at.episode:,}, which has "
             f"{stop - start:,}, from 0."
         )

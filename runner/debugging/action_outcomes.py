@@ -85,6 +85,8 @@ class WhatIf:
     """Where the episode led."""
     actions: tuple[ActionOutcome, ...]
     """Those of the highest value first, summed over learners."""
+    left_out: int
+    """Number of further actions, of lower value, that were not played."""
     notes: tuple[str, ...]
     """What a reader must know about these figures, a sentence each."""
     mdp: Mdp = field(repr=False)

@@ -7,6 +7,7 @@ with the run.
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,11 +16,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.errors import RecordingError
+from runner.errors import RecordingError, StorageError
 from runner.learning.ledger import SHARE, UPDATE, Ledger, spread
 from runner.recording.reader import Recording
 from runner.replay.tables import TableReplay
 from runner.util.files import storage_errors
+from runner.util.humanize import size
 
 STRETCHES: Final = 20
 """The most stretches of equally many episodes by which weights are counted."""
@@ -79,6 +81,12 @@ def weights_of(
     tables = ("q_1", "q_2") if "q_2" in replay.kinds else ("q",)
     initial_values = np.stack([replay.held[cell.learner][name].reshape(-1) for name in tables])
     advice = "set TMPDIR to a folder with more space"
+    free = shutil.disk_usage(tempfile.gettempdir()).free
+    if stop * UPDATE.itemsize > free:
+        raise StorageError(
+            f"{tempfile.gettempdir()}: has {size(free)} free, and {size(stop * UPDATE.itemsize)} are needed "
+            f"for a temporary file; {advice}."
+        )
     with storage_errors("a temporary file", advice), tempfile.TemporaryFile() as spool:
         episode = 0
         for updates in _updates(recording, replay, cell.learner, stop):

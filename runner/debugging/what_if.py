@@ -22,9 +22,8 @@ from runner.debugging.action_outcomes import ActionOutcome, Outcome, WhatIf
 from runner.debugging.continuation import Continuation, Moment
 from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import actions_in_words, agent_of, joint_action, own_action, states_in_words
-from runner.errors import NotInRecording
 from runner.export.contents import ending_of, require_steps
-from runner.export.episodes import EpisodePlace, place_of
+from runner.export.episodes import EpisodePlace, no_step, place_of
 from runner.export.reports.episode import episode_of
 from runner.export.reports.playback import tabular_playback
 from runner.export.reports.player_data import Playback
@@ -37,12 +36,15 @@ from runner.recording.reader import Recording, open_recording
 from runner.replay.steps import check_steps, episode_blocks, steps_of
 from runner.replay.tables import TableReplay
 from runner.runs.run import Run
+from runner.util.humanize import counted
 from runner.util.values import finite
 
 ALL: Final = "all"
 """Stands for every joint action."""
 MAX_STEPS: Final = 100_000
 """Steps that an action is played on for where the environment has no step limit."""
+MAX_ACTIONS: Final = 256
+"""Actions that are played on; of more, those of the highest value."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,8 @@ def what_if(run: Run, *, at: str | StepRef, actions: Sequence[str | int] = ()) -
         run: a run that was trained here, with its steps.
         at: the step: `EPISODE:T` of training, or `eval:N:TRIAL:T`.
         actions: numbers or names of joint actions, such as `north + east`, or `AGENT=VALUE` each: those in
-            which these agents act so; all if there are none.
+            which these agents act so; all if there are none. Of more than 256, those of the highest exact
+            value are played (the learned one with a discount of 1), and the recorded one.
 
     Raises:
         ConfigError: there is no such action or agent.
@@ -116,10 +119,7 @@ def branch_playback(
     found = branched(recording, at, action)
     shown = found.steps[first : first + limit]
     if not len(shown):
-        raise NotInRecording(
-            f"{recording.path}: this branch of {found.place.title} has {len(found.steps):,} steps, from 0; "
-            f"found no step {first:,}."
-        )
+        raise no_step(recording, f"this branch of {found.place.title}", len(found.steps), first)
     values = tuple(table[shown["state"]] for table in found.tables)
     episode = episode_of(found.place, recording.mdp, found.steps, found.outcome.end, values, first, limit)
     return tabular_playback(recording, episode)
@@ -143,7 +143,7 @@ class _Branches:
         )
         require_steps(recording, "branch")
         self._recording, self._at, self._mdp = recording, at, recording.mdp
-        self._place = place_of(recording, (at.episode,) if at.after is None else (at.after, at.episode))
+        self._place = place_of(recording, at.which)
         self._read_episode()
         is_training, step = at.after is None, int(self._step["step"])
         self._tables = TableReplay(recording, step if is_training else self._place.table_step)
@@ -163,9 +163,7 @@ class _Branches:
         recording, phase, episode, t = self._recording, self._place.phase, self._place.number, self._at.t
         span = recording.episode_span(phase, episode)
         if t >= len(span):
-            raise NotInRecording(
-                f"{recording.path}: {self._place.title} has {len(span):,} steps, from 0; found no step {t:,}."
-            )
+            raise no_step(recording, self._place.title, len(span), t)
         self._returns, self._succeeded, done = np.zeros(len(recording.agents)), False, 0
         returns = self._returns
         for block in episode_blocks(recording, phase, episode):
@@ -223,6 +221,8 @@ class _Branches:
         names, probabilities = actions_in_words(mdp), playing.policy
         learned = self._learned(state)
         values, optimal = self._exact_values(state, probabilities)
+        worth = list(map(sum, learned)) if playing.discount >= 1 else values.sum(axis=1).tolist()
+        ranked = sorted(set(actions), key=lambda action: (action != recorded, -worth[action], action))
         rows = [
             ActionOutcome(
                 **vars(self._play(action)[1]),
@@ -235,7 +235,7 @@ class _Branches:
                 optimal_value=finite(float(optimal[action])),
                 regret=finite(float(optimal.max() - optimal[action])),
             )
-            for action in actions
+            for action in ranked[:MAX_ACTIONS]
         ]
         return WhatIf(
             run_id=recording.run_id,
@@ -250,7 +250,8 @@ class _Branches:
             discount=playing.discount,
             recorded=self._recorded,
             actions=tuple(sorted(rows, key=_rank)),
-            notes=tuple(self._notes(rows)),
+            left_out=len(ranked) - len(rows),
+            notes=tuple(self._notes(rows, len(ranked) - len(rows))),
             mdp=mdp,
         )
 
@@ -279,8 +280,10 @@ class _Branches:
             action_values(mdp, state, best, mdp.summed_rewards[..., np.newaxis], discount)[:, 0],
         )
 
-    def _notes(self, rows: Sequence[ActionOutcome]) -> Iterator[str]:
+    def _notes(self, rows: Sequence[ActionOutcome], left_out: int) -> Iterator[str]:
         """Yield what a reader must know about these figures, a sentence each."""
+        if left_out:
+            yield f"{counted(left_out, 'joint action')} of lower value left out; name some to see them"
         if self._at.after is None:
             yield (
                 "nothing is learned after the step, so even the recorded action may lead elsewhere than it "

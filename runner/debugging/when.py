@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.sections import Grid, Section, html
-from runner.analysis.step_reference import EXPECTED_OF_TRAINING, StepRef, parse_step
+from runner.analysis.step_reference import EXPECTED_OF_TRAINING, StepRef, parse_step, training_step
 from runner.archive.places import at_hand
 from runner.debugging.expressions import Array, Columns, Expression, Parser, Term
 from runner.debugging.quantities import JobColumns, JobVocabulary, check_lost
@@ -150,15 +150,18 @@ def when_in(
     first: int | str | StepRef | None = None,
     last: int | str | StepRef | None = None,
     report: Callable[[int], None] = lambda _: None,
+    limit: int = MAX_INTERVALS,
 ) -> When:
-    """Return when an expression held in the training of an open recording; see `when`."""
+    """Return when an expression held in the training of an open recording; see `when`.
+
+    It lists at most `limit` intervals.
+    """
     recording.require_job("`when`", "A loop has no Q-tables; `dualtaxi plot` shows what it logged.")
     vocabulary = JobVocabulary(recording)
     parsed = Parser(expression, vocabulary.resolve).parse()
     require_steps(recording, "search")
-    steps = recording.count(schema.TRAIN_STEP)
-    start = _step_number(recording, first, steps, 0)
-    stop = _step_number(recording, last, steps, steps - 1) + 1
+    start = 0 if first is None else _step_number(recording, first)
+    stop = recording.count(schema.TRAIN_STEP) if last is None else _step_number(recording, last) + 1
     if start >= stop:
         raise RunnerError(f"found first step {start:,} and last step {stop - 1:,}, expected them in order.")
     columns = JobColumns(recording, list(vocabulary.quantities), max(start - 1, 0))
@@ -168,7 +171,7 @@ def when_in(
     with np.errstate(all="ignore"):
         held_before = bool(_values(parsed.condition, columns.last)[0])
         knows = not any(np.isnan(_values(term, columns.last)).any() for term in terms)
-        found = _search(recording, parsed, columns, every, start, stop, report)
+        found = _search(recording, parsed, columns, every, limit, start, stop, report)
     starts, ends = found.moments[::2], found.moments[1::2]
     return When(
         run_id=recording.run_id,
@@ -198,6 +201,7 @@ def _search(
     expression: Expression,
     columns: JobColumns,
     every: bool,
+    intervals: int,
     start: int,
     stop: int,
     report: Callable[[int], None],
@@ -206,7 +210,7 @@ def _search(
     moments: list[Moment] = []
     count = steps = 0
     holds, expected = False, start
-    limit = 2 * min(MAX_INTERVALS, MAX_VALUES // (2 * max(1, len(expression.terms))))
+    limit = 2 * min(intervals, MAX_VALUES // (2 * max(1, len(expression.terms))))
     for block in recording.blocks(schema.TRAIN_STEP, start, stop):
         first = int(block["step"][0])
         check_lost(recording, expected, first)
@@ -258,31 +262,15 @@ def _scalar(term: Term, value: np.float64 | np.bool_, is_known: bool) -> Scalar:
     return int(value) if term.is_whole else float(value)
 
 
-def _step_number(recording: Recording, at: int | str | StepRef | None, steps: int, default: int) -> int:
-    """Return the number of a training step."""
-    if at is None:
-        return default
-    if isinstance(at, str):
-        at = parse_step(at, EXPECTED_OF_TRAINING)
-    if isinstance(at, StepRef):
-        if at.after is not None:
-            raise RunnerError(f"found {at}, expected a step of training: {EXPECTED_OF_TRAINING}.")
-        span = recording.episode_span("train", at.episode)
-        if at.t >= len(span):
-            raise RunnerError(
-                f"found step {at.t} of training episode {at.episode}, expected one of 0 to {len(span) - 1}."
-            )
-        return span[at.t]
-    if not 0 <= at < steps:
-        raise RunnerError(f"found training step {at:,}, expected one of 0 to {steps - 1:,}.")
-    return at
+def _step_number(recording: Recording, at: int | str | StepRef) -> int:
+    return training_step(recording, parse_step(at, EXPECTED_OF_TRAINING) if isinstance(at, str) else at)
 
 
 # --- as text ----------------------------------------------------------------------------------------------
 
 
-def section_of(found: When, intervals: int = MAX_INTERVALS) -> Section:
-    """Return a result as sentences and tables: the first moment, and up to this number of intervals."""
+def section_of(found: When) -> Section:
+    """Return a result as sentences and tables: the first moment, and the intervals."""
     first, last = found.searched
     sentences = [f"State {number}: {name}." for number, name in found.states]
     if found.first is None:
@@ -300,10 +288,9 @@ def section_of(found: When, intervals: int = MAX_INTERVALS) -> Section:
         sentences.append("It held before that step too.")
     grids = [_values_grid("first", found.first, True)]
     if found.every:
-        shown = found.intervals[:intervals]
-        grids.append(_intervals_grid(shown, last))
-        if len(shown) < found.count:
-            sentences.append(f"The first {len(shown):,} intervals are listed.")
+        grids.append(_intervals_grid(found.intervals, last))
+        if len(found.intervals) < found.count:
+            sentences.append(f"The first {len(found.intervals):,} intervals are listed.")
     return Section(found.expression, sentences, grids)
 
 

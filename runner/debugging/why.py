@@ -34,8 +34,8 @@ from runner.environments.naming import (
     state_of,
     states_in_words,
 )
-from runner.errors import ConfigError, RecordingError, RunnerError, nearest
-from runner.export.episodes import place_of
+from runner.errors import ConfigError, RunnerError, nearest
+from runner.export.episodes import no_step, place_of
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.replay.steps import check_steps, last_step
@@ -82,7 +82,6 @@ def why(
         StorageError: the folder of temporary files cannot be written.
     """
     with open_recording(at_hand(run).recording) as recording:
-        at = StepRef.parse(at) if isinstance(at, str) else at
         state, action = (None if given is None else str(given) for given in (state, action))
         return why_in(recording, state, action, agent, at, limit, report)
 
@@ -92,11 +91,12 @@ def why_in(
     state: str | None = None,
     action: str | None = None,
     agent: str | None = None,
-    at: StepRef | None = None,
+    at: str | StepRef | None = None,
     limit: int = LIMIT,
     report: Callable[[int], None] = lambda _: None,
 ) -> Why:
     """Return where a Q-value comes from, as `why` does, from an open recording."""
+    at = StepRef.parse(at) if isinstance(at, str) else at
     recording.require_job(
         "where a Q-value comes from",
         "`dualtaxi values` shows what a loop's checkpoint expects along a recorded episode.",
@@ -184,23 +184,14 @@ def _step_at(recording: Recording, at: StepRef | None) -> NDArray[np.void]:
         raise ConfigError(
             "found no state or no action, expected both, or a step (`at`) whose state and action are meant."
         )
-    place = place_of(recording, (at.episode,) if at.after is None else (at.after, at.episode))
+    place = place_of(recording, at.which)
     span = recording.episode_span(place.phase, place.number)
-    found = []
-    if at.t < len(span):
-        topic = recording.topic(f"/{place.phase}/step")
-        found = list(recording.blocks(topic, span.start + at.t, span.start + at.t + 1))
-    if not found:
-        raise _no_step(recording, at, len(span))
-    check_steps(found[0], recording.mdp, str(recording.path), schema.PHASE_NAMES[place.phase])
-    step: NDArray[np.void] = found[0][0]
+    if at.t >= len(span):
+        raise no_step(recording, place.title, len(span), at.t)
+    (block,) = recording.blocks(recording.topic(f"/{place.phase}/step"), span[at.t], span[at.t] + 1)
+    check_steps(block, recording.mdp, str(recording.path), schema.PHASE_NAMES[place.phase])
+    step: NDArray[np.void] = block[0]
     return step
-
-
-def _no_step(recording: Recording, at: StepRef, steps: int) -> RecordingError:
-    return RecordingError(
-        f"{recording.path}: found no step {at.t:,} in {at.episode_name.lower()}, which has {steps:,}, from 0."
-    )
 
 
 def _steps_before(recording: Recording, at: StepRef) -> int:
@@ -209,11 +200,12 @@ def _steps_before(recording: Recording, at: StepRef) -> int:
     Raises:
         RecordingError: there is no such step.
     """
+    place = place_of(recording, at.which)
     if at.after is not None:
-        return place_of(recording, (at.after, at.episode)).table_step
+        return place.table_step
     span = recording.episode_span("train", at.episode)
     if at.t > len(span):
-        raise _no_step(recording, at, len(span))
+        raise no_step(recording, place.title, len(span), at.t)
     return span.start + at.t
 
 

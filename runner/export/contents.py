@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from runner.errors import RecordingError
+from runner.errors import NotInRecording, RecordingError
 from runner.recording import schema
 from runner.recording.metadata import RECORDING_STOPPED
 from runner.recording.reader import Recording
@@ -79,7 +79,7 @@ def whole_ranges(
     whole = [(start, count if stop is None else stop) for start, stop in ranges]
     for start, stop in whole:
         if not start < stop <= count:
-            raise RecordingError(
+            raise NotInRecording(
                 f"{where}: found no {schema.PHASE_NAMES[phase]} episodes {start}:{stop}; "
                 f"there are {count:,}, from 0. Ranges are START:STOP, STOP not included."
             )

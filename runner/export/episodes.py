@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.environments.naming import trial_in_words
-from runner.errors import RecordingError
+from runner.errors import NotInRecording, RecordingError
 from runner.export.contents import require_steps
 from runner.recording import schema
 from runner.recording.reader import Recording
@@ -36,6 +36,11 @@ def place_of(recording: Recording, which: tuple[int, ...]) -> EpisodePlace:
     evaluation = evaluation_after(evaluations_of(recording), after, where)
     title = trial_in_words(after, number)
     return EpisodePlace("eval", evaluation.trial(number, where), title, evaluation.train_step)
+
+
+def no_step(recording: Recording, title: str, steps: int, t: int) -> NotInRecording:
+    """Return the error that an episode with this title and number of steps has no step `t`."""
+    return NotInRecording(f"{recording.path}: {title} has {steps:,} steps, from 0; found no step {t:,}.")
 
 
 def chosen_episode(recording: Recording, episode: int | None, trial: tuple[int, int] | None) -> EpisodePlace:

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from runner.errors import CannotRedo, RecordingError
+from runner.errors import CannotRedo, NotInRecording, RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
@@ -82,7 +82,7 @@ def episode_at(
     """
     span, n = recording.episode_span(phase, number), recording.environments
     if not 0 <= t < len(span):
-        raise RecordingError(
+        raise NotInRecording(
             f"{recording.path}: found no step {t:,} of {schema.PHASE_NAMES[phase]} episode {number}; it has "
             f"{len(span):,}, from 0."
         )

@@ -126,6 +126,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
             JobQueue(settings.recordings[0], settings.workers, max_unfinished=limits.jobs, ray=settings.ray)
         )
         app.state.writers = anyio.CapacityLimiter(uploads.WRITERS)
+        app.state.spooling = anyio.CapacityLimiter(1)
         app.state.uploads = Uploads(settings.recordings[0], limits, log_upload)
         stack.callback(app.state.uploads.close)
         app.state.pictures = PictureStreams()

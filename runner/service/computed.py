@@ -31,6 +31,7 @@ from runner.analysis.histograms import histograms
 from runner.analysis.qtable import describe_tables, one_array, replay_at
 from runner.analysis.series import RunSeries, parse_target, read_series
 from runner.analysis.step_reference import StepRef
+from runner.debugging.q_value import why_body
 from runner.debugging.what_if import what_if_in
 from runner.debugging.when import section_of, when_in
 from runner.debugging.why import why_in
@@ -193,18 +194,24 @@ def when_section(
 ) -> bytes:
     """Return the result of `when` as sentences and tables for a page, as JSON with addresses of replays."""
     with open_recording(path) as recording:
-        found = when_in(recording, expression, every, first, last)
-        moments = [each.start.at.replay_address(found.run_id) for each in found.intervals[:intervals]]
-        return as_json({"section": dataclasses.asdict(section_of(found, intervals)), "replays": moments})
+        found = when_in(recording, expression, every, first, last, limit=intervals)
+    moments = [each.start.at.replay_address(found.run_id) for each in found.intervals]
+    return as_json({"section": dataclasses.asdict(section_of(found)), "replays": moments})
 
 
 def why(
-    path: Path, state: str | None, action: str | None, agent: str | None, at: str | None, limit: int
+    path: Path,
+    form: str,
+    state: str | None,
+    action: str | None,
+    agent: str | None,
+    at: str | None,
+    limit: int,
 ) -> bytes:
-    """Return where a Q-value comes from, as `dualtaxi why --json` prints it."""
-    step = StepRef.parse(at) if at else None
+    """Return where a Q-value comes from, as `dualtaxi why --json` prints it, or as `html` for a page."""
     with open_recording(path) as recording:
-        return as_json(why_in(recording, state, action, agent, step, limit).as_json())
+        found = why_in(recording, state, action, agent, at, limit)
+    return why_body(found, linked=True).encode() if form == "html" else as_json(found.as_json())
 
 
 def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
+from anyio import CapacityLimiter
 from fastapi import Depends, Path, Request
 
 from runner.archive.places import at_hand
@@ -12,6 +13,7 @@ from runner.errors import RecordingError
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.catalogue import Catalogue
+from runner.service.errors import Busy
 from runner.service.jobs.queue import JobQueue
 from runner.service.pictures import PictureStreams
 from runner.service.processes import ProcessPool
@@ -37,6 +39,9 @@ PicturesOf = Annotated[PictureStreams, _state("pictures")]
 CacheOf = Annotated[ResponseCache, _state("cache")]
 JobsOf = Annotated[JobQueue, _state("jobs")]
 UploadsOf = Annotated[Uploads, _state("uploads")]
+Spooling = Annotated[CapacityLimiter, _state("spooling")]
+MAX_WAITING: Final = 16
+"""Calls with large temporary files that may wait for the one that runs."""
 RunName = Annotated[
     str,
     Path(
@@ -89,15 +94,32 @@ def timed_recording_state(run: Run) -> tuple[str, int, int, str]:
 class Computation:
     """Functions of a run's recording, called in a child process, their results cached."""
 
-    def __init__(self, run: RecordedRun, cache: CacheOf, processes: ProcessesOf) -> None:
+    def __init__(self, run: RecordedRun, cache: CacheOf, processes: ProcessesOf, spooling: Spooling) -> None:
         self._run, self._cache, self._processes = run, cache, processes
+        self._spooling = spooling
 
-    async def __call__(self, function: Callable[..., bytes], *args: Hashable) -> bytes:
-        """Return the result of a function of the recording's path and further arguments."""
+    async def __call__(self, function: Callable[..., bytes], *args: Hashable, alone: bool = False) -> bytes:
+        """Return the result of a function of the recording's path and further arguments.
+
+        Args:
+            function: the function.
+            args: its arguments after the path.
+            alone: whether it writes large temporary files: one such call at a time.
+
+        Raises:
+            Busy: too many calls are waiting.
+        """
+
+        async def call() -> bytes:
+            if not alone:
+                return await self._processes(function, self._run.recording, *args)
+            if self._spooling.statistics().tasks_waiting >= MAX_WAITING:
+                raise Busy
+            async with self._spooling:
+                return await self._processes(function, self._run.recording, *args)
+
         key = (function.__name__, recording_state(self._run), *args)
-        return await self._cache.get_or_await(
-            key, lambda: self._processes(function, self._run.recording, *args), ALWAYS
-        )
+        return await self._cache.get_or_await(key, call, ALWAYS)
 
 
 ComputationOf = Annotated[Computation, Depends()]

@@ -24,11 +24,9 @@ from runner.analysis.histograms import histograms
 from runner.analysis.series import read_series
 from runner.analysis.step_reference import StepRef
 from runner.analysis.summary import random_policy_sentence
-from runner.debugging.q_value import why_body
 from runner.debugging.what_if import branch_playback, what_if_in
-from runner.debugging.why import why_in
 from runner.drawing import svg
-from runner.environments.naming import joint_action
+from runner.environments.naming import actions_in_words, joint_action
 from runner.errors import RecordingError
 from runner.export.encoded import picture_note
 from runner.export.episodes import last_episode, last_whole_evaluation, typical_trial
@@ -99,7 +97,7 @@ def what_if_page(run: Run, at: StepRef, action: str | None, start: int, steps: i
             "facts": found.facts,
             "notes": found.notes,
             "action": number,
-            "name": next(row.name for row in found.actions if row.action == number),
+            "name": str(actions_in_words(recording.mdp)[number]),
             "picture": found.picture(style=""),
             "matrix": found.matrix(address),
             "grid": asdict(found.grid),
@@ -147,15 +145,6 @@ def maps(path: Path) -> bytes:
         if recording.has_tables:
             rows = maps_of(recording.mdp, recording.agents, stages_of(recording), _typical_start(recording))
         return str(partials().maps(rows, drawing is not None and drawing.width > svg.BROAD)).encode()
-
-
-def why(
-    path: Path, state: str | None, action: str | None, agent: str | None, at: str | None, limit: int
-) -> bytes:
-    """Return where a Q-value comes from as HTML; arguments and errors as for `computed.why`."""
-    step = StepRef.parse(at) if at else None
-    with open_recording(path) as recording:
-        return why_body(why_in(recording, state, action, agent, step, limit), linked=True).encode()
 
 
 def distributions(path: Path, axis: str) -> bytes:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from runner.environments.mdp import Mdp, events_of
 from runner.errors import RecordingError
 from runner.export.contents import ENDINGS, ending_of, require_steps
-from runner.export.episodes import EpisodePlace, place_of
+from runner.export.episodes import EpisodePlace, no_step, place_of
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.steps import check_steps, steps_of
@@ -74,9 +74,7 @@ def episode_at(recording: Recording, place: EpisodePlace, limit: int = MAX_STEPS
     )
     shown = steps[first : first + limit]
     if not len(shown):
-        raise RecordingError(
-            f"{recording.path}: {place.title} has {len(steps):,} steps, from 0; found no step {first:,}."
-        )
+        raise no_step(recording, place.title, len(steps), first)
     check_steps(shown, recording.mdp, str(recording.path))
     return episode_of(
         place, recording.mdp, steps, ended, _values(recording, shown, place.table_step), first, limit

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from runner.environments.naming import spoken
 from runner.errors import RecordingError, shortened
 from runner.export.contents import ENDINGS, ending_of
-from runner.export.episodes import EpisodePlace
+from runner.export.episodes import EpisodePlace, no_step
 from runner.export.reports.episode import outcome_in_words
 from runner.export.reports.player_data import (
     Playback,
@@ -86,9 +86,7 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
     """Return what a page plays of an episode: at most `limit` steps from step `first` on."""
     span = recording.episode_span(place.phase, place.number)
     if not 0 <= first < len(span):
-        raise RecordingError(
-            f"{recording.path}: {place.title} has {len(span):,} steps, from 0; found no step {first:,}."
-        )
+        raise no_step(recording, place.title, len(span), first)
     observed, notes = _shown_parts(recording, "observation", MAX_SERIES)
     reader = _Reader(recording, place.phase, observed)
     before, steps = reader.part(place.number, span, first, limit)

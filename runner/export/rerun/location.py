@@ -11,7 +11,7 @@ from runner.analysis.diff import can_compare_steps, divergences
 from runner.analysis.diff.sections import where_in_words
 from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.analysis.step_reference import StepRef
-from runner.errors import RecordingError
+from runner.errors import NotInRecording
 from runner.export.contents import require_steps
 from runner.export.rerun.selection import Request, episodes_of, evaluations_with_steps, select
 from runner.recording import schema
@@ -43,7 +43,7 @@ def locate(run: Run, request: Request, step: StepRef | None) -> Location:
         if step.after is None:
             number, more = step.episode, Request(episodes=((step.episode, step.episode + 1),))
             if recording.environments == 1 and number >= episodes.count:
-                raise RecordingError(
+                raise NotInRecording(
                     f"{recording.path}: found no training episode {number}; there are {episodes.count:,}, "
                     "from 0."
                 )
@@ -61,7 +61,7 @@ def locate(run: Run, request: Request, step: StepRef | None) -> Location:
         else:
             steps = range(*episodes.first_step[number : number + 2].tolist())
         if t >= len(steps):
-            raise RecordingError(
+            raise NotInRecording(
                 f"{recording.path}: found no t = {t} there; the episode has {len(steps)} steps, from 0."
             )
         time = _time(recording, phase, steps[t])

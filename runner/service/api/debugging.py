@@ -70,6 +70,8 @@ class WhatIf(BaseModel):
     recorded: Outcome
     actions: list[ActionOutcome]
     """Those of the highest value first."""
+    left_out: int
+    """Number of further actions, of lower value, that were not played."""
     notes: list[str]
 
 

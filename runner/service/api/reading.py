@@ -321,7 +321,8 @@ async def why(
     limit: Annotated[int, Query(ge=0, le=MAX_LIMIT, description="Most steps, 0 for all.")] = LIMIT,
 ) -> dict[str, object]:
     """Return where a Q-value comes from, as `dualtaxi why --json` prints it; of a run trained here."""
-    return _json(await compute(computed.why, state, action, agent, at, limit))  # type: ignore[return-value]
+    body = await compute(computed.why, "json", state, action, agent, at, limit, alone=True)
+    return _json(body)  # type: ignore[return-value]
 
 
 @router.get(

@@ -55,7 +55,7 @@ def _environments(run: Run, at: StepRef) -> _EnvironmentsView:
     """Return the page of an episode and those of the other environments at its first step."""
     base = f"/runs/{run.run_id}/replay"
     with open_recording(run.recording) as recording:
-        place = place_of(recording, (at.episode,) if at.after is None else (at.after, at.episode))
+        place = place_of(recording, at.which)
         span = recording.episode_span(place.phase, place.number)
         # Trials are numbered within their evaluation, whose first one this is.
         first = place.number - at.episode

@@ -314,3 +314,15 @@ def test_a_training_step_after_the_last_is_refused_by_its_number(taxis):
     result = CliRunner().invoke(cli, ["branch", str(taxis.folder), "--at", str(steps), "--action", "all"])
     assert result.exit_code == 2
     assert f"found no training step {steps:,}; there are {steps:,}, from 0 to {steps - 1:,}" in result.output
+
+
+def test_of_very_many_actions_the_best_and_the_recorded_are_played(taxis, monkeypatch):
+    whole = runner.what_if(taxis, at="0:1")
+    monkeypatch.setattr("runner.debugging.what_if.MAX_ACTIONS", 5)
+    found = runner.what_if(taxis, at="0:1")
+    recorded = next(row.action for row in whole.actions if row.is_recorded)
+    best = [row.action for row in whole.actions if row.action != recorded][:4]
+    assert {row.action for row in found.actions} == {recorded, *best}
+    assert (whole.left_out, found.left_out) == (0, 31)
+    assert any("31 joint actions of lower value" in note for note in found.notes)
+    assert found.matrix() == ""

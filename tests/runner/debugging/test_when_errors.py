@@ -180,11 +180,11 @@ def test_a_condition_counts_as_0_or_1_and_a_division_by_zero_is_no_error(coopera
 @pytest.mark.parametrize(
     ("first", "last", "message"),
     [
-        (10**9, None, "expected one of 0 to"),
+        (10**9, None, "found no training step 1,000,000,000; there are"),
         ("9" * 5000, None, "EPISODE:T"),
-        ("20000", None, "found training step 20,000, expected one of 0 to"),
-        ("500:0", None, "has no training episode 500"),
-        ("0:5000", None, "found step 5000 of training episode 0"),
+        ("20000", None, "found no training step 20,000; there are"),
+        ("500:0", None, "found no training episode 500"),
+        ("0:5000", None, "found no step 5,000 of training episode 0"),
         ("eval:3000:1", None, "expected a step of training"),
         ("-1", None, "EPISODE:T"),
         ("1" * 5000, None, "EPISODE:T"),
@@ -193,7 +193,7 @@ def test_a_condition_counts_as_0_or_1_and_a_division_by_zero_is_no_error(coopera
     ],
 )
 def test_a_step_that_is_none_is_refused(cooperative, first, last, message):
-    with pytest.raises(RunnerError, match=r"found|has no") as caught:
+    with pytest.raises(RunnerError, match="found") as caught:
         runner.when(cooperative, "step >= 0", first=first, last=last)
     assert message in str(caught.value)
 

@@ -41,7 +41,7 @@ def test_the_api_refuses_what_is_wrong_with_a_mark(client):
     assert client.get(f"/api/v1{RUN}/when").status_code == 422
     assert client.get(f"/api/v1{RUN}/when", params={"expression": "1" * 2000}).status_code == 422
     wrong = {"expression": "step > 1", "from": "99999999"}
-    assert client.get(f"/api/v1{RUN}/when", params=wrong).status_code == 400
+    assert client.get(f"/api/v1{RUN}/when", params=wrong).status_code == 404
 
 
 def test_the_page_answers_with_links_to_the_replay(client, recordings):
