@@ -7,16 +7,17 @@ with the run.
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError, StorageError
+from runner.execution.estimate import free_bytes
 from runner.learning.ledger import SHARE, UPDATE, Ledger, spread
 from runner.recording.reader import Recording
 from runner.replay.tables import TableReplay
@@ -81,7 +82,7 @@ def weights_of(
     tables = ("q_1", "q_2") if "q_2" in replay.kinds else ("q",)
     initial_values = np.stack([replay.held[cell.learner][name].reshape(-1) for name in tables])
     advice = "set TMPDIR to a folder with more space"
-    free = shutil.disk_usage(tempfile.gettempdir()).free
+    free = free_bytes(Path(tempfile.gettempdir()))
     if stop * UPDATE.itemsize > free:
         raise StorageError(
             f"{tempfile.gettempdir()}: has {size(free)} free, and {size(stop * UPDATE.itemsize)} are needed "

@@ -210,7 +210,7 @@ def _search(
     moments: list[Moment] = []
     count = steps = 0
     holds, expected = False, start
-    limit = 2 * min(intervals, MAX_VALUES // (2 * max(1, len(expression.terms))))
+    limit = 2 * min(intervals, MAX_INTERVALS, MAX_VALUES // (2 * max(1, len(expression.terms))))
     for block in recording.blocks(schema.TRAIN_STEP, start, stop):
         first = int(block["step"][0])
         check_lost(recording, expected, first)
