@@ -144,8 +144,9 @@ def opened_run(
 @contextlib.contextmanager
 def compilation_notice() -> Iterator[None]:
     """Print a notice when a kernel is compiled, which takes seconds the first time."""
-    from runner.learning.numba_cache import MESSAGE, announced
+    from runner.learning.numba_cache import MESSAGE, announced, load_without_scipy
 
+    load_without_scipy()
     with announced(lambda: say(MESSAGE)):
         yield
 

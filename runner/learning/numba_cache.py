@@ -7,13 +7,17 @@ be taken from the cache as it was before those were edited.
 from __future__ import annotations
 
 import hashlib
+import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 from numba.core import caching, event
+from numba.core.registry import cpu_target
 
+BLAS: Final = "scipy.linalg.cython_blas"
+"""What Numba imports of SciPy."""
 MESSAGE: Final = "Compiling a kernel for this algorithm and number of agents: a few seconds, the first time."
 
 
@@ -46,6 +50,21 @@ def stamp(folder: Path) -> str:
     """Return a hash of a folder's Python files, their names and contents."""
     files = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.glob("*.py")}
     return hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest()
+
+
+def load_without_scipy() -> None:
+    """Load what Numba needs before its first function, except SciPy, whose import takes longer than the rest.
+
+    Numba looks for the BLAS of an installed SciPy, which no kernel here uses. Afterwards SciPy can be
+    imported, and Numba finds it for functions that need it, such as those of a user's environment.
+    """
+    if BLAS in sys.modules:
+        return
+    sys.modules[BLAS] = None  # type: ignore[assignment]  # makes its import fail, as Python documents it
+    try:
+        cpu_target.target_context.refresh()
+    finally:
+        del sys.modules[BLAS]
 
 
 class _FirstStart(event.Listener):  # type: ignore[misc]  # Numba has no types

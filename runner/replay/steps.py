@@ -14,6 +14,7 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.messages import Message, frame_place
 from runner.recording.reader import Recording
+from runner.replay.whole_steps import whole_steps
 
 _END_OF_TIME: Final = 2**62
 """Later than any message, in nanoseconds."""
@@ -48,8 +49,6 @@ def episode_blocks(recording: Recording, phase: str, episode: int) -> Iterator[N
     """Yield an episode's steps in blocks, where they have one size."""
     topic, numbers = recording.topic(f"/{phase}/step"), recording.episode_span(phase, episode)
     if recording.has_actions_alone(phase):
-        from runner.replay.whole_steps import whole_steps  # loads Gymnasium
-
         yield whole_steps(recording, phase, episode)
         return
     found = 0
@@ -71,8 +70,6 @@ def steps_of(recording: Recording, phase: str, episode: int) -> NDArray[np.void]
         CannotRedo: only its actions were recorded, and its environment cannot be had.
     """
     if recording.has_actions_alone(phase):
-        from runner.replay.whole_steps import whole_steps  # loads Gymnasium
-
         return whole_steps(recording, phase, episode)
     return recording.episode_steps(phase, episode)
 

@@ -14,7 +14,6 @@ from runner.errors import CannotRedo, RecordingError
 from runner.recording.blocks import blank_records
 from runner.recording.metadata import sizes_of
 from runner.recording.reader import MAX_EPISODE_BYTES, Recording, open_recording
-from runner.replay.environment import redo, redo_in_child
 from runner.replay.redone import RedoneSteps
 
 
@@ -38,6 +37,8 @@ def whole_steps(recording: Recording, phase: str, episode: int) -> NDArray[np.vo
 
 def _done_again(path: Path, phase: str, episode: int) -> Iterator[RedoneSteps]:
     """Yield the steps of an episode, done again in a process with limits: this one, if it has them."""
+    from runner.replay.environment import redo, redo_in_child  # loads Gymnasium
+
     if not multiprocessing.current_process().daemon:
         yield from redo_in_child(path, phase, [episode])
         return

@@ -103,10 +103,6 @@ def branch_command(
       dualtaxi branch lander --at 4:100 --action 0.5,-0.2 --policy agent:act
       dualtaxi branch spread --at 0:10 --action agent_0=1 --action agent_2=4
     """
-    from runner.api import interruptible
-    from runner.debugging.branch import branch
-    from runner.execution.branching import TrainingBranch
-
     run = find_recorded(run_name, options["recordings"])
     if at is None:
         raise click.UsageError("expected --at EPISODE:T, the step to branch at")
@@ -126,6 +122,10 @@ def branch_command(
                 at = reference_to(recording, training_step(recording, at))
         print_what_if(run, at, actions, as_json)
         return
+    from runner.api import interruptible
+    from runner.debugging.branch import branch
+    from runner.execution.branching import TrainingBranch
+
     action = _action(actions, run)
     with contextlib.ExitStack() as stack:
         report = stack.enter_context(steps_line("training" if run.can_train_again else "branching"))

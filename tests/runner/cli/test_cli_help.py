@@ -150,3 +150,19 @@ def test_the_module_can_be_run():
 def test_completion_knows_settings_fields_and_shipped_experiments(words, incomplete, expected):
     completed = ShellComplete(cli, {}, "dualtaxi", "_DUALTAXI_COMPLETE").get_completions(words, incomplete)
     assert [item.value for item in completed] == expected
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("when", "tiny", "step == 5"),
+        ("why", "tiny", "--state", "300", "--action", "0", "--agent", "taxi_1"),
+        ("branch", "tiny", "--at", "0:0", "--action", "all"),
+        ("qtable", "tiny"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_questions_to_a_run_import_what_kernels_need_alone(recorded, words):
+    imported = _imported(*words, "--recordings", recorded.recordings)
+    assert "numba" in imported
+    assert not imported & {"gymnasium", "jinja2", "matplotlib", "pandas", "pyarrow", "rerun", "sqlalchemy"}

@@ -1,5 +1,7 @@
 """Numba's cache notices an edit of any file that goes into the compiled kernel."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 from runner.learning import kernel, schedules
@@ -20,3 +22,15 @@ def test_the_kernel_is_cached_by_it():
     expected = stamp(Path(kernel.__file__).resolve().parent)
     for function in (kernel.train, kernel.evaluate, kernel.replay, schedules.schedule_value):
         assert function._cache._impl.locator.get_source_stamp() == expected
+
+
+def test_scipy_is_left_to_functions_that_need_it():
+    program = (
+        "import sys, numba, numpy as np\n"
+        "from runner.learning.numba_cache import load_without_scipy\n"
+        "load_without_scipy()\n"
+        "print('scipy.linalg' in sys.modules)\n"
+        "print(numba.njit(lambda a: np.linalg.det(a @ a))(np.eye(2)))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "1.0"]
