@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from runner.execution.rerecord import evaluate, rerecord
     from runner.execution.resume import resume
     from runner.execution.verify import verify
+    from runner.export.notebook import plot, report
     from runner.loops.batches import record_batches
     from runner.loops.env import record
     from runner.loops.parallel import record_aec, record_parallel
@@ -57,12 +58,14 @@ __all__ = [
     "label",
     "list_runs",
     "open_recording",
+    "plot",
     "record",
     "record_aec",
     "record_batches",
     "record_parallel",
     "record_vector",
     "register_space",
+    "report",
     "rerecord",
     "resume",
     "run",
@@ -85,12 +88,14 @@ _HOME = {
     "label": "runner.runs.run",
     "list_runs": "runner.runs.listing",
     "open_recording": "runner.recording.reader",
+    "plot": "runner.export.notebook",
     "record": "runner.loops.env",
     "record_aec": "runner.loops.parallel",
     "record_batches": "runner.loops.batches",
     "record_parallel": "runner.loops.parallel",
     "record_vector": "runner.loops.vector",
     "register_space": "runner.recording.gym_json",
+    "report": "runner.export.notebook",
     "rerecord": "runner.execution.rerecord",
     "resume": "runner.execution.resume",
     "run": "runner.api",

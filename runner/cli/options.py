@@ -111,6 +111,27 @@ axis_option: Final = click.option(
     metavar="episodes|steps|updates|time",
     help="Read metrics over training episodes, training steps, updates as a loop logged them, or wall time.",
 )
+
+
+def curve_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options on how curves are drawn: axis, lines, smooth, log_x and log_y."""
+    for option in (
+        click.option("--log-y", is_flag=True, help="Logarithmic vertical axes."),
+        click.option("--log-x", is_flag=True, help="A logarithmic horizontal axis."),
+        click.option(
+            "--smooth",
+            type=click.FloatRange(0, 100),
+            default=0.0,
+            metavar="PERCENT",
+            help="Draw exponential means with this memory, in percent of the axis; values faintly behind.",
+        ),
+        click.option("--lines", is_flag=True, help="Draw each run as a thin line too."),
+        axis_option,
+    ):
+        command = option(command)
+    return command
+
+
 normalise_option: Final = click.option(
     "--normalise",
     metavar="FILE|minmax",

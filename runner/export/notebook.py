@@ -1,11 +1,11 @@
 """Runs in a notebook: the report of a run, plots of several, and the Rerun viewer inline.
 
     import runner
-    from runner.export.notebook import plot, rerun_view
+    from runner.export.notebook import rerun_view
 
     run = runner.run("quick")
     run                       # summary, replay, plots and maps
-    plot(run, other)          # the learning curves of both
+    runner.plot(run, other)   # the learning curves of both
     rerun_view(run)           # the Rerun viewer, where rerun-notebook is installed
 
 Everything is read from the recordings.
@@ -74,17 +74,38 @@ def run_html(run: Run) -> str:
         return facts_html(run) + f"<p>{escape(str(error))}</p>"
 
 
-def report(*runs: Run, height: int = HEIGHT) -> Html:
+def report(
+    *runs: Run,
+    axis: str = "episodes",
+    lines: bool = False,
+    smooth: float = 0,
+    log_x: bool = False,
+    log_y: bool = False,
+    height: int = HEIGHT,
+) -> Html:
     """Return the report of runs (summary, replay, plots, maps) in a frame of its own.
+
+    Args:
+        runs: the runs.
+        axis: of the plots; it and how curves are drawn are as for `plot`.
+        lines: as for `plot`.
+        smooth: as for `plot`.
+        log_x: as for `plot`.
+        log_y: as for `plot`.
+        height: in pixels.
 
     Raises:
         MissingExtra: Jinja2 is not installed.
-        RecordingError: a recording cannot be read.
+        RecordingError: a recording cannot be read, or does not have the axis.
+        RunnerError: there is no such axis, or smooth is not from 0 to 100.
     """
+    from runner.analysis.axes import axis_of
     from runner.archive.places import at_hand
+    from runner.export.plots.metrics import CurveStyle
     from runner.export.reports.report import render_report
 
-    page, _ = render_report([at_hand(run).recording for run in runs])
+    paths, style = [at_hand(run).recording for run in runs], CurveStyle(lines, smooth, log_x, log_y)
+    page, _ = render_report(paths, axis=axis_of(axis), style=style)
     page = page.replace("</head>", f"{_FRAME_STYLE}</head>", 1)
     title = ", ".join(f"{run.name}, run {run.run_id}" for run in runs)
     return Html(
@@ -93,28 +114,46 @@ def report(*runs: Run, height: int = HEIGHT) -> Html:
     )
 
 
-def plot(*runs: Run) -> Picture:
-    """Return the learning curves of runs as one picture, runs of one configuration as median and band.
+def plot(
+    *runs: Run,
+    axis: str = "episodes",
+    lines: bool = False,
+    smooth: float = 0,
+    log_x: bool = False,
+    log_y: bool = False,
+) -> Picture:
+    """Return the learning curves of runs as one picture, as `dualtaxi plot` draws them.
+
+    Args:
+        runs: the runs; those that differ in nothing but the seed are one line with a band.
+        axis: `episodes`, `steps`, `updates` or `time`.
+        lines: draw each run as a thin line too.
+        smooth: draw exponential means with this memory, in percent of the axis, 0 to 100; 0 for none.
+        log_x: draw a logarithmic horizontal axis.
+        log_y: draw logarithmic vertical axes.
 
     Raises:
         MissingExtra: Matplotlib is not installed.
-        RecordingError: a recording cannot be read.
+        RecordingError: a recording cannot be read, or does not have the axis.
+        RunnerError: there is no such axis, or smooth is not from 0 to 100.
     """
+    from runner.analysis.axes import axis_of
     from runner.analysis.groups import groups_of
     from runner.analysis.series import read_series
     from runner.archive.places import at_hand
     from runner.export.plots.curves import curves_sheet
     from runner.export.plots.image import write_image
-    from runner.export.plots.metrics import panels_of
+    from runner.export.plots.metrics import CurveStyle, panels_of
     from runner.recording.reader import open_recording
 
+    style, over = CurveStyle(lines, smooth, log_x, log_y), axis_of(axis)
     series = []
     for run in runs:
         with open_recording(at_hand(run).recording) as recording:
-            series.append(read_series(recording))
+            series.append(read_series(recording, over))
     groups = groups_of(series)
     buffer = io.BytesIO()
-    write_image(curves_sheet(groups, panels_of(groups)), buffer, "png", dpi=110)
+    write_image(curves_sheet(groups, panels_of(groups), style), buffer, "png", dpi=110)
     return Picture(buffer.getvalue())
 
 

@@ -38,7 +38,7 @@ from runner.debugging.why import why_in
 from runner.errors import RunnerError
 from runner.export.plots.curves import curves_sheet
 from runner.export.plots.image import check_suffix, save
-from runner.export.plots.metrics import Curve, NoMetrics, Panel, panels_of
+from runner.export.plots.metrics import Curve, CurveStyle, NoMetrics, Panel, panels_of, smoothed
 from runner.export.rerun.cache import cached_export
 from runner.export.rerun.selection import Request
 from runner.export.rerun.viewer import require_rerun
@@ -61,11 +61,13 @@ def curves(
     stop: float | None = None,
     points: int = 0,
     lines: bool = False,
+    smooth: float = 0,
 ) -> bytes:
     """Return the metrics of runs over an axis as JSON, runs that differ only in the seed as one curve.
 
     All metrics if none are named; positions from `start` to before `stop`; curves of more than `points` are
-    thinned, 0 is no limit; `lines` adds the single runs of a curve.
+    thinned, 0 is no limit; `lines` adds the single runs of a curve, `smooth` exponential means with a
+    memory of this percentage of the part shown.
     """
     series, common = [], list(AXES.values())
     for path in paths:
@@ -78,7 +80,11 @@ def curves(
     with contextlib.suppress(NoMetrics):
         for panel in panels_of(groups):
             if not metrics or panel.metric in metrics:
-                shown += [_shown_curve(panel, curve, start, stop, points, lines) for curve in panel.curves]
+                end = panel.last if stop is None else stop
+                memory = max(end - start, 0) * smooth / 100
+                shown += [
+                    _shown_curve(panel, curve, start, stop, points, lines, memory) for curve in panel.curves
+                ]
     return as_json(
         {
             "axis": axis,
@@ -110,7 +116,13 @@ def run_histograms(path: Path, axis: str) -> bytes:
 
 
 def _shown_curve(
-    panel: Panel, curve: Curve, start: float, stop: float | None, points: int, lines: bool
+    panel: Panel,
+    curve: Curve,
+    start: float,
+    stop: float | None,
+    points: int,
+    lines: bool,
+    memory: float,
 ) -> dict[str, object]:
     inside = np.flatnonzero((curve.places >= start) & (curve.places < (math.inf if stop is None else stop)))
     chosen = inside[thinned(curve.middle[inside], points)]
@@ -123,6 +135,7 @@ def _shown_curve(
         "unit": panel.unit,
         "positions": curve.places[chosen].tolist(),
         "values": curve.middle[chosen].tolist(),
+        "smoothed": smoothed(curve.places, curve.middle, memory)[chosen].tolist() if memory else None,
         "low": curve.low[chosen].tolist() if has_band else None,
         "high": curve.high[chosen].tolist() if has_band else None,
         "runs": curve.runs[:, chosen].tolist() if has_band and lines else [],
@@ -234,13 +247,13 @@ def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:
     return bytes(sink.getvalue())
 
 
-def plot(path: Path, form: str) -> bytes:
-    """Return every metric of a run over episodes in one figure, as `svg`, `png` or `pdf`."""
+def plot(path: Path, form: str, axis: str, style: CurveStyle) -> bytes:
+    """Return every metric of a run over an axis in one figure, as `svg`, `png` or `pdf`."""
     check_suffix(Path(f"plot.{form}"))
-    groups = groups_of(_series([path]))
+    groups = groups_of(_series([path], axis_of(axis)))
     with tempfile.TemporaryDirectory() as folder:
         picture = Path(folder, f"plot.{form}")
-        save(curves_sheet(groups, panels_of(groups)), picture)
+        save(curves_sheet(groups, panels_of(groups), style), picture)
         return picture.read_bytes()
 
 

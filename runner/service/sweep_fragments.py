@@ -95,8 +95,8 @@ def sweep_pictures(name: str, recordings: Path, digest: str) -> bytes:
         html = shown.charts("parameters", "Parameters", picture.footnote, picture_plots(picture))
     try:
         groups, panels = learning(results, recordings)
-        plots = panel_plots(panels, len(groups))
-        html += shown.charts("curves", "Learning curves", footnote(groups), plots, sweep_legend(groups))
+        plots, note = panel_plots(panels, len(groups)), footnote(groups, panels)
+        html += shown.charts("curves", "Learning curves", note, plots, sweep_legend(groups))
     except RunnerError as error:
         html += shown.charts("curves", "Learning curves", without_folders(str(error), recordings), [])
     return str(html).encode()

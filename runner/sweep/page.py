@@ -55,7 +55,7 @@ def render_sweep(results: Results, recordings: Path) -> str:
         best=results.best_yaml,
         legend=sweep_legend(groups),
         plots=panel_plots(panels, len(groups)),
-        footnote=footnote(groups),
+        footnote=footnote(groups, panels),
         moment=f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     )
     return render(view)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from runner.cli import Command
-from runner.cli.options import EXPORTS, axis_option, normalise_option, runs_argument, writing_options
+from runner.cli.options import EXPORTS, curve_options, normalise_option, runs_argument, writing_options
 from runner.cli.output import print_written, say
 from runner.cli.parameter_types import INDEX, TRIAL
 from runner.cli.progress import count_line, stage_line
@@ -21,18 +22,21 @@ from runner.util.humanize import size
 if TYPE_CHECKING:
     from runner.analysis.axes import Axis
     from runner.analysis.series import RunSeries
+    from runner.export.plots.metrics import CurveStyle
 
 
 @click.command("plot", cls=Command)
 @runs_argument
-@axis_option
-@click.option("--lines", is_flag=True, help="Draw each run as a thin line too.")
+@curve_options
 @normalise_option
 @writing_options(EXPORTS / "plot.png", "FILE.png|svg|pdf")
 def plot_command(
     run_names: tuple[str, ...],
     axis: Axis,
     lines: bool,
+    smooth: float,
+    log_x: bool,
+    log_y: bool,
     normalise: str | None,
     output: Path,
     force: bool,
@@ -54,7 +58,7 @@ def plot_command(
     Examples:
       dualtaxi plot @latest
       dualtaxi plot cooperative competitive -o comparison.pdf
-      dualtaxi plot ppo dqn --axis steps
+      dualtaxi plot ppo dqn --axis steps --smooth 5 --log-y
       dualtaxi plot ppo dqn --axis steps --normalise minmax
       dualtaxi plot hyperparameters -o hyperparameters.png
     """
@@ -63,15 +67,20 @@ def plot_command(
     from runner.export.contents import shortcomings
     from runner.export.plots.curves import curves_sheet
     from runner.export.plots.image import check_suffix, save
-    from runner.export.plots.metrics import panels_of
+    from runner.export.plots.metrics import CurveStyle, panels_of
     from runner.recording.reader import open_recording
 
     check_suffix(output)
     folder = recordings_folder(recordings)
+    style = CurveStyle(lines, smooth, log_x, log_y)
+    if normalise is not None and style != CurveStyle():
+        raise click.UsageError(
+            "--normalise has a figure of its own: leave out --lines, --smooth, --log-x and --log-y."
+        )
     if is_sweep(run_names, folder):
-        _refuse_axis(axis)
-        if lines or normalise is not None:
-            raise click.UsageError("--lines, --normalise: found a sweep, expected runs.")
+        _refuse_style(axis, style)
+        if normalise is not None:
+            raise click.UsageError("--normalise: found a sweep, expected runs.")
         _plot_sweep(run_names[0], folder, output, force, as_json)
         return
     series = []
@@ -93,7 +102,7 @@ def plot_command(
         say(sentence)
     panels = panels_of(groups)
     with stage_line("drawing"):
-        write_new(output, force, lambda path: save(curves_sheet(groups, panels, lines), path))
+        write_new(output, force, lambda path: save(curves_sheet(groups, panels, style), path))
     count = sum(len(group.runs) for group in groups)
     text = f"{output}: {len(panels)} metric{'s' if len(panels) != 1 else ''} of {_runs(count)}"
     print_written(text, as_json, output, metrics=len(panels), runs=count)
@@ -119,11 +128,13 @@ def _plot_tasks(series: list[RunSeries], normalise: str, output: Path, force: bo
     print_written(text, as_json, output, groups=len(found.algorithms), environments=len(found.tasks))
 
 
-def _refuse_axis(axis: Axis) -> None:
+def _refuse_style(axis: Axis, style: CurveStyle) -> None:
     if axis.name != "episodes":
         raise click.UsageError(
             f"--axis: found {axis.name}, expected episodes, as sweeps are drawn over them."
         )
+    if any(astuple(style)):
+        raise click.UsageError("--lines, --smooth, --log-x, --log-y: found a sweep, expected runs.")
 
 
 def _plot_sweep(name: str, recordings: Path, output: Path, force: bool, as_json: bool) -> None:
@@ -161,7 +172,7 @@ def _plot_sweep(name: str, recordings: Path, output: Path, force: bool, as_json:
     metavar="N:TRIAL",
     help="Also show this trial of the evaluation after N training episodes; may be repeated.",
 )
-@axis_option
+@curve_options
 @writing_options(EXPORTS / "report.html", "FILE.html")
 def report_command(
     run_names: tuple[str, ...],
@@ -169,6 +180,10 @@ def report_command(
     episodes: tuple[int, ...],
     trials: tuple[tuple[int, int], ...],
     axis: Axis,
+    lines: bool,
+    smooth: float,
+    log_x: bool,
+    log_y: bool,
     force: bool,
     recordings: Path | None,
     as_json: bool,
@@ -188,14 +203,16 @@ def report_command(
       dualtaxi report hyperparameters -o hyperparameters.html
       dualtaxi report k3v9m2xq --episode 500 --eval 3000:7 --force
     """
+    from runner.export.plots.metrics import CurveStyle
     from runner.export.reports.report import require_packages, write_report
 
     require_packages()
+    style = CurveStyle(lines, smooth, log_x, log_y)
     folder = recordings_folder(recordings)
     if is_sweep(run_names, folder):
         if episodes or trials:
             raise click.UsageError("the page of a sweep shows no episode: leave out --episode and --eval.")
-        _refuse_axis(axis)
+        _refuse_style(axis, style)
         _report_sweep(run_names[0], folder, output, force, as_json)
         return
     replays = [*(("train", number, 0) for number in episodes), *(("eval", *trial) for trial in trials)]
@@ -203,7 +220,9 @@ def report_command(
     notes: list[str] = []
     with stage_line("reading") as progress:
         write_new(
-            output, force, lambda path: notes.extend(write_report(path, paths, replays, progress, axis))
+            output,
+            force,
+            lambda path: notes.extend(write_report(path, paths, replays, progress, axis, style)),
         )
     for note in notes:
         say(note)

@@ -332,7 +332,7 @@ def _round_step(width: float) -> float:
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    """Return powers of ten, or where there are fewer than two of them, their multiples as well."""
+    """Return powers of ten; where there are fewer than two of them, their multiples, or else even steps."""
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     tens = [10.0**power for power in range(first, last + 1)]
     inside = [tick for tick in tens if low <= tick <= high]
@@ -340,4 +340,4 @@ def _log_ticks(low: float, high: float) -> list[float]:
         return inside[:: math.ceil(len(inside) / 6)]
     finer = [round(ten * digit, 12) for ten in tens for digit in (1, 2, 5)]
     inside = [tick for tick in finer if low <= tick <= high]
-    return inside if len(inside) >= 2 else [low, high]
+    return inside if len(inside) >= 2 else Scale(low, high, 0, 1).ticks

@@ -9,9 +9,11 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runner.analysis.axes import EPISODES
 from runner.analysis.groups import Group
@@ -27,7 +29,18 @@ from runner.export.plots.chart import (
     series_colour,
     series_marker,
 )
-from runner.export.plots.metrics import Curve, NoMetrics, Panel, panels_of
+from runner.export.plots.metrics import (
+    PLAIN,
+    Curve,
+    CurveStyle,
+    NoMetrics,
+    Panel,
+    not_drawn,
+    panels_of,
+    smoothed,
+    style_of,
+    visible,
+)
 from runner.recording.metrics import SHARES
 
 WIDTH: Final = 288.0
@@ -36,7 +49,7 @@ _TOP: Final = 32.0
 _BOTTOM: Final = 146.0
 _LETTER: Final = 0.56
 """Width of an average letter, as a share of the text's size."""
-_LETTERS: Final = 230
+_LETTERS: Final = 215
 """Letters of a note that fit on a line of a sheet of three columns."""
 
 
@@ -49,30 +62,29 @@ class Plot(NamedTuple):
     """Whether it takes a whole row."""
 
 
-def plots_of(groups: Sequence[Group]) -> list[Plot]:
-    """Return the learning curves of groups of runs for a page; none where no run has a metric."""
+def plots_of(groups: Sequence[Group], style: CurveStyle = PLAIN) -> tuple[list[Plot], str]:
+    """Return the learning curves of groups of runs for a page, and a note on them; none without metrics."""
     try:
         panels = panels_of(groups)
     except NoMetrics:
-        return []
-    return panel_plots(panels, len(groups))
+        return [], ""
+    return panel_plots(panels, len(groups), style), footnote(groups, panels, style)
 
 
-def panel_plots(panels: Sequence[Panel], groups: int) -> list[Plot]:
+def panel_plots(panels: Sequence[Panel], groups: int, style: CurveStyle = PLAIN) -> list[Plot]:
     """Return panels of a number of groups for a page."""
-    return [Plot(panel.title, panel_chart(panel, groups).svg(), panel.metric == SHARES) for panel in panels]
+    return [
+        Plot(panel.title, panel_chart(panel, groups, style).svg(), panel.metric == SHARES) for panel in panels
+    ]
 
 
-def curves_sheet(groups: Sequence[Group], panels: Sequence[Panel], single_runs: bool = False) -> Canvas:
-    """Return all panels on one sheet, with a legend of the groups above and notes below.
-
-    With `single_runs` each run is a thin line too.
-    """
+def curves_sheet(groups: Sequence[Group], panels: Sequence[Panel], style: CurveStyle = PLAIN) -> Canvas:
+    """Return all panels on one sheet, with a legend of the groups above and notes below."""
     columns = min(3, len(panels))
     narrow = [panel for panel in panels if panel.metric != SHARES]
     wide = [panel for panel in panels if panel.metric == SHARES]
     width = WIDTH * max(columns, 2)
-    notes = textwrap.wrap(footnote(groups), round(_LETTERS * width / (3 * WIDTH)))
+    notes = textwrap.wrap(footnote(groups, panels, style), round(_LETTERS * width / (3 * WIDTH)))
     head = 32.0 + 14 * len(groups)
     rows = math.ceil(len(narrow) / columns) + len(wide)
     sheet = Canvas(width, head + HEIGHT * rows + 8 + 10 * len(notes), f"Metrics over {groups[0].axis.title}")
@@ -86,18 +98,24 @@ def curves_sheet(groups: Sequence[Group], panels: Sequence[Panel], single_runs: 
         sheet.text(42, y, group.described)
     for number, panel in enumerate(narrow):
         row, column = divmod(number, columns)
-        sheet.place(panel_chart(panel, len(groups), single_runs), WIDTH * column, head + HEIGHT * row)
+        sheet.place(panel_chart(panel, len(groups), style), WIDTH * column, head + HEIGHT * row)
     for number, panel in enumerate(wide):
-        sheet.place(panel_chart(panel, len(groups)), 0, head + HEIGHT * (rows - len(wide) + number))
+        chart = panel_chart(panel, len(groups), style)
+        sheet.place(chart, 0, head + HEIGHT * (rows - len(wide) + number))
     for number, line in enumerate(notes):
         sheet.text(10, sheet.height - 10 * (len(notes) - number) + 2, line, size=SMALL)
     return sheet
 
 
-def footnote(groups: Sequence[Group]) -> str:
+def footnote(groups: Sequence[Group], panels: Sequence[Panel], style: CurveStyle = PLAIN) -> str:
     """Return what lines and bands mean, and which values are not drawn."""
     runs = [run for group in groups for run in group.runs]
-    left_out = "".join(f" {sentence}" for sentence in values_left_out(runs))
+    left_out = "".join(f" {sentence}" for sentence in values_left_out(runs)) + not_drawn(panels, style)
+    if style.smooth:
+        left_out = (
+            f" Lines are exponential means with a memory of {style.smooth:g} % of the axis; "
+            f"their values are drawn faintly behind.{left_out}"
+        )
     loops = any(not run.can_train_again for run in runs)
     interpolated = loops or runs[0].axis is not EPISODES
     greedy = "" if loops else " Evaluation trials follow the greedy policy: no exploring."
@@ -111,28 +129,27 @@ def footnote(groups: Sequence[Group]) -> str:
     )
 
 
-def panel_chart(panel: Panel, groups: int, single_runs: bool = False) -> Chart:
+def panel_chart(panel: Panel, groups: int, style: CurveStyle = PLAIN) -> Chart:
     """Return the chart of a metric: curves of groups of runs over their axis."""
-    is_shares = panel.metric == SHARES
-    last = max(float(curve.places.max()) for curve in panel.curves) or 1.0
-    x = Scale(0.0, last * 1.02, 50.0, 461.0 if is_shares else 280.0)
-    y = _y_scale(panel, single_runs)
+    is_shares, style = panel.metric == SHARES, style_of(panel, style)
+    x = _x_scale(panel, style, 461.0 if is_shares else 280.0)
+    y = _y_scale(panel, style)
     width = 2 * WIDTH if is_shares else WIDTH
     chart = Chart(x, y, width, HEIGHT, f"{panel.title} over {panel.axis.title}")
     has_legend = len(panel.lines) > 1 and not is_shares
-    largest = max(float(np.abs([curve.low, curve.high]).max()) for curve in panel.curves)
+    largest = max(abs(y.low), abs(y.high))
     if is_shares:
-        _draw_shares(chart, panel)
+        _draw_shares(chart, panel, style)
     ticks = x.ticks if not panel.axis.whole else [tick for tick in x.ticks if tick == int(tick)]
     chart.x_ticks(labelled(ticks, short=panel.axis is not EPISODES))
-    chart.y_ticks(labelled(range(0, 101, 20) if panel.percent else y.ticks, largest >= 10_000))
+    chart.y_ticks(labelled(range(0, 101, 20) if panel.percent and not y.log else y.ticks, largest >= 10_000))
     chart.frame(panel.title, 14.0 if has_legend else 25.0, panel.axis.label, [panel.unit])
     if is_shares:
         return chart
-    if not panel.percent and not panel.at_least_zero:
+    if not panel.percent and not panel.at_least_zero and not y.log:
         chart.shape([(x.start, y.at(0)), (x.end, y.at(0))], stroke=palette.INK, width=0.6)
     for curve in panel.curves:
-        _draw_curve(chart, panel, curve, groups, single_runs)
+        _draw_curve(chart, panel, curve, groups, style)
     if has_legend:
         colours = [series_colour(i) if groups == 1 else palette.INK for i in range(len(panel.lines))]
         draw_legend(chart, [spoken(line) or "all" for line in panel.lines], colours)
@@ -148,12 +165,27 @@ def draw_legend(chart: Chart, names: Sequence[str], colours: Sequence[str]) -> N
         at += 32 + len(name) * SMALL * _LETTER
 
 
-def _y_scale(panel: Panel, single_runs: bool) -> Scale:
-    drawn = [
-        np.vstack([curve.low, curve.high, *(curve.runs if single_runs else ())]) for curve in panel.curves
-    ]
-    low = min(float(np.nanmin(values)) for values in drawn)
-    high = max(float(np.nanmax(values)) for values in drawn)
+def _x_scale(panel: Panel, style: CurveStyle, end: float) -> Scale:
+    last = panel.last or 1.0
+    if not style.log_x:
+        return Scale(0.0, last * 1.02, 50.0, end)
+    first = min(float(curve.places[curve.places > 0].min(initial=last)) for curve in panel.curves)
+    if first == last:
+        return Scale(first / 2, last * 2, 50.0, end, log=True)
+    return Scale(first, last * (last / first) ** 0.02, 50.0, end, log=True)
+
+
+def _y_scale(panel: Panel, style: CurveStyle) -> Scale:
+    drawn = []
+    for curve in panel.curves:
+        lines = np.vstack(
+            [curve.low, curve.high, *(curve.runs if style.lines else ()), _shown(panel, curve, style)]
+        )
+        drawn.append(lines[:, curve.places > 0] if style.log_x else lines)
+    values = np.concatenate([lines[np.isfinite(lines)] for lines in drawn])
+    if style.log_y:
+        return Scale.around(values[values > 0], _BOTTOM, _TOP, log=True)
+    low, high = float(values.min()), float(values.max())
     if panel.percent:
         low, high = 0.0, 100.0 if panel.metric == SHARES else 103.0
     elif panel.at_least_zero:
@@ -164,27 +196,47 @@ def _y_scale(panel: Panel, single_runs: bool) -> Scale:
     return Scale(low, high, _BOTTOM, _TOP)
 
 
-def _draw_curve(chart: Chart, panel: Panel, curve: Curve, groups: int, single_runs: bool) -> None:
+def _shown(panel: Panel, curve: Curve, style: CurveStyle) -> NDArray[np.float64]:
+    """Return the values of a curve's line: its own, or their exponential mean; NaN where it is not drawn."""
+    values = curve.middle
+    if style.smooth and panel.last > 0:
+        values = smoothed(curve.places, values, panel.last * style.smooth / 100)
+    return np.where(
+        visible(curve.places, curve.middle, style) & visible(curve.places, values, style), values, np.nan
+    )
+
+
+def _draw_curve(chart: Chart, panel: Panel, curve: Curve, groups: int, style: CurveStyle) -> None:
     line = panel.lines.index(curve.line)
     number = line if groups == 1 and len(panel.lines) > 1 else curve.group
     colour = series_colour(number)
-    if (curve.high > curve.low).any():
-        chart.band(curve.places, curve.low, curve.high, colour, opacity=0.2)
-    for run in curve.runs if single_runs and len(curve.runs) > 1 else ():
-        known = ~np.isnan(run)
+    shown = visible(curve.places, curve.middle, style)
+    if (curve.high > curve.low)[shown].any():
+        low = np.maximum(curve.low[shown], chart.y.low) if style.log_y else curve.low[shown]
+        chart.band(curve.places[shown], low, curve.high[shown], colour, opacity=0.2)
+    for run in curve.runs if style.lines and len(curve.runs) > 1 else ():
+        known = visible(curve.places, run, style)
         chart.line(curve.places[known], run[known], colour, line, width=0.6, opacity=0.5)
-    chart.line(curve.places, curve.middle, colour, line)
-    every = slice(None, None, max(len(curve.places) // 8, 1))
-    chart.markers(curve.places[every], curve.middle[every], colour, series_marker(number), 1.7)
+    if style.smooth:
+        chart.line(curve.places[shown], curve.middle[shown], colour, line, width=0.8, opacity=0.35)
+    values = _shown(panel, curve, style)
+    places, values = curve.places[~np.isnan(values)], values[~np.isnan(values)]
+    if not len(places):
+        return
+    chart.line(places, values, colour, line)
+    every = slice(None, None, max(len(places) // 8, 1))
+    chart.markers(places[every], values[every], colour, series_marker(number), 1.7)
 
 
-def _draw_shares(chart: Chart, panel: Panel) -> None:
+def _draw_shares(chart: Chart, panel: Panel, style: CurveStyle) -> None:
     """Draw shares of a whole on top of each other, the lowest reward darkest and at the bottom."""
     places = panel.curves[0].places
-    bottom = np.zeros_like(panel.curves[0].middle)
+    if style.log_x:
+        places = places[places > 0]
+    bottom = np.zeros_like(places)
     colours = palette.ramp_colours(len(panel.curves))
     for curve, colour in zip(panel.curves, colours, strict=True):
-        top = bottom + np.interp(places, curve.places, curve.middle)
+        top = bottom + np.interp(places, curve.places, _shown(panel, curve, replace(style, log_x=False)))
         chart.band(places, bottom, top, colour, stroke=palette.WHITE, width=0.3)
         bottom = top
     left = chart.x.end + 10

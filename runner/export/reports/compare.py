@@ -15,7 +15,7 @@ from runner.analysis.compare.tasks import TaskComparison
 from runner.analysis.groups import Group
 from runner.analysis.sections import Grid, Section
 from runner.export.plots.comparisons import intervals_svg, letter, profile_svg
-from runner.export.plots.curves import Plot, footnote, plots_of
+from runner.export.plots.curves import Plot, plots_of
 from runner.export.plots.tasks import task_charts
 from runner.export.reports.rendering import LegendEntry, View, render
 from runner.util.humanize import UNKNOWN
@@ -57,6 +57,7 @@ class _ComparisonView(View):
 def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
     """Return the page of a comparison, with the learning curves of its groups."""
     labels = [group.label for group in groups]
+    plots, footnote = plots_of(groups)
     rows = [
         (
             run.run_id,
@@ -78,8 +79,8 @@ def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
                 for i, group in enumerate(groups)
             ],
             metrics=[_metric(metric, labels) for metric in comparison.metrics],
-            plots=plots_of(groups),
-            footnote=footnote(groups),
+            plots=plots,
+            footnote=footnote,
             runs=Grid(("run", "group", "name", "seed", "status"), rows),
             moment=comparison.moment,
         )

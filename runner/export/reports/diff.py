@@ -98,7 +98,7 @@ class DifferenceView(View):
 def render_diff(difference: RunDiff, a: Recording, b: Recording) -> str:
     """Return the page of a difference of two recordings."""
     groups = [Group(name, (read_series(recording),)) for name, recording in (("A", a), ("B", b))]
-    return render(difference_view(difference, a, b, plots_of(groups)))
+    return render(difference_view(difference, a, b, plots_of(groups)[0]))
 
 
 def difference_view(

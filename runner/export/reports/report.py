@@ -23,7 +23,8 @@ from runner.errors import RecordingError
 from runner.export.contents import flat_text, shortcomings, why_no_steps
 from runner.export.encoded import picture_note
 from runner.export.episodes import last_whole_evaluation, place_of, ranked, ranked_trials
-from runner.export.plots.curves import Plot, footnote, plots_of
+from runner.export.plots.curves import Plot, plots_of
+from runner.export.plots.metrics import PLAIN, CurveStyle
 from runner.export.reports.episode import episode_at
 from runner.export.reports.evaluations import EvaluationTable, evaluation_table
 from runner.export.reports.maps import MapRow, maps_of, stages_of
@@ -89,8 +90,8 @@ class _ReportView(View):
     title: str
     runs: list[ReportedRun]
     plots: list[Plot]
-    legend: list[LegendEntry]
     footnote: str
+    legend: list[LegendEntry]
     columns: Sequence[Metric]
     """The metrics of the last evaluations that any run knows."""
     max_values: int = MAX_VALUES
@@ -102,13 +103,14 @@ def write_report(
     chosen: Sequence[Choice] = (),
     progress: Callable[[str], None] = lambda _: None,
     axis: Axis = EPISODES,
+    style: CurveStyle = PLAIN,
 ) -> list[str]:
     """Write the page about some recordings, and return what is missing from it, a sentence each.
 
     The chosen episodes are shown in addition to those that are always shown; `progress` is called with the
-    next stage of the work; the axis is that of the plots.
+    next stage of the work; axis and style are those of the plots.
     """
-    page, missing = render_report(recordings, chosen, progress, axis)
+    page, missing = render_report(recordings, chosen, progress, axis, style)
     path.write_text(page, encoding="utf-8")
     return missing
 
@@ -123,6 +125,7 @@ def render_report(
     chosen: Sequence[Choice] = (),
     progress: Callable[[str], None] = lambda _: None,
     axis: Axis = EPISODES,
+    style: CurveStyle = PLAIN,
 ) -> tuple[str, list[str]]:
     """Return the page about some recordings, and what is missing from it; see `write_report`."""
     require_packages()
@@ -142,7 +145,7 @@ def render_report(
         if not (metric.per_agent and any(run.has_tables for run in runs))
         and any(run.last is not None and run.last.value(metric.name) is not None for run in runs)
     ]
-    page = render(_ReportView(_title(runs), runs, plots_of(groups), legend, footnote(groups), columns))
+    page = render(_ReportView(_title(runs), runs, *plots_of(groups, style), legend, columns))
     return page, [*(note for run in runs for note in run.notes), *values_left_out(series)]
 
 

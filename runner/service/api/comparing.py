@@ -15,7 +15,15 @@ from runner.debugging.explanation_files import explanations_in, read_explanation
 from runner.errors import RunNotFound
 from runner.runs.run import Run
 from runner.service import computed
-from runner.service.api.reading import AxisName, Curves, FirstPosition, LastPosition, Metrics, Points
+from runner.service.api.reading import (
+    AxisName,
+    Curves,
+    FirstPosition,
+    LastPosition,
+    Metrics,
+    Points,
+    Smooth,
+)
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import (
     CacheOf,
@@ -104,11 +112,13 @@ async def curves(
     stop: LastPosition = None,
     points: Points = 0,
     lines: Annotated[bool, Query(description="Include the single runs of each curve.")] = False,
+    smooth: Smooth = 0,
 ) -> Response:
     """Return every metric over an axis, runs that differ in nothing but the seed as one curve with a band."""
     runs = await found_runs(catalogue, run)
     key = ("curves", *map(recording_state, runs), request.url.query)
-    options = ([found.recording for found in runs], axis, tuple(metric or ()), start, stop, points, lines)
+    paths, names = [found.recording for found in runs], tuple(metric or ())
+    options = (paths, axis, names, start, stop, points, lines, smooth)
     body = await cache.get_or_await(key, lambda: processes(computed.curves, *options), ALWAYS)
     return Response(body, media_type="application/json")
 

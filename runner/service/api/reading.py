@@ -12,6 +12,7 @@ from runner.analysis.axes import AXES, EPISODES
 from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.debugging.expressions import MAX_CHARACTERS
 from runner.debugging.why import LIMIT, MAX_LIMIT
+from runner.export.plots.metrics import CurveStyle
 from runner.recording.reader import Recording
 from runner.service import computed
 from runner.service.computed import too_many
@@ -70,6 +71,15 @@ LastPosition = Annotated[
     float | None, Query(ge=0, allow_inf_nan=False, description="The first position not included.")
 ]
 Points = Annotated[int, Query(ge=0, le=100_000, description="Maximum of a curve; 0: all.")]
+Smooth = Annotated[
+    float,
+    Query(
+        ge=0,
+        le=100,
+        allow_inf_nan=False,
+        description="Memory of an exponential mean, in percent of the axis from start to stop; 0: none.",
+    ),
+]
 
 
 class Curve(BaseModel):
@@ -85,6 +95,8 @@ class Curve(BaseModel):
     positions: list[float]
     values: list[float | None]
     """Of several runs, their interquartile mean; below four runs, their mean."""
+    smoothed: list[float] | None
+    """The exponential mean of the values, if it was requested."""
     low: list[float | None] | None
     """Of several runs, the lower end of the 95 % interval; below four runs, the lowest."""
     high: list[float | None] | None
@@ -178,13 +190,15 @@ async def metrics(
     start: FirstPosition = 0,
     stop: LastPosition = None,
     points: Points = 0,
+    smooth: Smooth = 0,
 ) -> Response:
     """Return every metric over an axis, as plots show it.
 
     With `points`, longer curves have the lowest and the highest value of each section only, and `thinned` is
     true; `start` and `stop` select a part at full resolution.
     """
-    return _json(await compute(computed.run_curves, axis, tuple(metric or ()), start, stop, points))
+    names = tuple(metric or ())
+    return _json(await compute(computed.run_curves, axis, names, start, stop, points, False, smooth))
 
 
 @router.get(
@@ -344,9 +358,17 @@ async def whole_q_table(compute: ComputationOf, step: Step = None, episode: Epis
     responses=media_docs(*MEDIA.values()) | BUSY,
     summary="Every metric in one figure.",
 )
-async def plot(compute: ComputationOf, form: Literal["svg", "png", "pdf"]) -> Response:
+async def plot(
+    compute: ComputationOf,
+    form: Literal["svg", "png", "pdf"],
+    axis: AxisName = EPISODES.name,
+    smooth: Smooth = 0,
+    log_x: Annotated[bool, Query(description="A logarithmic horizontal axis.")] = False,
+    log_y: Annotated[bool, Query(description="Logarithmic vertical axes.")] = False,
+) -> Response:
     """Return the figure that `dualtaxi plot` draws."""
-    return Response(await compute(computed.plot, form), media_type=MEDIA[form])
+    style = CurveStyle(smooth=smooth, log_x=log_x, log_y=log_y)
+    return Response(await compute(computed.plot, form, axis, style), media_type=MEDIA[form])
 
 
 def _refuse_both(step: int | None, episode: int | None) -> None:

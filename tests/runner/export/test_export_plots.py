@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import re
 from statistics import mean
 
 import numpy as np
@@ -162,6 +163,21 @@ def test_a_full_disk_is_no_fault_of_the_input(pictured, tmp_path, monkeypatch):
     assert result.exit_code == 1
     assert "cannot be written (No space left on device)" in result.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_axis_smoothing_and_logarithms_are_options_of_plot_and_report(pictured, tmp_path):
+    run = pictured("taxis")
+    words = ("--axis", "steps", "--smooth", "10", "--log-x", "--log-y", "--lines")
+    for command, name in (("plot", "p.svg"), ("report", "r.html")):
+        path = tmp_path / name
+        done = CliRunner().invoke(cli, [command, str(run.folder), *words, "-o", str(path)])
+        assert done.exit_code == 0, done.output
+        text = " ".join(re.sub(r"<[^>]*>", " ", path.read_text()).split())
+        assert "memory of 10 % of the axis" in text
+        assert "On logarithmic axes" in text
+        assert "training steps" in text
+    assert "0<=x<=100" in plot(run.folder, "--smooth", "101").stderr
+    assert "a figure of its own" in plot(run.folder, "--normalise", "minmax", "--log-y").stderr
 
 
 def test_a_name_stands_for_all_its_runs(pictured, tmp_path):

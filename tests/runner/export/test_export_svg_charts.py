@@ -11,7 +11,7 @@ import pytest
 from runner.analysis.axes import EPISODES
 from runner.export.plots.chart import Scale
 from runner.export.plots.curves import panel_chart
-from runner.export.plots.metrics import Curve, Panel
+from runner.export.plots.metrics import Curve, CurveStyle, Panel, not_drawn, smoothed
 from runner.recording.metrics import SHARES
 
 
@@ -50,6 +50,35 @@ def test_a_chart_is_well_formed_and_its_lines_are_inside(curves):
     assert len(drawn) == len(curves)
     for points in drawn:
         assert ((points >= [49.9, 31.9]) & (points <= [280.1, 146.1])).all()
+
+
+@pytest.mark.parametrize("log_x", [False, True])
+@pytest.mark.parametrize("values", [[800.0, 90.0, 0.0, 0.0, 4.0, 0.0], [-3.0, 0.0, -2.0, -1.0], [5.0]])
+def test_smoothed_and_logarithmic_lines_are_inside_with_the_values_faintly_behind(values, log_x):
+    style = CurveStyle(lines=True, smooth=20, log_x=log_x, log_y=True)
+    panel = Panel("event.pickup", "Pickups", "per trial", (curve(values, spread=1.0),), EPISODES)
+    chart = panel_chart(panel, 1, style)
+    is_log = max(values[1:] if log_x else values, default=0) > 0
+    assert chart.y.log == (is_log or len(values) == 1)
+    svg = chart.svg()
+    assert "nan" not in svg
+    assert "inf" not in svg
+    drawn = lines_of(svg)
+    for points in drawn:
+        assert ((points >= [49.9, 31.9]) & (points <= [280.1, 146.1])).all()
+    assert svg.count('opacity="0.35"') == 1
+    note = not_drawn([panel], style)
+    assert ("left out of “Pickups”" in note) == (len(values) > 1 and (log_x or chart.y.log))
+    assert ("no value is positive in “Pickups”" in note) == (not chart.y.log)
+
+
+def test_the_exponential_mean_has_its_memory_in_units_of_the_axis():
+    step = np.concatenate([[0.0], np.ones(50)])
+    sparse = smoothed(np.arange(51) * 2.0, step, 10.0)
+    assert sparse[5] == pytest.approx(1 - np.exp(-1))
+    dense_places = np.linspace(0, 100, 1001)
+    dense = smoothed(dense_places, (dense_places > 0).astype(float), 10.0)
+    assert dense[100] == pytest.approx(sparse[5])
 
 
 def test_a_long_line_keeps_every_spike():

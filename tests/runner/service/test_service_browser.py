@@ -138,8 +138,8 @@ def test_axis_smoothing_and_logarithmic_scales_are_chosen_and_kept_in_the_addres
     wait(browser, lambda: "axis=steps" in browser.current_url)
     set_field(browser, "smooth", "5")
     wait(browser, lambda: "5 % of the axis" in text_of(browser, "form.zoom"))
-    set_field(browser, "logy", True)
-    wait(browser, lambda: "logy=1" in browser.current_url)
+    set_field(browser, "log_y", True)
+    wait(browser, lambda: "log_y=1" in browser.current_url)
     caption = "not logarithmic: no value is positive"  # returns of the taxis are negative
     wait(browser, lambda: caption in text_of(browser, ".plots"))
     browser.refresh()

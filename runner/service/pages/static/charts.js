@@ -20,13 +20,13 @@ function chosen() {
   const number = (name) => query.get(name) ? Number(query.get(name)) : null;
   return {
     axis: query.get("axis") ?? "episodes", from: number("from"), to: number("to"), smooth: number("smooth") ?? 0,
-    logx: query.has("logx"), logy: query.has("logy"), lines: query.has("lines"),
+    log_x: query.has("log_x"), log_y: query.has("log_y"), lines: query.has("lines"),
   };
 }
 
 function fill(state) {
   for (const name of ["from", "to"]) fields[name].value = state[name] ?? "";
-  for (const name of ["logx", "logy", "lines"]) fields[name].checked = state[name];
+  for (const name of ["log_x", "log_y", "lines"]) fields[name].checked = state[name];
   fields.smooth.value = state.smooth;
   fields.smoothed.value = state.smooth ? `${state.smooth} % of the axis` : "none";
 }
@@ -45,12 +45,13 @@ function change(changes, keep = true) {
 // --- data -----------------------------------------------------------------------------------------------
 
 async function draw() {
-  const mine = ++requests, { axis, from, to, lines } = chosen();
+  const mine = ++requests, { axis, from, to, lines, smooth } = chosen();
   const query = new URLSearchParams({ axis, points: Math.max(400, Math.round(plots.clientWidth)) });
   for (const run of runs) query.append("run", run.id);
   if (from !== null) query.set("start", Math.max(0, from));
   if (to !== null) query.set("stop", axis === "time" ? to : to + 1);
   if (lines) query.set("lines", "true");
+  if (smooth) query.set("smooth", smooth);
   box.setAttribute("aria-busy", "true");
   try {
     const found = await request(`/api/v1/curves?${query}`);
@@ -101,28 +102,16 @@ function groupName(number) {
   return own.length <= 5 ? `${letters}: ${label}` : `${label}, ${own.length} runs`;
 }
 
-// An exponential mean whose memory is a share of the visible axis, so that it does not depend on how many points
-// there are. The first value begins it.
-function smoothed(positions, values, memory) {
-  let mean = null, before = 0;
-  return values.map((value, i) => {
-    if (value === null) return null;
-    mean = mean === null ? value : mean + (1 - Math.exp(-(positions[i] - before) / memory)) * (value - mean);
-    before = positions[i];
-    return mean;
-  });
-}
-
 // The series of a plot: for each curve its band, its single runs, its values (faint if they are smoothed), and
 // the smoothed line. A logarithmic axis leaves out what is not positive, and is linear if nothing is.
 function seriesOf(panel, state) {
   const lines = [...new Set(panel.curves.map((curve) => curve.line))];
-  const logy = state.logy && panel.curves.some((curve) => curve.values.some((value) => value > 0));
+  const logy = state.log_y && panel.curves.some((curve) => curve.values.some((value) => value > 0));
   const series = [];
   let left = 0;
   for (const curve of panel.curves) {
     const at = lines.indexOf(curve.line), several = last.groups.length > 1;
-    const keep = curve.positions.map((place, i) => !(state.logx && place <= 0) && !(logy && curve.values[i] !== null && curve.values[i] <= 0));
+    const keep = curve.positions.map((place, i) => !(state.log_x && place <= 0) && !(logy && curve.values[i] !== null && curve.values[i] <= 0));
     left += keep.filter((kept) => !kept).length;
     const only = (values) => values.filter((_, i) => keep[i]).map((value) => logy && value <= 0 ? null : value);
     const positions = curve.positions.filter((_, i) => keep[i]);
@@ -134,11 +123,10 @@ function seriesOf(panel, state) {
     }
     curve.runs.forEach((values, i) => add(only(values), { width: 0.7, points: false, stroke: `${base.stroke}aa`, label: `${named(last.groups[curve.group].runs[i])}${curve.line && lines.length > 1 ? `, ${spoken(curve.line)}` : ""}` }));
     const values = only(curve.values), label = labelOf(curve, lines);
-    if (!state.smooth || positions.length < 3) add(values, { label });
+    if (!curve.smoothed) add(values, { label });
     else {
-      const span = (state.to ?? positions.at(-1)) - (state.from ?? positions[0]);
       add(values, { stroke: `${base.stroke}55`, width: 1, points: false });
-      add(smoothed(positions, values, span * state.smooth / 100), { label, points: false });
+      add(only(curve.smoothed), { label, points: false });
     }
   }
   return { series, left, logy };
@@ -158,7 +146,7 @@ const spoken = (name) => name.replaceAll("_", " ");
 function plot(metric, panel) {
   const state = chosen(), { series, left, logy } = seriesOf(panel, state);
   const data = uPlot.join(series.map(({ positions, values }) => [positions, values]));
-  const kinds = JSON.stringify([series.map(({ label, stroke, width, points }) => [label, stroke, width, points]), state.logx, logy, state.axis, plots.clientWidth < 500]);
+  const kinds = JSON.stringify([series.map(({ label, stroke, width, points }) => [label, stroke, width, points]), state.log_x, logy, state.axis, plots.clientWidth < 500]);
   let one = shown.get(metric);
   if (one && one.kinds !== kinds) { one.chart.destroy(); one.chart = null; }
   if (!one) {
@@ -173,7 +161,7 @@ function plot(metric, panel) {
   const [title, unit] = [document.createElement("b"), document.createElement("span")];
   title.textContent = panel.title;
   unit.textContent = [panel.unit, panel.curves.some((curve) => curve.thinned) && "thinned",
-    state.logy && !logy && "not logarithmic: no value is positive",
+    state.log_y && !logy && "not logarithmic: no value is positive",
     left && `${left.toLocaleString("en")} point${left > 1 ? "s" : ""} at 0 or below left out`,
     series.every(({ positions }) => positions.length === 0) && "no point in this part"].filter(Boolean).join(", ");
   caption.replaceChildren(title, " ", unit);
@@ -258,7 +246,7 @@ function options(panel, series, state, logy, place, key) {
   return {
     width: place.clientWidth, height: 216, padding: [8, 22, 0, 0],
     scales: {
-      x: { time: false, ...scale(state.logx, (low, high) => [state.from ?? low ?? 0, state.to ?? high ?? 1]) },
+      x: { time: false, ...scale(state.log_x, (low, high) => [state.from ?? low ?? 0, state.to ?? high ?? 1]) },
       y: scale(logy, (low, high) => bounds(low, high, percent, positive)),
     },
     series: [{}, ...lines],
@@ -302,8 +290,13 @@ form.addEventListener("submit", (event) => {
 });
 fields.axis.addEventListener("change", () => { change({ axis: fields.axis.value, from: null, to: null }); draw(); document.dispatchEvent(new Event("axischange")); });
 fields.lines.addEventListener("change", () => { change({ lines: fields.lines.checked }); draw(); });
-for (const name of ["logx", "logy"]) fields[name].addEventListener("change", () => { change({ [name]: fields[name].checked }); if (last) show(); });
-fields.smooth.addEventListener("input", () => { change({ smooth: Number(fields.smooth.value) }, false); if (last) show(); });
+for (const name of ["log_x", "log_y"]) fields[name].addEventListener("change", () => { change({ [name]: fields[name].checked }); if (last) show(); });
+let sliding = 0;
+fields.smooth.addEventListener("input", () => {
+  change({ smooth: Number(fields.smooth.value) }, false);
+  clearTimeout(sliding);
+  sliding = setTimeout(draw, 150);
+});
 box.querySelector("[data-reset]").addEventListener("click", () => go(null, null));
 plots.addEventListener("dblclick", () => go(null, null));
 addEventListener("popstate", () => { fill(chosen()); draw(); });
