@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -70,14 +69,6 @@ def check(folder: Path, report: Callable[[int], None] = lambda _: None) -> Manif
     archive.check_files()
     _Restorer(archive, None, report).restore()
     return archive.manifest
-
-
-@dataclass(frozen=True)
-class _Row:
-    """A row of snapshots, and its step."""
-
-    step: int
-    row: Json
 
 
 class _Restorer:
@@ -208,13 +199,12 @@ class _Restorer:
         for batch in self._archive.batches(table.name, table.columns, self._archive.count(*table.topics), n):
             yield from batch.to_pylist()
 
-    def _snapshots(self) -> Iterator[_Row]:
+    def _snapshots(self) -> Iterator[tuple[int, Json]]:
         table = Table(layout.Q_TABLES, (schema.Q_TABLE_TOPIC,), layout.SCHEMAS[layout.Q_TABLES])
-        return (_Row(row["step"], row) for row in self._rows(table))
+        return ((row["step"], row) for row in self._rows(table))
 
-    def _restore_snapshot(self, tables: DerivedTables, snapshot: _Row) -> None:
+    def _restore_snapshot(self, tables: DerivedTables, row: Json) -> None:
         """Send a snapshot: its values, or those that the steps before it give."""
-        row = snapshot.row
         where = f"{self._where}: the Q-table of {row['agent']!r} after {row['step']} steps"
         if row["data"] is None:
             values = tables.at(row["step"], row["table"])

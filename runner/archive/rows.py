@@ -25,11 +25,6 @@ class PlacedTable:
     position: int
     table: QTable
 
-    @property
-    def step(self) -> int:
-        """The number of training steps before it."""
-        return self.table.step
-
 
 def message_row(topic: Topic, payload: bytes, shape: Shape) -> Message:
     """Return a message as the values of its columns, but run and position.

@@ -204,12 +204,12 @@ class _ArchiveWriter:
                 self._report(self._batches.steps)
             visitor.finish()
 
-    def _snapshots(self) -> Iterator[PlacedTable]:
+    def _snapshots(self) -> Iterator[tuple[int, PlacedTable]]:
         topic = schema.Q_TABLE_TOPIC
         for position, payload in self._batches.messages(topic):
             table = decode_q_table(payload)
             self._batches.compare(topic, position, encode_q_table(table), payload)
-            yield PlacedTable(position, table)
+            yield table.step, PlacedTable(position, table)
 
     def _snapshot_row(self, tables: DerivedTables, snapshot: PlacedTable) -> pa.RecordBatch:
         """Return the row of a snapshot: without its values if the steps before it give them."""

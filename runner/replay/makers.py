@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 import importlib.metadata
@@ -9,7 +10,7 @@ import importlib.util
 import inspect
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from gymnasium.envs.registration import EnvSpec
@@ -66,11 +67,7 @@ def make_environment(maker: EnvironmentMaker, trust: bool, render: bool = False)
     Raises:
         CannotRedo: it cannot be made; the message is why.
     """
-    if reason := why_not_made(maker, trust):
-        raise CannotRedo(reason)
-    if render:
-        _without_display()
-    try:
+    with _making("environment", maker, trust, render):
         if maker.make and trust:
             env = _made_by_function(maker.make, render)
         elif maker.kind == "pettingzoo":
@@ -78,22 +75,29 @@ def make_environment(maker: EnvironmentMaker, trust: bool, render: bool = False)
         else:
             env = _made(maker, trust, render)
         return Turns(env) if maker.kind == "pettingzoo" and is_in_turns(env) else env
-    except CannotRedo:
-        raise
-    except MemoryError:
+
+
+@contextlib.contextmanager
+def _making(what: str, maker: EnvironmentMaker, trust: bool, render: bool) -> Iterator[None]:
+    """Refuse what cannot be made, and raise what foreign code raises in the block as `CannotRedo`."""
+    if reason := why_not_made(maker, trust):
+        raise CannotRedo(reason)
+    if render:
+        _without_display()
+    try:
+        yield
+    except (CannotRedo, MemoryError):
         raise
     except Exception as error:  # foreign code raises anything
         raise CannotRedo(
-            f"The environment cannot be made here: {type(error).__name__}: {_short(error)}"
+            f"The {what} cannot be made here: {type(error).__name__}: {_short(error)}"
         ) from error
 
 
 def is_whole_vector(maker: EnvironmentMaker) -> bool:
     """Return whether a vector cannot be taken apart: its environments are not independent of one another."""
     vector = maker.vector
-    if vector is None:
-        return False
-    if vector.is_vec_env:
+    if vector is None or vector.is_vec_env:
         return False
     return vector.mode == "custom" or bool(maker.make) or bool(vector_wrappers(vector))
 
@@ -115,20 +119,10 @@ def make_vector(maker: EnvironmentMaker, trust: bool, render: bool = False) -> o
     Raises:
         CannotRedo: it cannot be made; the message is why.
     """
-    if reason := why_not_made(maker, trust):
-        raise CannotRedo(reason)
-    if render:
-        _without_display()
-    try:
+    with _making("vector environment", maker, trust, render):
         if maker.make and trust:
             return _made_by_function(maker.make, render)
         return _made_vector(maker, trust, render)
-    except (CannotRedo, MemoryError):
-        raise
-    except Exception as error:  # foreign code raises anything
-        raise CannotRedo(
-            f"The vector environment cannot be made here: {type(error).__name__}: {_short(error)}"
-        ) from error
 
 
 def _made_vector(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import heapq
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ _ROWS: Final = 1024
 """Steps of varying size in a piece."""
 _FOREVER: Final = 2**63 - 1
 _BLOCK_BYTES: Final = 16 << 20
+T = TypeVar("T")
 _Row = tuple[Any, ...]
 """Number, environment, episode, step, time, seed, whether it has one, and observation of a reset."""
 _Extra = tuple[dict[str, object] | None, int | None]
@@ -157,9 +158,9 @@ def _with_extras(
         if not here:
             yield from ((row, None, None) for row in group)
             continue
-        calls = list(_calls(group))
-        none: list[_Extra] = [(None, None)] * (len(calls) - len(here))
-        for call, (options, seed) in zip(calls, [*none, *here[-len(calls) :]], strict=True):
+        of_group = list(calls(group, lambda row: row[1]))
+        none: list[_Extra] = [(None, None)] * (len(of_group) - len(here))
+        for call, (options, seed) in zip(of_group, [*none, *here[-len(of_group) :]], strict=True):
             yield from ((row, options, seed) for row in call)
 
 
@@ -186,14 +187,14 @@ def _extras(
         )
 
 
-def _calls(rows: Iterable[_Row]) -> Iterator[list[_Row]]:
+def calls(resets: Iterable[T], environment_of: Callable[[T], int]) -> Iterator[list[T]]:
     """Yield the resets of each call; within a call, the environments are in order."""
-    call: list[_Row] = []
-    for row in rows:
-        if call and row[1] <= call[-1][1]:
+    call: list[T] = []
+    for reset in resets:
+        if call and environment_of(reset) <= environment_of(call[-1]):
             yield call
             call = []
-        call.append(row)
+        call.append(reset)
     if call:
         yield call
 

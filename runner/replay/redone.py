@@ -31,16 +31,10 @@ class Values:
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
 
-    def since(self, row: int) -> Values:
-        """Return the values from a row on."""
+    def part(self, rows: slice) -> Values:
+        """Return the values of some rows."""
         return Values(
-            self.observations[row:], self.rewards[row:], self.terminated[row:], self.truncated[row:]
-        )
-
-    def first(self, rows: int) -> Values:
-        """Return the values of the first rows."""
-        return Values(
-            self.observations[:rows], self.rewards[:rows], self.terminated[:rows], self.truncated[:rows]
+            self.observations[rows], self.rewards[rows], self.terminated[rows], self.truncated[rows]
         )
 
 
@@ -91,10 +85,11 @@ class RedoneSteps:
         at = int(np.searchsorted(self.step, step))
         kept = {name: getattr(self, name)[at:] for name in ("step", "episode", "t", "actions", "frames")}
         starts = tuple(start._replace(row=start.row - at) for start in self.starts if start.row >= at)
-        return replace(self, **kept, recorded=self.recorded.since(at), got=self.got.since(at), starts=starts)
+        recorded, got = (values.part(slice(at, None)) for values in (self.recorded, self.got))
+        return replace(self, **kept, recorded=recorded, got=got, starts=starts)
 
     def without_rows(self) -> RedoneSteps:
         """Return the difference alone: it is in an episode before the requested one."""
         empty = {name: getattr(self, name)[:0] for name in ("step", "episode", "t", "actions")}
-        recorded, got = self.recorded.first(0), self.got.first(0)
+        recorded, got = (values.part(slice(0)) for values in (self.recorded, self.got))
         return replace(self, **empty, recorded=recorded, got=got, starts=(), frames=())

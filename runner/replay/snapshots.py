@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,24 +56,19 @@ class DerivedTables:
         replay.rewind(step, held_of(tables, replay.kinds))
 
 
-class Snapshot(Protocol):
-    """A table at a step."""
-
-    @property
-    def step(self) -> int:
-        """Training steps taken."""
-
-
-S = TypeVar("S", bound=Snapshot)
+S = TypeVar("S")
 
 
 class SnapshotVisitor(Generic[S]):
     """Calls a function with each snapshot of a run, after the training steps before it were applied.
 
     `tables`: moved forward by the steps.
+    `snapshots`: each with the number of training steps before it.
     """
 
-    def __init__(self, tables: DerivedTables, snapshots: Iterator[S], visit: Callable[[S], None]) -> None:
+    def __init__(
+        self, tables: DerivedTables, snapshots: Iterator[tuple[int, S]], visit: Callable[[S], None]
+    ) -> None:
         self._tables = tables
         self._snapshots = snapshots
         self._visit = visit
@@ -81,8 +76,8 @@ class SnapshotVisitor(Generic[S]):
 
     def take(self, steps: NDArray[np.void]) -> None:
         """Take the next training steps."""
-        while self._next is not None and self._next.step <= int(steps["step"][-1]):
-            before = int(np.searchsorted(steps["step"], self._next.step))
+        while self._next is not None and self._next[0] <= int(steps["step"][-1]):
+            before = int(np.searchsorted(steps["step"], self._next[0]))
             self._tables.take(steps[:before])
             self._visit_next()
             steps = steps[before:]
@@ -95,5 +90,5 @@ class SnapshotVisitor(Generic[S]):
 
     def _visit_next(self) -> None:
         assert self._next is not None
-        self._visit(self._next)
+        self._visit(self._next[1])
         self._next = next(self._snapshots, None)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from runner.environments.gym_types import AnyVectorEnv, Space
@@ -15,9 +14,9 @@ from runner.recording import schema
 from runner.recording.gym_values import filler, leaves_of, put_chosen
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value
-from runner.replay.recorded import RecordedReset
+from runner.replay.recorded import RecordedReset, calls
 from runner.replay.redone import Frame
-from runner.replay.stepping import Results, Stepper
+from runner.replay.stepping import Results, Stepper, values_in
 from runner.util.arrays import Array
 
 _Numbered = tuple[int, RecordedReset]
@@ -59,7 +58,8 @@ class VectorStepper(Stepper):
         by_time: dict[int, list[_Numbered]] = {}
         for number, (time, reset) in enumerate(resets):
             by_time.setdefault(time, []).append((number, reset))
-        actions = _batches(self.action_space, self._raw_actions(rows), n)
+        column = self._raw_actions(rows)
+        actions = values_in(self.action_space, column.reshape(times, n, *column.shape[1:]))
         only_reset = (rows["t"] == schema.RESET_ONLY).reshape(times, n)
         try:
             for time in range(times):
@@ -117,7 +117,7 @@ class VectorStepper(Stepper):
                 results.first_observations[number] = self._last[own]
             else:
                 explicit.append((number, reset))
-        for call in _calls(explicit):
+        for call in calls(explicit, lambda numbered: numbered[1].environment):
             which = np.zeros(self._n, np.bool_)
             which[[reset.environment for _, reset in call]] = True
             options = dict(call[0][1].options or {}) | ({} if which.all() else {"reset_mask": which})
@@ -176,26 +176,3 @@ def final_observations(infos: Any) -> Value:
         return infos.get("final_obs")
     last = [info.get("terminal_observation") for info in infos]  # as SuperSuit's vectors return them
     return last if any(value is not None for value in last) else None
-
-
-def _calls(resets: Sequence[_Numbered]) -> Iterator[list[_Numbered]]:
-    """Yield the resets of each call; within a call, the environments are in order."""
-    call: list[_Numbered] = []
-    for numbered in resets:
-        if call and numbered[1].environment <= call[-1][1].environment:
-            yield call
-            call = []
-        call.append(numbered)
-    if call:
-        yield call
-
-
-def _batches(space: Space, column: NDArray[Any], n: int) -> Sequence[Value]:
-    """Return a column of actions as batches of n, as a vector takes them."""
-    if isinstance(space, spaces.Dict):
-        parts = {key: _batches(part, column[str(key)], n) for key, part in space.spaces.items()}
-        return [{key: part[time] for key, part in parts.items()} for time in range(len(column) // n)]
-    if isinstance(space, spaces.Tuple):
-        columns = [_batches(part, column[str(i)], n) for i, part in enumerate(space.spaces)]
-        return list(zip(*columns, strict=True))
-    return list(np.array(column).reshape(len(column) // n, n, *column.shape[1:]))

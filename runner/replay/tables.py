@@ -38,10 +38,6 @@ class TableReplay(StepReplay):
         self._load(*self._nearest(step))
         self.advance(step)
 
-    def advance(self, step: int) -> None:
-        """Replay up to a later step."""
-        self._advance(step)
-
     def rows(self, stop: int) -> NDArray[np.float64]:
         """Replay up to a step, and return the values that the learners saw on the way.
 
@@ -50,7 +46,7 @@ class TableReplay(StepReplay):
             beyond a learner's own actions.
         """
         seen = self.empty_rows(max(stop - self.step, 0))
-        self._advance(stop, rows=seen)
+        self.advance(stop, rows=seen)
         return seen
 
     def updates(self, stop: int, learner: int) -> NDArray[np.void]:
@@ -61,7 +57,7 @@ class TableReplay(StepReplay):
         """
         trace = Trace(np.empty(max(stop - self.step, 0), UPDATE), learner)
         first = self.step
-        self._advance(stop, trace=trace)
+        self.advance(stop, trace=trace)
         unknown = np.flatnonzero(trace.updates["outcome"] == UNKNOWN_OUTCOME)
         if len(unknown):
             raise RecordingError(
@@ -94,13 +90,18 @@ class TableReplay(StepReplay):
         nearest = _snapshot_before(self._recording, step, self.kinds)
         if nearest is None:
             raise RecordingError(f"{self._recording.path}: has no Q-table at or before step {step}.")
-        _check_shapes(self._recording, nearest[1], self.held)
+        found, own = (
+            [table.shape for one in held for table in one.values()] for held in (nearest[1], self.held)
+        )
+        if found != own:
+            raise RecordingError(f"{self._where}: found Q-tables of shape {found}, expected {own}.")
         if step - nearest[0] <= CHECKPOINT_STEPS:
             return nearest
         at, tables = self._checkpoints.nearest(step, [table.shape for table in self.snapshot()])
         return (at, held_of(tables, self.kinds)) if at > nearest[0] else nearest
 
-    def _advance(self, stop: int, rows: NDArray[np.float64] = NO_ROWS, trace: Trace | None = None) -> None:
+    def advance(self, stop: int, rows: NDArray[np.float64] = NO_ROWS, trace: Trace | None = None) -> None:
+        """Replay up to a later step; `rows` and `trace` are filled as `apply` fills them."""
         first = self.step
         if stop < first:
             raise RecordingError(f"a replay at step {first} cannot go back to {stop}; start another.")
@@ -111,17 +112,12 @@ class TableReplay(StepReplay):
                 at = slice(self.step - first, self.step - first + len(part))
                 own = None if trace is None else Trace(trace.updates[at], trace.learner)
                 self.apply(part, rows[at], trace=own)
-                self._keep_checkpoint()
+                is_far = self._origin is not None and self.step - self._origin >= CHECKPOINT_STEPS
+                if is_far and self.step % CHECKPOINT_STEPS == 0:  # no snapshot is near before it
+                    self._checkpoints.save(self.step, self.snapshot())
         self._checkpoints.prune()
         if self.step < stop:
             raise self._lost(stop)
-
-    def _keep_checkpoint(self) -> None:
-        """Keep the tables for later replays where no snapshot is near before them."""
-        if self._origin is None or self.step % CHECKPOINT_STEPS or self.step == self._origin:
-            return
-        if self.step - self._origin >= CHECKPOINT_STEPS:
-            self._checkpoints.save(self.step, self.snapshot())
 
     def _missing(self, stop: int) -> RecordingError:
         recording = self._recording
@@ -170,12 +166,6 @@ def initially_held(recording: Recording) -> list[Held] | None:
     """Return the learners' tables before training, from the first snapshot; None if that is missing."""
     nearest = _snapshot_before(recording, 0, kinds_of(from_mapping(recording.config)))
     return nearest and nearest[1]
-
-
-def _check_shapes(recording: Recording, found: list[Held], expected: list[Held]) -> None:
-    shapes = [[table.shape for one in held for table in one.values()] for held in (found, expected)]
-    if shapes[0] != shapes[1]:
-        raise RecordingError(f"{recording.path}: found Q-tables of shape {shapes[0]}, expected {shapes[1]}.")
 
 
 def _snapshot_before(
