@@ -82,27 +82,41 @@ def branch_training(
         RunnerError: the episodes before the branch are not those of the parent.
         StorageError: the folder of the new run cannot be written.
     """
-    place = parse_step(at) if isinstance(at, str) else at
-    run_name, folder = checked_run_name(name), recordings_folder(recordings)
+    run_name, folder = branch_name(run, name), recordings_folder(recordings)
     with open_recording(run.recording) as recording:
-        job, where = _job_of(recording, place, action, overrides, episodes)
-        fresh = create_run(folder, job.config, job.seed, run_name or f"{run.name[:90]}.branch")
-        with unless_empty(fresh):
-            own = run_job(job, fresh, report, stop, mdp=recording.mdp, initial=recorded_tables(recording))
-        _check_beginning(recording, own, where.episode)
+        job, where = branch_job(recording, at, action, overrides, episodes)
+        own = train_branch(recording, job, create_run(folder, job.config, job.seed, run_name), report, stop)
     origin = origin_in(job.config.to_mapping())
     assert isinstance(origin, TrainingOrigin)
     return TrainingBranch(own, origin, where)
 
 
-def _job_of(
+def branch_name(run: Run, name: str | None = None) -> str:
+    """Return the name of a branch of a run: the one that was chosen, checked, or `NAME.branch`."""
+    return checked_run_name(name) or f"{run.name[:90]}.branch"
+
+
+def train_branch(parent: Recording, job: Job, run: Run, report: Report, stop: Stop) -> Run:
+    """Train the job of a branch as a run, in the environment that its parent recorded.
+
+    Raises:
+        RunnerError: the episodes before the branch are not those of the parent.
+    """
+    with unless_empty(run):
+        own = run_job(job, run, report, stop, mdp=parent.mdp, initial=recorded_tables(parent))
+    _check_beginning(parent, own, reference_to(parent, job.config.branches[-1].step).episode)
+    return own
+
+
+def branch_job(
     recording: Recording,
-    at: int | StepRef,
+    at: str | int | StepRef,
     action: Action | None,
     overrides: Sequence[str],
     episodes: int | None,
 ) -> tuple[Job, StepRef]:
-    """Return the job of a branch, and its step by its episode."""
+    """Return the job of a branch, and its step by its episode; arguments as for `branch_training`."""
+    at = parse_step(at) if isinstance(at, str) else at
     parent, taken = from_mapping(recording.config), training_steps(recording)
     step = taken if at == taken else training_step(recording, at)  # from the end on, training can be longer
     where, now = reference_to(recording, step), parent.from_step(step)

@@ -19,7 +19,7 @@ from pydantic import BaseModel
 
 from runner.errors import RunnerError
 from runner.service import login, pages
-from runner.service.api import comparing, debugging, files, jobs, reading, replay, runs, uploads
+from runner.service.api import comparing, debugging, files, jobs, questions, reading, replay, runs, uploads
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CatalogueOf, SettingsOf
 from runner.service.guard import Guard
@@ -99,7 +99,7 @@ def create_app(settings: Settings) -> FastAPI:
         HTTPStatus.TOO_MANY_REQUESTS,
         HTTPStatus.INSUFFICIENT_STORAGE,
     )
-    for part in (runs, reading, replay, debugging, comparing, files, jobs, uploads):
+    for part in (runs, reading, replay, debugging, questions, comparing, files, jobs, uploads):
         app.include_router(part.router, prefix=API, responses=general)
     for router in (health, login.router, pages.router):
         app.include_router(router)

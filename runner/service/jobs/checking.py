@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, ParamSpec
 
 from runner.config import from_text
 from runner.config.document import Document, Problem, read_yaml
@@ -28,6 +28,7 @@ from runner.sweep.loading import from_text as sweep_from_text
 from runner.sweep.search import Search, require_optuna
 from runner.util.processes import OutOfMemory, ProcessDied, TimedOut
 
+Args = ParamSpec("Args")
 PROCESSES: Final = 2
 """Checks that run at the same time."""
 CHECK_SECONDS: Final = 30.0
@@ -46,7 +47,7 @@ SWEEP_KEYS: Final = ("base", "parameters", "strategy")
 
 @dataclass(frozen=True)
 class CheckedJob:
-    """The meaning of a submitted text."""
+    """The meaning of a submitted text, or of a question about runs."""
 
     kind: Kind
     name: str
@@ -133,7 +134,13 @@ class JobChecker:
         """Return the meaning of a text, without blocking a thread of the server; see the function `check`."""
         if len(text) > MAX_BYTES or len(text.encode()) > MAX_BYTES:
             raise ConfigError(f"{source}: larger than 1 MiB, expected a configuration of a few kilobytes")
-        future = self._pool.submit(_check_as_config_errors, text, source, self._recordings)
+        return await self.call(source, _check_as_config_errors, text, source, self._recordings)
+
+    async def call(
+        self, source: str, function: Callable[Args, CheckedJob], *args: Args.args, **keywords: Args.kwargs
+    ) -> CheckedJob:
+        """Return the job that a function returns in a child process; `source` begins the messages."""
+        future = self._pool.submit(function, *args, **keywords)
         waiting = asyncio.wrap_future(future)
         done, _ = await asyncio.wait({waiting}, timeout=QUEUE_SECONDS)
         if not done and future.cancel():

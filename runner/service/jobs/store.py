@@ -39,7 +39,7 @@ from runner.util.values import JsonView
 if TYPE_CHECKING:
     from filelock import FileLock
 
-Kind = Literal["config", "sweep"]
+Kind = Literal["config", "sweep", "branch"]
 State = Literal["queued", "running", "interrupted", "finished", "failed", "cancelled"]
 
 FOLDER: Final = ".jobs"

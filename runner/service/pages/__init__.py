@@ -5,6 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter
 
 from runner.service.pages import (
+    branch,
     compare,
     environments,
     episodes,
@@ -29,7 +30,7 @@ __all__ = ["add_error_handlers", "refused", "router"]
 
 router = APIRouter(include_in_schema=False)
 for _module in (
-    *(runs, rerun, run, setup, replay, when, why, what_if, environments, episodes),
+    *(runs, rerun, run, setup, replay, when, why, what_if, branch, environments, episodes),
     *(compare, machine, submit, jobs, sweeps, explanations, static),
 ):
     router.include_router(_module.router)

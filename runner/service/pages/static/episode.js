@@ -3,13 +3,14 @@ import { onKeys, partAt } from "./parts.js";
 import { picturesOf } from "./pictures.js";
 
 const root = document.querySelector("[data-part]"), source = root.dataset.part;
-const [toRerun, toWhatIf] = ["rerun", "what-if"].map((name) => root.querySelector(`[data-to-${name}]`));
+const [toRerun, toWhatIf, toBranch] = ["rerun", "what-if", "branch"].map((name) => root.querySelector(`[data-to-${name}]`));
 let writing = null;
 
 // Browsers limit how often the address may change, so a playing replay does not write every step.
 function moved(k) {
   if (toRerun) toRerun.href = `${root.dataset.rerun}:${Math.max(0, k - 1)}`;
   if (toWhatIf) toWhatIf.href = `${root.dataset.whatIf}:${Math.min(k, replay.length - 1)}`;
+  if (toBranch) toBranch.href = toBranch.href.replace(/[0-9]+$/, Math.min(k, replay.length - 1));
   clearTimeout(writing);
   writing = setTimeout(() => history.replaceState(null, "", `?t=${k}`), 150);
 }

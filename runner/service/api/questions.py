@@ -1,0 +1,73 @@
+"""Questions about runs that are answered by training: jobs of the queue."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+from pathlib import Path
+from typing import Annotated
+
+from fastapi import APIRouter, Request, Response
+from pydantic import BaseModel, Field
+from starlette.concurrency import run_in_threadpool
+
+from runner.config.document import write_yaml
+from runner.runs.run import Run
+from runner.service.api.jobs import JobResponse, job_response
+from runner.service.dependencies import JobsOf, RecordedRun
+from runner.service.errors import Refused
+from runner.service.jobs.branches import BranchQuestion, check_branch
+from runner.service.jobs.checking import CheckedJob
+from runner.service.jobs.queue import JobQueue
+from runner.service.jobs.store import Job
+from runner.service.problems import error_docs
+
+router = APIRouter(
+    tags=["jobs"], responses=error_docs(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT, HTTPStatus.BAD_REQUEST)
+)
+Text = Annotated[str, Field(max_length=1000)]
+
+
+class BranchRequest(BaseModel, extra="forbid"):
+    """A change of a training step; as the options of `dualtaxi branch`."""
+
+    at: Text | int = Field(description="The first step that may differ: `EPISODE:T`, or its number.")
+    action: Text | int | dict[Text, Text | int] | None = Field(
+        default=None, description="A joint action, or one by agent; names or numbers. Null: as recorded."
+    )
+    overrides: list[Text] = Field(default=[], max_length=100, description="`KEY=VALUE` each, as for `--set`.")
+    episodes: int | None = Field(default=None, ge=1, description="Training episodes in all.")
+    name: Text | None = Field(default=None, description="Name of the new run; `NAME.branch` by default.")
+
+
+@router.post(
+    "/runs/{run}/branch",
+    status_code=HTTPStatus.CREATED,
+    response_model=JobResponse,
+    summary="Branch the training of a run: another action at a step, or other settings from it on.",
+)
+async def branch(
+    run: RecordedRun, jobs: JobsOf, sent: BranchRequest, request: Request, response: Response
+) -> JobResponse:
+    """Queue a branch of training, as `dualtaxi branch` records it; of a run that was trained here."""
+    job = await queue_branch(run, jobs, BranchQuestion(**dict(sent)))
+    response.headers["location"] = f"{request.app.url_path_for('list_jobs')}/{job.number}"
+    return await run_in_threadpool(job_response, job, jobs)
+
+
+async def queue_branch(run: Run, jobs: JobQueue, question: BranchQuestion) -> Job:
+    """Check a branch of training, and queue it."""
+    _require_own(run, jobs.recordings)
+    return await _queue(jobs, await jobs.checker.call(f"run {run.run_id}", check_branch, run, question))
+
+
+def _require_own(run: Run, recordings: Path) -> None:
+    """Refuse a run that jobs do not find, as they work in one folder."""
+    if run.folder.resolve().parent != recordings.resolve():
+        raise Refused(
+            HTTPStatus.CONFLICT,
+            f"run {run.run_id} is in a folder that this service only reads; branch it where it was recorded.",
+        )
+
+
+async def _queue(jobs: JobQueue, checked: CheckedJob) -> Job:
+    return await run_in_threadpool(jobs.add, write_yaml(checked.values), checked)

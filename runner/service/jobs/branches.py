@@ -1,0 +1,49 @@
+"""A job that branches the training of a run: checked, and run as a run of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from runner.archive.places import at_hand
+from runner.config.job import Job
+from runner.errors import RunnerError
+from runner.execution.branching import Action, branch_job, branch_name, train_branch
+from runner.execution.estimate import estimate
+from runner.execution.session import Report, Stop
+from runner.recording.reader import open_recording
+from runner.runs.resolve import run_of_id
+from runner.runs.run import Run
+from runner.service.jobs.channel import JobSpec
+from runner.service.jobs.checking import CheckedJob
+
+
+@dataclass(frozen=True)
+class BranchQuestion:
+    """A branch of training; the fields are the arguments of `runner.branch`."""
+
+    at: str | int
+    action: Action | None = None
+    overrides: Sequence[str] = ()
+    episodes: int | None = None
+    name: str | None = None
+
+
+def check_branch(run: Run, question: BranchQuestion) -> CheckedJob:
+    """Return the job of a branch of a run."""
+    with open_recording(run.recording) as recording:
+        recording.require_job("a branch of training", "`dualtaxi branch` plays an episode of a loop on.")
+        job, _ = branch_job(recording, question.at, question.action, question.overrides, question.episodes)
+        limit = recording.mdp.step_limit
+    size = estimate(job.config, limit).typical_bytes if limit else 0
+    return CheckedJob("branch", branch_name(run, question.name), 1, size, job.config.to_mapping())
+
+
+def run_branch(spec: JobSpec, job: Job, run: Run, report: Report, stop: Stop) -> Run:
+    """Train a branch; its parent must still be there."""
+    number = job.config.branches[-1].run
+    parent = run_of_id(number, spec.recordings)
+    if parent is None:
+        raise RunnerError(f"run {number}, the parent of this branch, is no longer there.")
+    with open_recording(at_hand(parent).recording) as recording:
+        return train_branch(recording, job, run, report, stop)

@@ -1,0 +1,78 @@
+"""Branching the training of a run at one of its steps: a form, which queues a job."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from http import HTTPStatus
+from typing import Annotated, ClassVar
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import RedirectResponse
+from starlette.concurrency import run_in_threadpool
+
+from runner.environments.naming import numbered_actions
+from runner.errors import RunnerError
+from runner.recording.reader import open_recording
+from runner.runs.run import Run
+from runner.service.api.questions import queue_branch
+from runner.service.dependencies import JobsOf, RecordedRun
+from runner.service.jobs.branches import BranchQuestion
+from runner.service.pages.frame import RunView, head_of
+from runner.service.pages.rendering import Form, message_of, page
+
+router = APIRouter(prefix="/runs/{run}/branch", include_in_schema=False)
+
+
+@dataclass(frozen=True)
+class _BranchView(RunView):
+    TEMPLATE: ClassVar = "run_branch.html"
+    form: Mapping[str, str]
+    """The fields as they were sent."""
+    actions: dict[str, list[str]]
+    """The names of each agent's own actions."""
+    problem: str = ""
+
+
+@router.get("")
+def form(request: Request, run: RecordedRun, at: Annotated[str, Query(max_length=60)] = "") -> Response:
+    """Show the form for a step."""
+    return page(request, _view(run, {"at": at}))
+
+
+@router.post("")
+async def branch(request: Request, run: RecordedRun, sent: Form, jobs: JobsOf) -> Response:
+    """Queue the branch, or show what is wrong."""
+    given = {name: text.strip() for name, text in sent.items()}
+    try:
+        job = await queue_branch(run, jobs, _question(given))
+    except RunnerError as error:
+        view = await run_in_threadpool(_view, run, given, message_of(error, request))
+        return await run_in_threadpool(page, request, view, HTTPStatus.UNPROCESSABLE_ENTITY)
+    return RedirectResponse(f"/queue/{job.number}", HTTPStatus.SEE_OTHER)
+
+
+def _question(given: Mapping[str, str]) -> BranchQuestion:
+    """Return the branch that the fields of the form describe."""
+    episodes = given.get("episodes", "")
+    if episodes and not (episodes.isdecimal() and len(episodes) < 16):
+        raise RunnerError(f"found {episodes[:40]!r}, expected a number of training episodes.")
+    prefix = "action."
+    own = {
+        name.removeprefix(prefix): text for name, text in given.items() if name.startswith(prefix) and text
+    }
+    return BranchQuestion(
+        at=given.get("at", ""),
+        action=own or None,
+        overrides=tuple(filter(None, map(str.strip, given.get("overrides", "").splitlines()))),
+        episodes=int(episodes) if episodes else None,
+        name=given.get("name") or None,
+    )
+
+
+def _view(run: Run, fields: Mapping[str, str], problem: str = "") -> _BranchView:
+    with open_recording(run.recording) as recording:
+        recording.require_job("a branch of training", "`dualtaxi branch` plays an episode of a loop on.")
+        mdp = recording.mdp
+    actions = dict(zip(mdp.agents, numbered_actions(mdp), strict=True))
+    return _BranchView(head_of(run), "replay", fields, actions, problem)
