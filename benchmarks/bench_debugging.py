@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import statistics
-import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.figures import Figure, figure
-from benchmarks.processes import Process, run, run_command
+from benchmarks.figures import Figure, command_seconds, peak_memory
+from benchmarks.processes import dualtaxi, run, run_command
 from runner.config import load
 
 CONFIG = "tutorial_cooperative"
 STATE = 'q[300, "north + east"] > q[300, "west + east"]'
 NEVER = "max(q[300]) > 1e6"
 PATH = "greedy_success[300]"
+MEMORY = (400, 300)
 VALUE = ("--state", "300", "--action", "north+south")
 
 
@@ -28,18 +26,18 @@ def measure(quick: bool) -> list[Figure]:
         figures += [*when(folder, repetitions), *why(folder, repetitions)]
     with tempfile.TemporaryDirectory() as folder:
         run(run_command(CONFIG, folder, f"episodes={50_000 * times}"))
-        longer = [command(folder, "when", "@latest", text, "--all") for text in (STATE, PATH, "reward > 0")]
+        longer = [dualtaxi(folder, "when", "@latest", text, "--all") for text in (STATE, PATH, "reward > 0")]
         at = f"{50_000 * times - 1}:0"
-        last = command(folder, "branch", "@latest", "--at", at, "--action", "all")
-        whole = command(folder, "why", "@latest", *VALUE)
-        trained = command(folder, "branch", "@latest", "--at", at, "--set", "epsilon=0.3")
+        last = dualtaxi(folder, "branch", "@latest", "--at", at, "--action", "all")
+        whole = dualtaxi(folder, "why", "@latest", *VALUE)
+        trained = dualtaxi(folder, "branch", "@latest", "--at", at, "--set", "epsilon=0.3")
     figures += explain(1 if quick else 3)
     return [
         *figures,
-        _peak(f"  why, for a run {times} times as long", [whole]),
-        _peak(f"  when, for a run {times} times as long", longer),
-        _peak(f"  branch, all actions, for a run {times} times as long", [last]),
-        _peak(f"  training branch, for a run {times} times as long", [trained]),
+        peak_memory(f"  why, for a run {times} times as long", [whole], MEMORY),
+        peak_memory(f"  when, for a run {times} times as long", longer, MEMORY),
+        peak_memory(f"  branch, all actions, for a run {times} times as long", [last], MEMORY),
+        peak_memory(f"  training branch, for a run {times} times as long", [trained], MEMORY),
     ]
 
 
@@ -52,10 +50,10 @@ def training(folder: str, repetitions: int) -> list[Figure]:
     words = ("branch", str(parent), "--at", "4000000", "--set", "epsilon=0.3")
     end = ("--episodes", "46258")  # the step is in episode 46,257
     with tempfile.TemporaryDirectory() as other:
-        command(other, *words, *end)  # compiles
-        done = [command(other, *words, *end) for _ in range(repetitions)]
+        dualtaxi(other, *words, *end)  # compiles
+        done = [dualtaxi(other, *words, *end) for _ in range(repetitions)]
     what = "training branch at step 4 M, until it goes on"
-    return [_seconds(what, done, (1, 0.3)), _peak("  peak memory", done)]
+    return [command_seconds(what, done, (1, 0.3)), peak_memory("  peak memory", done, MEMORY)]
 
 
 def what_if(folder: str, repetitions: int) -> list[Figure]:
@@ -67,16 +65,16 @@ def what_if(folder: str, repetitions: int) -> list[Figure]:
     figures, processes = [], []
     for what, at in places.items():
         words = ("branch", "@latest", "--at", at, "--action", "all")
-        command(folder, *words)  # compiles
-        done = [command(folder, *words) for _ in range(repetitions)]
-        figures.append(_seconds(what, done, (1, 0.3)))
+        dualtaxi(folder, *words)  # compiles
+        done = [dualtaxi(folder, *words) for _ in range(repetitions)]
+        figures.append(command_seconds(what, done, (1, 0.3)))
         processes += done
-    return [*figures, _peak("  peak memory", processes)]
+    return [*figures, peak_memory("  peak memory", processes, MEMORY)]
 
 
 def when(folder: str, repetitions: int) -> list[Figure]:
     """Return the figures of `dualtaxi when` for one state."""
-    command(folder, "when", "@latest", PATH)  # compiles
+    dualtaxi(folder, "when", "@latest", PATH)  # compiles
     questions = {
         "when, first time": ((1, 0.3), [STATE]),
         "when, searched to the end, never found": ((2, 0.5), [NEVER]),
@@ -85,10 +83,10 @@ def when(folder: str, repetitions: int) -> list[Figure]:
     }
     figures, processes = [], []
     for what, (targets, words) in questions.items():
-        done = [command(folder, "when", "@latest", *words) for _ in range(repetitions)]
-        figures.append(_seconds(what, done, targets))
+        done = [dualtaxi(folder, "when", "@latest", *words) for _ in range(repetitions)]
+        figures.append(command_seconds(what, done, targets))
         processes += done
-    return [*figures, _peak("  peak memory", processes)]
+    return [*figures, peak_memory("  peak memory", processes, MEMORY)]
 
 
 def explain(repetitions: int) -> list[Figure]:
@@ -100,30 +98,16 @@ def explain(repetitions: int) -> list[Figure]:
             other = load("tutorial_text_cooperative", ["step_size=0.3", "discount=0.9"])
             words[2] = str(Path(folder, "other.yaml"))
             Path(words[2]).write_text(other.to_yaml(), encoding="utf-8")
-            processes.append(command(folder, *words))
-    figures = [_seconds("explain, 4 settings, 20 seeds, 5,000 episodes", processes[1:], (60, 25))]
-    return [*figures, _peak("  peak memory of its main process", processes)]
+            processes.append(dualtaxi(folder, *words))
+    figures = [command_seconds("explain, 4 settings, 20 seeds, 5,000 episodes", processes[1:], (60, 25))]
+    return [*figures, peak_memory("  peak memory of its main process", processes, MEMORY)]
 
 
 def why(folder: str, repetitions: int) -> list[Figure]:
     """Return the figures of `dualtaxi why` for a value at the end."""
-    command(folder, "why", "@latest", *VALUE)  # compiles
-    done = [command(folder, "why", "@latest", *VALUE) for _ in range(repetitions)]
-    return [_seconds("why, a value at the end", done, (2, 0.5)), _peak("  peak memory", done)]
-
-
-def command(folder: str, *words: str) -> Process:
-    """Return the process of a command of the program over a folder of runs."""
-    return run([sys.executable, "-m", "runner", *words, "--recordings", folder])
-
-
-def _seconds(what: str, processes: Sequence[Process], targets: tuple[float, float]) -> Figure:
-    cpu = statistics.median(process.cpu_seconds for process in processes)
-    seconds = [process.seconds for process in processes]
-    detail = f"{cpu:.2f} s of processor time in all threads"
-    return figure(what, seconds, "s", targets, higher_is_better=False, detail=detail)
-
-
-def _peak(what: str, processes: Sequence[Process]) -> Figure:
-    peak = max(process.peak_megabytes for process in processes)
-    return figure(what, [peak], "MB", (400, 300), higher_is_better=False)
+    dualtaxi(folder, "why", "@latest", *VALUE)  # compiles
+    done = [dualtaxi(folder, "why", "@latest", *VALUE) for _ in range(repetitions)]
+    return [
+        command_seconds("why, a value at the end", done, (2, 0.5)),
+        peak_memory("  peak memory", done, MEMORY),
+    ]

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import statistics
-import sys
 import tempfile
-from collections.abc import Sequence
 
-from benchmarks.figures import Figure, figure
-from benchmarks.processes import Process, run, run_command
+from benchmarks.figures import Figure, command_seconds, peak_memory
+from benchmarks.processes import Process, dualtaxi, run, run_command
 
 CONFIG = "tutorial_cooperative"
 OTHERS = {"another discount": "discount=0.8", "another seed": "seed=1"}
+MEMORY = (500, 250)
 
 
 def measure(quick: bool) -> list[Figure]:
@@ -24,53 +22,29 @@ def measure(quick: bool) -> list[Figure]:
             whole = [compared(folder, other) for _ in range(repetitions)]
             first = [compared(folder, other, "--first") for _ in range(repetitions)]
             figures += [
-                _seconds(f"diff, {name}", whole, (8, 3)),
-                _seconds(f"diff --first, {name}", first, (0.7, 0.3)),
-                _peak(f"  peak memory, {name}", whole),
+                command_seconds(f"diff, {name}", whole, (8, 3)),
+                command_seconds(f"diff --first, {name}", first, (0.7, 0.3)),
+                peak_memory(f"  peak memory, {name}", whole, MEMORY),
             ]
     with tempfile.TemporaryDirectory() as folder:
         record(folder, f"episodes={50_000 * times}")
         longer = [compared(folder, other) for other in OTHERS.values()]
-    return [*figures, _peak(f"  for runs {times} times as long", longer)]
-
-
-def _seconds(what: str, processes: Sequence[Process], targets: tuple[float, float]) -> Figure:
-    cpu = statistics.median(process.cpu_seconds for process in processes)
-    seconds = [process.seconds for process in processes]
-    detail = f"{cpu:.2f} s of processor time in all threads"
-    return figure(what, seconds, "s", targets, higher_is_better=False, detail=detail)
-
-
-def _peak(what: str, processes: Sequence[Process]) -> Figure:
-    peak = max(process.peak_megabytes for process in processes)
-    return figure(what, [peak], "MB", (500, 250), higher_is_better=False)
+    return [*figures, peak_memory(f"  for runs {times} times as long", longer, MEMORY)]
 
 
 def record(folder: str, *overrides: str) -> None:
-    """Record the tutorial's run and those to compare it with."""
-    for other in ("name=base", *(f"name={named(other)}" for other in OTHERS.values())):
-        sets = [text for text in OTHERS.values() if other == f"name={named(text)}"]
-        run(run_command(CONFIG, folder, *overrides, *sets, other))
-    compared(folder, OTHERS["another discount"])  # compiles
+    """Record the tutorial's run and those to compare it with, and compile what compares them."""
+    run(run_command(CONFIG, folder, *overrides, "name=base"))
+    for other in OTHERS.values():
+        run(run_command(CONFIG, folder, *overrides, other, f"name={named(other)}"))
+    compared(folder, OTHERS["another discount"])
 
 
 def named(override: str) -> str:
     """Return the name of the run with an override."""
-    return override.replace("=", "_").replace(".", "_")
+    return override.replace("=", "_")
 
 
 def compared(folder: str, other: str, *options: str) -> Process:
-    """Compare the base run with another and return time and memory."""
-    names = ["base", named(other)]
-    return run([sys.executable, "-c", PROGRAM, "diff", *names, "--recordings", folder, *options])
-
-
-PROGRAM = """
-import sys
-from runner.cli import cli
-try:
-    cli(sys.argv[1:])
-except SystemExit as exit:
-    sys.exit(exit.code != 1)
-"""
-"""Calls the command, whose expected exit code is 1: the runs differ."""
+    """Compare the base run with another, which differs, and return time and memory."""
+    return dualtaxi(folder, "diff", "base", named(other), *options, exit_code=1)

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import statistics
 import sys
 import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,16 +23,18 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces, wrappers
-from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space
 
 import runner
-from benchmarks.figures import Figure, figure
+from benchmarks.figures import Figure, figure, processor_seconds
 from benchmarks.processes import run
 
 Env = gymnasium.Env[Any, Any]
-TARGETS = {"Taxi-v4": (36, 30), "CartPole-v1": (60, 45)}
-"""Targets in bytes per step: at least, aim."""
+Targets = tuple[float, float]
+TARGETS: dict[str, tuple[Targets, Targets]] = {
+    "Taxi-v4": ((2, 1.3), (36, 30)),
+    "CartPole-v1": ((4, 3), (60, 45)),
+}
+"""Targets (at least, aim) in microseconds and in bytes per step."""
 
 MEMORY = """
 import sys, runner
@@ -67,9 +69,7 @@ def measure(quick: bool) -> list[Figure]:
             figures += _environment(name, Path(folder), steps, repetitions)
         for name, kind, count in (("Blackjack-v1", "short", steps // 20), ("Taxi-v4", "long", steps // 2)):
             figures += _against_minari(name, kind, Path(folder), count, repetitions)
-        figures += [_vector(count, Path(folder), steps // 5, repetitions) for count in (1, 4, 16)]
         figures += _pong(Path(folder), steps // 10, repetitions)
-        figures += [_batches(count, Path(folder), steps * 40, repetitions) for count in (16, 1024)]
         figures += _extras(Path(folder), steps, repetitions)
         figures += _short(Path(folder), 100 if quick else 1_000, repetitions)
         figures += _logging(Path(folder), steps, repetitions)
@@ -88,28 +88,44 @@ def drive(env: Env, steps: int) -> None:
             env.reset()
 
 
-def _environment(name: str, folder: Path, steps: int, repetitions: int) -> list[Figure]:
-    """Return the overhead per step of recording an environment, and its size on disk."""
+@dataclass(frozen=True)
+class _Overhead:
+    """What recording adds to a step of an environment that is played at random."""
+
+    added: list[float]
+    """Processor time of the loop's thread in microseconds, a value for each repetition."""
+    whole: float
+    """That of all threads, the median."""
+    alone: float
+    """Processor time of a step that is not recorded, in microseconds."""
+    size: float
+    """Bytes a step on disk."""
+
+
+def _overhead(make: Callable[[], Env], folder: Path, steps: int, repetitions: int) -> _Overhead:
     added, whole, size = [], [], 0.0
     for _ in range(repetitions):
-        with contextlib.closing(gymnasium.make(name)) as env:
-            alone = _times(lambda env=env: drive(env, steps))  # type: ignore[misc]
-        with runner.record(gymnasium.make(name), folder / "recordings") as env:
-            recorded = _times(lambda env=env: drive(env, steps))  # type: ignore[misc]
+        with contextlib.closing(make()) as env:
+            alone = processor_seconds(partial(drive, env, steps))
+        with runner.record(make(), folder / "recordings") as env:
+            recorded = processor_seconds(partial(drive, env, steps))
         size = env.run.summary["bytes"] / steps
         added.append((recorded[0] - alone[0]) / steps * 1e6)
         whole.append((recorded[1] - alone[1]) / steps * 1e6)
-    targets = (5, 2) if name == "Taxi-v4" else None
+    return _Overhead(added, statistics.median(whole), alone[0] / steps * 1e6, size)
+
+
+def _environment(name: str, folder: Path, steps: int, repetitions: int) -> list[Figure]:
+    """Return the overhead per step of recording an environment, and its size on disk."""
+    of = _overhead(partial(gymnasium.make, name), folder, steps, repetitions)
+    time_targets, size_targets = TARGETS[name]
+    detail = f"processor time of the loop's thread; all threads {of.whole:.2f} us"
+    added = figure(
+        f"added per step, {name}", of.added, "us", time_targets, higher_is_better=False, detail=detail
+    )
     return [
-        figure(
-            f"added per step, {name}",
-            added,
-            "us",
-            targets,
-            higher_is_better=False,
-            detail=f"processor time of the loop's thread; all threads {statistics.median(whole):.2f} us",
-        ),
-        figure(f"  on disk, {name}", [size], "bytes/step", TARGETS[name], higher_is_better=False),
+        added,
+        figure(f"  on disk, {name}", [of.size], "bytes/step", size_targets, higher_is_better=False),
     ]
 
 
@@ -126,28 +142,13 @@ def _pong(folder: Path, steps: int, repetitions: int) -> list[Figure]:
         frames = wrappers.AtariPreprocessing(gymnasium.make("ALE/Pong-v5", frameskip=1))
         return wrappers.FrameStackObservation(frames, 4)
 
-    added, whole, size = [], [], 0.0
-    for _ in range(repetitions):
-        with contextlib.closing(make()) as env:
-            alone = _times(lambda env=env: drive(env, steps))  # type: ignore[misc]
-        with runner.record(make(), folder / "recordings") as env:
-            recorded = _times(lambda env=env: drive(env, steps))  # type: ignore[misc]
-        size = env.run.summary["bytes"] / steps
-        added.append((recorded[0] - alone[0]) / steps * 1e6)
-        whole.append((recorded[1] - alone[1]) / steps * 1e6)
-    detail = f"processor time of the loop's thread; all threads {statistics.median(whole):.0f} us; a step "
-    detail += f"of the environment takes {alone[0] / steps * 1e6:.0f} us"
+    of = _overhead(make, folder, steps, repetitions)
+    detail = f"processor time of the loop's thread; all threads {of.whole:.0f} us; a step "
+    detail += f"of the environment takes {of.alone:.0f} us"
     return [
-        figure("added per step, Pong", added, "us", (60, 25), higher_is_better=False, detail=detail),
-        figure("  on disk, Pong", [size], "bytes/step", (110, 60), higher_is_better=False),
+        figure("added per step, Pong", of.added, "us", (60, 25), higher_is_better=False, detail=detail),
+        figure("  on disk, Pong", [of.size], "bytes/step", (110, 60), higher_is_better=False),
     ]
-
-
-def _times(work: Callable[[], object]) -> tuple[float, float]:
-    """Return the processor time of this thread and of the process."""
-    thread, process = time.thread_time(), time.process_time()
-    work()
-    return time.thread_time() - thread, time.process_time() - process
 
 
 def _against_minari(name: str, kind: str, folder: Path, steps: int, repetitions: int) -> list[Figure]:
@@ -195,90 +196,6 @@ def _whole(make: Callable[[], Any], steps: int) -> float:
     return time.process_time() - begin
 
 
-class Prepared(gymnasium.vector.VectorEnv[Any, Any, Any]):
-    """Vector environments that take no time: prepared arrays, in which one step in 22 ends an episode."""
-
-    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - as in Gymnasium
-
-    def __init__(self, count: int) -> None:
-        self.num_envs = count
-        self.single_observation_space = spaces.Box(-9, 9, (4,), np.float32)
-        self.single_action_space = spaces.Discrete(2)
-        self.observation_space = batch_space(self.single_observation_space, count)
-        self.action_space = batch_space(self.single_action_space, count)
-        draws = np.random.default_rng(0)
-        self._observations = draws.normal(size=(1024, count, 4)).astype(np.float32)
-        self._rewards = np.ones(count)
-        self._ends = draws.random((1024, count)) < 1 / 22
-        self._never = np.zeros(count, np.bool_)
-        self._t = 0
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:  # noqa: ARG002
-        """Return the first observations."""
-        return self._observations[0], {}
-
-    def step(self, actions: Any) -> Any:  # noqa: ARG002
-        """Return the next of the prepared arrays."""
-        self._t = t = (self._t + 1) % 1024
-        return self._observations[t], self._rewards, self._ends[t], self._never, {}
-
-
-def _vector(count: int, folder: Path, steps: int, repetitions: int) -> Figure:
-    """Return the overhead of recording per step of a vector environment."""
-    added, whole = [], []
-    for _ in range(repetitions):
-        alone = _times(partial(_drive_vector, Prepared(count), steps))
-        with runner.record_vector(Prepared(count), folder / "recordings") as envs:
-            recorded = _times(partial(_drive_vector, envs, steps))
-        added.append((recorded[0] - alone[0]) / steps * 1e6)
-        whole.append((recorded[1] - alone[1]) / steps * 1e6)
-    return figure(
-        f"vector step, {count} environment{'s' if count > 1 else ''}",
-        added,
-        "us",
-        (20, 6),
-        higher_is_better=False,
-        detail=f"processor time of the loop's thread; all threads {statistics.median(whole):.2f} us",
-    )
-
-
-def _drive_vector(envs: Any, steps: int) -> None:
-    actions = np.zeros(envs.num_envs, np.int64)
-    envs.reset(seed=0)
-    for _ in range(steps):
-        envs.step(actions)
-
-
-def _batches(count: int, folder: Path, steps: int, repetitions: int) -> Figure:
-    """Return how many steps of this many environments are recorded a second, from batches of 128 steps."""
-    draws = np.random.default_rng(0)
-    moves = draws.normal(scale=0.01, size=(129, count, 4)).astype(np.float32)
-    observations, actions = moves.cumsum(axis=0), draws.integers(0, 2, (128, count))
-    rewards, ends = np.ones((128, count), np.float32), draws.random((128, count)) < 1 / 200
-    batches = max(1, steps // rewards.size)
-    rates, spent, size = [], [], 0.0
-    for _ in range(repetitions):
-        begin, began = time.process_time(), time.perf_counter()
-        with runner.record_batches(
-            "CartPole", folder / "recordings", action_space=spaces.Discrete(2), autoreset_mode="NextStep"
-        ) as rec:
-            rec.reset(observations[0])
-            for _ in range(batches):
-                rec.batch(observations[1:], actions, rewards, ends)
-        rates.append(batches * rewards.size / (time.perf_counter() - began) / 1e6)
-        spent.append((time.process_time() - begin) / (batches * rewards.size) * 1e9)
-        size = rec.run.summary["bytes"] / (batches * rewards.size)
-        shutil.rmtree(rec.run.folder)
-    return figure(
-        f"batches of {count:,} environments",
-        rates,
-        "M steps/s",
-        (3, 10),
-        detail=f"CartPole's observations, to the end of the file; {statistics.median(spent):.0f} ns of "
-        f"processor time a step, all threads; {size:.0f} bytes a step",
-    )
-
-
 class Observed(gymnasium.Env[Any, Any]):
     """An environment that takes no time, with observations of 4 float32 under each of these names."""
 
@@ -321,9 +238,9 @@ def _extras(folder: Path, steps: int, repetitions: int) -> list[Figure]:
     for _ in range(repetitions):
         for kind, own in added.items():
             names = "ab" if kind == "second" else "a"
-            alone = _times(partial(play, Observed(numbers, names), False))
+            alone = processor_seconds(partial(play, Observed(numbers, names), False))
             with runner.record(Observed(numbers, names), folder / "recordings") as env:
-                recorded = _times(partial(play, env, kind == "extras"))
+                recorded = processor_seconds(partial(play, env, kind == "extras"))
             own.append((recorded[0] - alone[0]) / steps * 1e6)
             sizes[kind] = env.run.summary["bytes"] / steps
     by_extras, by_observation = (

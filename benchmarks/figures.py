@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from benchmarks.processes import Process
+
 
 @dataclass(frozen=True)
 class Figure:
@@ -45,6 +47,27 @@ def figure(
     at_least, aim = targets or (None, None)
     spread = (min(values), max(values)) if len(values) > 1 else None
     return Figure(what, statistics.median(values), unit, at_least, aim, higher_is_better, spread, detail)
+
+
+def command_seconds(what: str, processes: Sequence[Process], targets: tuple[float, float]) -> Figure:
+    """Return the elapsed time of repeated processes, with their processor time as detail."""
+    cpu = statistics.median(process.cpu_seconds for process in processes)
+    times = [process.seconds for process in processes]
+    detail = f"{cpu:.2f} s of processor time in all threads"
+    return figure(what, times, "s", targets, higher_is_better=False, detail=detail)
+
+
+def peak_memory(what: str, processes: Sequence[Process], targets: tuple[float, float]) -> Figure:
+    """Return the highest peak memory of some processes, in MB."""
+    peak = max(process.peak_megabytes for process in processes)
+    return figure(what, [peak], "MB", targets, higher_is_better=False)
+
+
+def processor_seconds(work: Callable[[], object]) -> tuple[float, float]:
+    """Return the processor time of a call, of this thread and of the process."""
+    thread, process = time.thread_time(), time.process_time()
+    work()
+    return time.thread_time() - thread, time.process_time() - process
 
 
 def seconds(work: Callable[[], object]) -> float:

@@ -26,7 +26,8 @@ _, status, usage = os.wait4(child, 0)
 elapsed = time.perf_counter() - begin
 unit = 1 if sys.platform == "darwin" else 1024
 print(json.dumps([elapsed, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * unit]))
-sys.exit(os.waitstatus_to_exitcode(status) and 1)
+code = os.waitstatus_to_exitcode(status)
+sys.exit(code if code >= 0 else 128 - code)
 """
 
 
@@ -55,11 +56,11 @@ class JobRun:
     """Size of the recording."""
 
 
-def run(command: Sequence[str], environment: Mapping[str, str] | None = None) -> Process:
+def run(command: Sequence[str], environment: Mapping[str, str] | None = None, exit_code: int = 0) -> Process:
     """Run a command and return its time and memory.
 
     Raises:
-        RuntimeError: it failed; the message has its output.
+        RuntimeError: it ended with another exit code; the message has its output.
     """
     inherited = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     done = subprocess.run(
@@ -70,7 +71,7 @@ def run(command: Sequence[str], environment: Mapping[str, str] | None = None) ->
         text=True,
         check=False,
     )
-    if done.returncode:
+    if done.returncode != exit_code:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stdout}{done.stderr}")
     elapsed, cpu, peak = json.loads(done.stdout.splitlines()[-1])
     return Process(elapsed, cpu, peak / 1e6)
@@ -90,6 +91,11 @@ def run_config(
         summary = facts["summary"]
         size = (facts_file.parent / "recording.mcap").stat().st_size
         return JobRun(process, summary["seconds"], summary["train_steps"] + summary["eval_steps"], size)
+
+
+def dualtaxi(recordings: str, *words: str, exit_code: int = 0) -> Process:
+    """Run a command of the program over a folder of runs, and return its time and memory."""
+    return run([sys.executable, "-m", "runner", *words, "--recordings", recordings], exit_code=exit_code)
 
 
 def run_command(config: str, recordings: str, *overrides: str) -> list[str]:
