@@ -35,7 +35,7 @@ from runner.recording.reference import Reference
 from runner.recording.writer import RecordingFile, create_recording
 from runner.runs import run as runs
 from runner.runs.code import CodeCollector
-from runner.runs.provenance import provenance
+from runner.runs.provenance import provenance_entries
 from runner.runs.redaction import LineRedactor
 from runner.runs.run import Run
 from runner.util.arrays import Records
@@ -104,7 +104,7 @@ def run_job(
         file = create_recording(run.folder / runs.RECORDING_FILE)
     with file:
         with _failing(run):
-            made_by = provenance(with_command=job.config.recording.code)
+            made_by = provenance_entries(with_command=job.config.recording.code)
             describe(file, job, run, learner, made_by)
             run = run.update(provenance={key: made_by[key] for key in runs.MADE_BY if key in made_by})
         recorder = recorder_for(job, learner, file, beat=code.beat(run, file), threads=threads)
@@ -377,7 +377,7 @@ def describe(
         run.run_id, run.name, job.seed, job.identity, run.created_text, learner.agents, events
     )
     config, environment = job.config.to_mapping(), _environment(learner.mdp)
-    write_description(file, facts, config, made_by or provenance(), environment)
+    write_description(file, facts, config, made_by or provenance_entries(), environment)
 
 
 @lru_cache(maxsize=4)

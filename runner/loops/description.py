@@ -55,10 +55,10 @@ class Described:
         return {name: describe_space(space) for name, space in spaces_of.items()}
 
     @cached_property
-    def spaces_json(self) -> str:
+    def recorded_spaces(self) -> dict[str, object]:
         """The descriptions of both spaces, of actions as they are recorded."""
         wide = {} if self.wide_action is None else {"action": describe_space(self.wide_action)}
-        return json.dumps(self._spaces | wide)
+        return self._spaces | wide
 
     @property
     def common(self) -> str:

@@ -27,11 +27,11 @@ from runner.loops.outcomes import Outcomes
 from runner.recording import schema
 from runner.recording.action_recorder import ActionRecorder
 from runner.recording.actions import ACTION_TOPICS
-from runner.recording.blocks import record_dtype
+from runner.recording.blocks import Sizes, record_dtype
 from runner.recording.compaction import compacted
 from runner.recording.gym_spaces import can_widen, widened
 from runner.recording.maker import EnvironmentMaker
-from runner.recording.metadata import run_metadata, sizes_of, write_description, write_maker, write_result
+from runner.recording.metadata import run_metadata, sizes_in, write_description, write_maker, write_result
 from runner.recording.recorder import Recorder
 from runner.recording.schema import Topic
 from runner.recording.syncing import SYNCER
@@ -39,7 +39,7 @@ from runner.recording.writer import create_recording
 from runner.runs import run as runs
 from runner.runs.code import CodeCollector
 from runner.runs.listing import run_at
-from runner.runs.provenance import provenance
+from runner.runs.provenance import provenance_entries
 from runner.runs.redaction import LineRedactor
 from runner.runs.run import RECORDING_FILE, Run, new_run, recordings_folder, unless_empty
 from runner.runs.shards import RUN_VARIABLE, new_shard
@@ -60,7 +60,7 @@ class LoopRun:
         self._is_described = False
         self.is_settled = not can_widen(described.action)
         """Whether the dtypes of all values are known."""
-        self._made_by = provenance(with_command=options.packing.code)
+        self._made_by = provenance_entries(with_command=options.packing.code)
         made_by = {key: self._made_by[key] for key in runs.MADE_BY if key in self._made_by}
         facts = {"provenance": made_by, "spaces": described.common}
         self.run = self._new_run(outbox_folder() if client else None, facts)
@@ -78,7 +78,7 @@ class LoopRun:
             packing=options.packing.packing,
             record_steps=options.steps == "all",
             beat=self._beat,
-            sizes=sizes_of(self._facts, str(path)),
+            sizes=self._sizes(),
             watch=self._watch,
             before=self.describe,
             system=options.packing.system and not is_shard,
@@ -97,8 +97,9 @@ class LoopRun:
                 self._mark_failed(truncated_message(error))
                 raise
         self._follower = Follower(client, self.run, lambda: self._file.size) if client else None
+        self._absolute = os.path.abspath(self.run.folder)  # noqa: PTH100 - links stay what they are
         if not is_shard:
-            os.environ[RUN_VARIABLE] = os.path.abspath(self.run.folder)  # noqa: PTH100 - links stay what they are
+            os.environ[RUN_VARIABLE] = self._absolute
 
     def _new_run(self, folder: Path | None, facts: Mapping[str, Any]) -> Run:
         """Create the folder of the run, or of the shard of the run that is joined."""
@@ -136,17 +137,22 @@ class LoopRun:
         job = json.dumps(content | {"seed": self._options.seed}, sort_keys=True)
         return run_metadata(
             run.run_id,
-            str(run.facts["name"]),
+            run.facts["name"],
             self._options.seed,
             job=blake3(job.encode()).hexdigest()[:32],
-            created=run.created_text,
+            created=run.facts["created"],
             agents=described.agents,
             events=len(mdp.event_names) if mdp else 0,
         ) | {
             "kind": described.kind,
-            "spaces": described.spaces_json,
+            "spaces": json.dumps(described.recorded_spaces),
             "environments": str(described.environments),
         }
+
+    def _sizes(self) -> dict[Topic, Sizes]:
+        described, events = self.described, int(self._facts["events"])
+        learners, spaces = len(described.agents), described.recorded_spaces
+        return sizes_in(described.kind, learners, events, spaces, str(self._file.path))
 
     def describe(self) -> None:
         """Write what makes the recording self-contained, once; from then on dtypes are fixed."""
@@ -165,7 +171,7 @@ class LoopRun:
             return False
         self.described = replace(self.described, wide_action=wide)
         self._facts = self._run_facts()
-        self.recorder.resize(sizes_of(self._facts, str(self.run.recording)))
+        self.recorder.resize(self._sizes())
         return True
 
     def commit(self) -> None:
@@ -198,7 +204,7 @@ class LoopRun:
         counts = self.recorder.counts
         steps = {
             ACTION_TOPICS[topic.name]: record_dtype(topic.message, sizes)
-            for topic, sizes in sizes_of(self._facts, str(self._file.path)).items()
+            for topic, sizes in self._sizes().items()
             if topic.name in ACTION_TOPICS
         }
         if sum(counts[topic.name] for topic in steps) > len(steps):
@@ -213,12 +219,12 @@ class LoopRun:
 
     def write_status(self, status: str, summary: Mapping[str, object]) -> None:
         """Write how the run ended next to its recording, which is synced to disk within seconds."""
-        SYNCER.add(self.run.recording, partial(_mark_unsynced, self.run.folder))
+        SYNCER.add(self._file.path, partial(_mark_unsynced, self.run.folder))
         self.run = self.run.update(status=status, summary=summary, provenance=self._code.made_by(self.run))
 
     def fold(self) -> None:
         """Put together what several processes recorded, if this was the last one."""
-        if os.environ.get(RUN_VARIABLE) == os.path.abspath(self.run.folder):  # noqa: PTH100
+        if os.environ.get(RUN_VARIABLE) == self._absolute:
             del os.environ[RUN_VARIABLE]
         joined = self._options.join
         whole = fold_if_over(joined or self.run, 0 if joined else OWNER_WAITS)

@@ -7,9 +7,10 @@ threads can encode while another one learns.
 from __future__ import annotations
 
 import struct
+import threading
 import zlib
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from typing import Final
 
 import lz4.frame
@@ -33,6 +34,8 @@ _PICTURE_BYTES: Final = 1 << 13
 """Steps of more bytes have pictures in their observations, or are as rare."""
 _MOSTLY_ZEROS: Final = 16
 """Blocks of actions that become this many times smaller are discrete: nearly all of their columns are 0."""
+_MAX_QUICK_LEVEL: Final = 4
+"""At higher levels a compressor takes megabytes, and is not kept."""
 _DATA_LENGTH: Final = struct.Struct("<Q")
 _MAX_NAME_BYTES: Final = 4
 """The length of the longest name of a compression, `zstd`."""
@@ -104,10 +107,18 @@ def message_index(channel: int, log_times: NDArray[np.uint64], offsets: NDArray[
 def _compress(records: bytes | memoryview, packing: Packing, width: int) -> bytes:
     if packing.compression == "zstd":
         parameters = _zstd_parameters(packing.level, bool(width), width > _PICTURE_BYTES)
-        return zstandard.ZstdCompressor(compression_params=parameters).compress(records)
+        if packing.level > _MAX_QUICK_LEVEL:
+            return zstandard.ZstdCompressor(compression_params=parameters).compress(records)
+        return _compressor(parameters, threading.get_ident()).compress(records)
     if packing.compression == "lz4":
         return bytes(lz4.frame.compress(records))
     return bytes(records)
+
+
+@lru_cache(8)
+def _compressor(parameters: zstandard.ZstdCompressionParameters, _thread: int) -> zstandard.ZstdCompressor:
+    """Return the compressor of a thread; making one takes longer than compressing a small chunk."""
+    return zstandard.ZstdCompressor(compression_params=parameters)
 
 
 @cache
@@ -119,7 +130,7 @@ def _zstd_parameters(level: int, has_arrays: bool, has_pictures: bool) -> zstand
     floats the quickest search finds as much. A stack of frames shares all but one with the record before,
     which a longer search finds: a quarter less, in a tenth of the time that an emulator takes for a step.
     """
-    if level not in (3, 4):
+    if level not in (3, _MAX_QUICK_LEVEL):
         return zstandard.ZstdCompressionParameters.from_level(level)
     tables = {"hash_log": 12, "chain_log": 12, "min_match": 4}
     if has_pictures:

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 
 from blake3 import blake3
 
-from runner.recording.schema import ALL_TOPICS, Topic
+from runner.recording.schema import Topic
 
 _PREFIX = b"dualtaxi content 0\n"
 
@@ -22,19 +22,18 @@ class ContentHash:
     """The running digest of a recording."""
 
     def __init__(self) -> None:
-        self._topics = {topic.name: blake3() for topic in ALL_TOPICS if topic.digested}
-        self._bytes = dict.fromkeys(self._topics, 0)
+        self._topics: dict[str, blake3] = {}
 
     def update(self, topic: Topic, records: bytes | memoryview) -> None:
         """Take in whole message records of a topic, in canonical form."""
-        if topic.digested:
-            view = memoryview(records).cast("B")
-            self._topics[topic.name].update(view)
-            self._bytes[topic.name] += len(view)
+        if topic.digested and len(records):
+            if (own := self._topics.get(topic.name)) is None:
+                own = self._topics[topic.name] = blake3()
+            own.update(memoryview(records).cast("B"))
 
     def topics(self) -> dict[str, str]:
         """Return the hash of each topic that has messages, in hexadecimal."""
-        return {name: self._topics[name].hexdigest() for name in sorted(self._topics) if self._bytes[name]}
+        return {name: self._topics[name].hexdigest() for name in sorted(self._topics)}
 
     def content(self) -> str:
         """Return the content digest, in hexadecimal."""

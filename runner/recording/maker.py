@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from runner.errors import RecordingError
@@ -98,7 +98,8 @@ class EnvironmentMaker:
 
     def to_metadata(self) -> dict[str, str]:
         """Return the entries of the metadata record."""
-        return {"json": json.dumps(asdict(self), sort_keys=True)}
+        vector = None if self.vector is None else vars(self.vector)
+        return {"json": json.dumps(vars(self) | {"vector": vector}, sort_keys=True)}
 
 
 def parse_maker(values: Mapping[str, object], where: str) -> EnvironmentMaker:

@@ -42,6 +42,8 @@ _PACKAGE: Final = "package."
 _PACKAGES: Final = "packages"
 """The entry of the provenance with the versions of all packages: JSON, in zstd, in Base64."""
 _MAX_PACKAGES_BYTES: Final = 1 << 20
+_FIXED_KINDS: Final = ("step", "transition")
+"""The kinds of loops whose steps have one size."""
 _RUN_TEXTS: Final = ("run_id", "name", "job", "created", "agents")
 _RUN_COUNTS: Final = {"seed": 2**64 - 1, "learners": MAX_AGENTS, "events": MAX_EVENTS}
 """The numbers that every metadata record `run` has, and the largest possible value of each."""
@@ -162,10 +164,19 @@ def sizes_of(run: Mapping[str, str], path: str) -> dict[Topic, Sizes]:
     Raises:
         RecordingError: its spaces are not described.
     """
-    learners, events, kind = int(run["learners"]), int(run["events"]), kind_of(run)
+    kind = kind_of(run)
+    spaces = spaces_of(run, path) if kind in _FIXED_KINDS else {}
+    return sizes_in(kind, int(run["learners"]), int(run["events"]), spaces, path)
+
+
+def sizes_in(kind: str, learners: int, events: int, spaces: JsonView, path: str) -> dict[Topic, Sizes]:
+    """Return what `sizes_of` returns, of a recording of this kind, whose spaces have these descriptions.
+
+    Raises:
+        RecordingError: a space is not described.
+    """
     action = observation = None
-    if kind in ("step", "transition"):
-        spaces = spaces_of(run, path)
+    if kind in _FIXED_KINDS:
         action, observation = (
             dtype_of(spaces[name], f"{path}: the {name} space") for name in ("action", "observation")
         )

@@ -169,5 +169,7 @@ def is_usable(values: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 def finite_mean(values: NDArray[np.float64]) -> float | None:
     """Return the mean of the values that are finite and no larger than `LARGEST`; None without any."""
+    if not values.size:
+        return None
     usable = is_usable(values)
     return float(values[usable].mean()) if usable.any() else None

@@ -119,11 +119,11 @@ class _Thread:
             self._observers.discard(observer)
             self._stop_unheard()
             thread = self._thread
-            if self._observers:
+            if self._observers or thread is None:
                 return
             self._wake.set()
             self._thread, self._wake = None, threading.Event()
-        if thread is not None and thread is not threading.current_thread():
+        if thread is not threading.current_thread():
             thread.join(SAMPLE_SECONDS)  # it may wait for a driver or a disk for ever
 
     def ensure_running(self) -> None:

@@ -87,13 +87,14 @@ class Pipeline:
         self._last_beat = self._last_sync = time.monotonic()
         self._encoders: ThreadPoolExecutor | None = None
         self._writer: threading.Thread | None = None
-        self._queue: queue.Queue[tuple[_Work, Future[Chunk] | None] | None] = queue.Queue(MAX_PENDING)
+        self._queue: queue.Queue[tuple[_Work, Future[Chunk] | None] | None]
         self._before = before
         self._held: list[_Work] | None = None if before is None else []
         if threads and before is None:
             self._start()
 
     def _start(self) -> None:
+        self._queue = queue.Queue(MAX_PENDING)
         self._encoders = ThreadPoolExecutor(ENCODERS, thread_name_prefix="encoder")
         self._writer = threading.Thread(target=self._write_queue, name="recording-writer", daemon=True)
         self._writer.start()

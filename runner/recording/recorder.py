@@ -262,6 +262,10 @@ class Recorder:
     def flush(self) -> None:
         """Write every open block and batch now; records that were not taken must be put down again."""
         self._record_machine()
+        self._send_open()
+
+    def _send_open(self) -> None:
+        """Send every open block and batch to the pipeline."""
         self._batches.flush()
         for lane in self._lanes.values():
             if lane.open is not None and lane.open.filled:
@@ -275,7 +279,7 @@ class Recorder:
             StorageError: the disk is full or failing; everything before is kept.
         """
         self._record_machine(is_last=True)
-        self.flush()
+        self._send_open()
         self._pipeline.close()
         self._pipeline.raise_failure()
         return self._pipeline.hash.topics()
@@ -294,7 +298,7 @@ class Recorder:
         """Write what was committed, unless writing failed, and stop the threads of a run that failed."""
         if self._file is not None and self._pipeline.is_open and self._pipeline.failure is None:
             self._record_machine(is_last=True)
-            self.flush()
+            self._send_open()
         elif self._observer is not None:
             self._observer.take(is_last=True)
         self._pipeline.close()

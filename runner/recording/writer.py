@@ -1,7 +1,7 @@
 """The MCAP file being written: records in order, and the entries of its summary.
 
-The `mcap` library lays out every record but chunks and message indexes, which `chunks` encodes: nearly all
-of a recording consists of them.
+The `mcap` library lays out the records that a recording has one of. Chunks and message indexes, nearly all
+of a long recording, are encoded by `chunks`; the many small records of a short one, here.
 """
 
 from __future__ import annotations
@@ -23,13 +23,11 @@ from mcap.records import (
     Channel,
     ChunkIndex,
     DataEnd,
-    Footer,
     Header,
     McapRecord,
     MetadataIndex,
     Schema,
     Statistics,
-    SummaryOffset,
 )
 from mcap.writer import MCAP0_MAGIC
 
@@ -43,6 +41,8 @@ from runner.recording.schema import ALL_TOPICS, KINDS, MESSAGES, PROFILE, Topic
 from runner.util.version import __version__
 
 _LIBRARY = f"dualtaxi {__version__}"
+_TWO = struct.Struct("<QQ")
+_SUMMARY_OFFSET = struct.Struct("<BQBQQ")
 
 
 class RecordingFile:
@@ -210,12 +210,9 @@ class RecordingFile:
         summary_start = self._offset + len(data_end)
         summary, offsets = self._summary(summary_start)
         offsets_start = summary_start + len(summary)
-        crc = zlib.crc32(summary + offsets)
-        crc = zlib.crc32(
-            FOOTER_HEAD.pack(Opcode.FOOTER, FOOTER_BODY_BYTES, summary_start, offsets_start), crc
-        )
-        footer = Footer(summary_start=summary_start, summary_offset_start=offsets_start, summary_crc=crc)
-        return b"".join((data_end, summary, offsets, _bytes_of(footer), MCAP0_MAGIC))
+        footer = FOOTER_HEAD.pack(Opcode.FOOTER, FOOTER_BODY_BYTES, summary_start, offsets_start)
+        crc = zlib.crc32(footer, zlib.crc32(summary + offsets))
+        return b"".join((data_end, summary, offsets, footer, struct.pack("<I", crc), MCAP0_MAGIC))
 
     def close(self) -> None:
         """Close the file as it is."""
@@ -244,17 +241,16 @@ class RecordingFile:
             (Opcode.CHANNEL, channels),
             (Opcode.STATISTICS, _bytes_of(self._statistics())),
             (Opcode.CHUNK_INDEX, _bytes_of(*self._chunks)),
-            (Opcode.ATTACHMENT_INDEX, _bytes_of(*self._attachments)),
-            (Opcode.METADATA_INDEX, _bytes_of(*self._metadata)),
+            (Opcode.ATTACHMENT_INDEX, b"".join(map(_attachment_index, self._attachments))),
+            (Opcode.METADATA_INDEX, b"".join(map(_metadata_index, self._metadata))),
         ]
         body, offsets = bytearray(), []
         for opcode, data in groups:
             if data:
-                offsets.append(
-                    SummaryOffset(group_opcode=opcode, group_start=start + len(body), group_length=len(data))
-                )
+                offset = Opcode.SUMMARY_OFFSET, 17, opcode, start + len(body), len(data)
+                offsets.append(_SUMMARY_OFFSET.pack(*offset))
             body += data
-        return bytes(body), _bytes_of(*offsets)
+        return bytes(body), b"".join(offsets)
 
     def _statistics(self) -> Statistics:
         return Statistics(
@@ -317,6 +313,17 @@ def metadata_record(name: str, entries: Mapping[str, str]) -> bytes:
 def _pairs(entries: tuple[tuple[str, str], ...]) -> bytes:
     """Return the entries of a metadata record; those that list packages are the same in the next run."""
     return b"".join(_prefixed(text) for pair in entries for text in pair)
+
+
+def _metadata_index(index: MetadataIndex) -> bytes:
+    body = _TWO.pack(index.offset, index.length) + _prefixed(index.name)
+    return RECORD_HEAD.pack(Opcode.METADATA_INDEX, len(body)) + body
+
+
+def _attachment_index(index: AttachmentIndex) -> bytes:
+    numbers = index.offset, index.length, index.log_time, index.create_time, index.data_size
+    body = struct.pack("<QQQQQ", *numbers) + _prefixed(index.name) + _prefixed(index.media_type)
+    return RECORD_HEAD.pack(Opcode.ATTACHMENT_INDEX, len(body)) + body
 
 
 def _prefixed(text: str) -> bytes:

@@ -116,6 +116,7 @@ class CodeCollector:
             return
         cells = _cells()
         with contextlib.suppress(OSError):  # there is no current folder: the thread notes it
+            recordings = recordings.absolute()
             self._found = _recent.fresh(cells, recordings)
         if self._found is None:
             self._thread = threading.Thread(
@@ -141,7 +142,9 @@ class CodeCollector:
 
     def made_by(self, run: Run) -> dict[str, str]:
         """Return the provenance in `run.json`, with the commit if it is known."""
-        return dict(run.file.provenance) | {key: self.entries[key] for key in ("git",) if key in self.entries}
+        return dict(run.facts.get("provenance", {})) | {
+            key: self.entries[key] for key in ("git",) if key in self.entries
+        }
 
     def write(self, file: RecordingFile, wait: bool = False) -> None:
         """Write the code into a recording, once, if it is known; nothing else may write into it meanwhile.
@@ -188,10 +191,10 @@ class _Recent:
         """Return the code of this process, if it was read a few seconds ago."""
         _, _, key = self._place(cells)
         code, before = self.code, self.recordings
-        is_fresh = key == self.key and time.monotonic() - self.read_at <= _FRESH_SECONDS
-        if is_fresh and _within(code.root, recordings) == _within(code.root, before):
-            return code
-        return None
+        if key != self.key or time.monotonic() - self.read_at > _FRESH_SECONDS:
+            return None
+        is_same = recordings == before or _within(code.root, recordings) == _within(code.root, before)
+        return code if is_same else None
 
     def read(self, cells: str, recordings: Path) -> RecordedCode:
         """Return the code of this process, read now or a few seconds ago."""

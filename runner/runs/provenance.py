@@ -15,7 +15,7 @@ import shlex
 import socket
 import sys
 from collections.abc import Iterator, Mapping
-from functools import cache
+from functools import cache, lru_cache
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any, Final
@@ -23,6 +23,7 @@ from typing import Any, Final
 import numpy as np
 from blake3 import blake3
 
+from runner.recording.metadata import packed_provenance
 from runner.runs.redaction import is_secret_name, redacted_arguments, redacted_text
 from runner.util.values import as_utf8
 from runner.util.version import __version__
@@ -78,11 +79,12 @@ def provenance(with_command: bool = True) -> dict[str, str]:
     Args:
         with_command: False leaves out the command line, for runs that do not record the user's code.
     """
-    variables = dict(os.environ)
-    facts = _settings(variables) | {"host": socket.gethostname(), "user": _user(), "directory": _directory()}
-    if with_command and is_code_wanted():
-        facts["command"] = shlex.join(redacted_arguments(sys.argv, variables))
-    return _machine() | _packages() | {key: as_utf8(text) for key, text in facts.items()}
+    return _machine() | _packages() | _settings(with_command)
+
+
+def provenance_entries(with_command: bool = True) -> dict[str, str]:
+    """Return the entries of the metadata record `provenance`; quick, because many runs may be short."""
+    return _packed_constants() | _settings(with_command)
 
 
 def is_code_wanted() -> bool:
@@ -122,6 +124,11 @@ def _machine() -> dict[str, str]:
 
 
 @cache
+def _packed_constants() -> dict[str, str]:
+    return packed_provenance(_machine() | _packages())
+
+
+@cache
 def _packages() -> dict[str, str]:
     """Return the versions of all installed distributions, by `package.NAME`.
 
@@ -145,16 +152,15 @@ def _normalised(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def _settings(variables: Mapping[str, str]) -> dict[str, str]:
+def _settings(with_command: bool) -> dict[str, str]:
     """Return what may change during a process: environment variables, flags, states of random generators."""
-    facts = {
-        f"env.{name}": redacted_text(value, variables)
-        for name, value in variables.items()
-        if _VARIABLE.fullmatch(name) and not is_secret_name(name)
-    }
+    variables, command = _redacted(frozenset(os.environ.items()), tuple(sys.argv))
+    facts = {"host": socket.gethostname(), "directory": _directory(), "user": _user()}
+    if with_command and is_code_wanted():
+        facts["command"] = command
     if hasattr(os, "sched_getaffinity"):
         facts["processors.usable"] = str(len(os.sched_getaffinity(0)))
-    facts["random.state"] = _digest(np.array(random.getstate()[1], np.int64).tobytes())
+    facts["random.state"] = _random_digest(random.getstate()[1])
     if "numpy.random" in sys.modules:
         state: Any = np.random.get_state(legacy=False)["state"]
         facts["numpy.random.state"] = _digest(state["key"].tobytes() + state["pos"].to_bytes(4))
@@ -162,7 +168,26 @@ def _settings(variables: Mapping[str, str]) -> dict[str, str]:
         if name in sys.modules:
             with contextlib.suppress(Exception):  # it may be of another version, or being imported
                 facts |= dict(read(sys.modules[name]))
-    return facts
+    return variables | {key: as_utf8(text) for key, text in facts.items()}
+
+
+@lru_cache(1)
+def _redacted(
+    variables: frozenset[tuple[str, str]], arguments: tuple[str, ...]
+) -> tuple[dict[str, str], str]:
+    """Return the recorded environment variables by key, and the command line, both without secrets."""
+    values = dict(variables)
+    facts = {
+        f"env.{name}": as_utf8(redacted_text(value, values))
+        for name, value in sorted(values.items())
+        if _VARIABLE.fullmatch(name) and not is_secret_name(name)
+    }
+    return facts, shlex.join(redacted_arguments(arguments, values))
+
+
+@lru_cache(1)
+def _random_digest(state: tuple[int, ...]) -> str:
+    return _digest(np.array(state, np.int64).tobytes())
 
 
 def _torch(torch: Any) -> Iterator[tuple[str, str]]:
@@ -196,6 +221,7 @@ def _directory() -> str:
         return ""
 
 
+@cache
 def _user() -> str:
     try:
         return getpass.getuser()

@@ -48,6 +48,7 @@ MADE_BY: Final = ("host", "git", "dualtaxi")
 RECORDINGS_VARIABLE: Final = "DUALTAXI_RECORDINGS"
 
 _ID_ALPHABET: Final = "abcdefghjkmnpqrstvwxyz23456789"
+_ID_LENGTH: Final = 8
 
 
 @dataclass(frozen=True, repr=False)
@@ -84,7 +85,7 @@ class Run:
     @property
     def run_id(self) -> str:
         """The unique id."""
-        return self.file.run_id
+        return str(self.facts["run_id"])
 
     @property
     def name(self) -> str:
@@ -267,13 +268,15 @@ def new_run(
     """
     check_folder_name(recordings)
     with storage_errors(recordings, f"choose another folder by --recordings or {RECORDINGS_VARIABLE}"):
-        recordings.mkdir(parents=True, exist_ok=True)
-        run_id = run_id or (next(ids) if ids else new_run_id(recordings))
+        run_id = run_id or (next(ids) if ids else _random_id())
         while True:
-            with contextlib.suppress(FileExistsError):
+            try:
                 (folder := recordings / run_id).mkdir()
                 break
-            run_id = next(ids) if ids else new_run_id(recordings)
+            except FileNotFoundError:
+                recordings.mkdir(parents=True, exist_ok=True)
+            except FileExistsError:
+                run_id = next(ids) if ids else _random_id()
         facts = {
             "run_id": run_id,
             "name": name,
@@ -293,9 +296,17 @@ def new_run(
 
 def new_run_id(recordings: Path) -> str:
     """Return a new id that no run in the folder has."""
-    while (recordings / (run_id := "".join(secrets.choice(_ID_ALPHABET) for _ in range(8)))).exists():
+    while (recordings / (run_id := _random_id())).exists():
         continue
     return run_id
+
+
+def _random_id() -> str:
+    number, letters = secrets.randbelow(len(_ID_ALPHABET) ** _ID_LENGTH), []
+    for _ in range(_ID_LENGTH):
+        number, letter = divmod(number, len(_ID_ALPHABET))
+        letters.append(_ID_ALPHABET[letter])
+    return "".join(letters)
 
 
 @contextlib.contextmanager

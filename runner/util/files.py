@@ -27,6 +27,7 @@ TABLES: Final = "tables"
 """The folder of the cache with Q-tables along long runs; their names begin with the run's id."""
 _BINARY: Final = getattr(os, "O_BINARY", 0)
 """On Windows, leaves line ends as they are."""
+_to_json: Final = json.JSONEncoder(ensure_ascii=False).encode
 
 
 def cache_folder() -> Path:
@@ -89,14 +90,16 @@ def write_object(path: Path, value: JsonView, mode: int = 0o666) -> None:
     Raises:
         OSError: it cannot be written; it is as before.
     """
+    # A line for each key: with `indent`, `json` takes much longer.
+    lines = [f" {_to_json(key)}: {_to_json(own)}" for key, own in value.items()]
+    left = memoryview(("{\n" + ",\n".join(lines) + "\n}\n").encode())
     with replacing(path) as fresh:
         descriptor = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BINARY, mode)
-        with os.fdopen(descriptor, "wb") as stream:
-            # A line for each key: with `indent`, `json` takes much longer.
-            lines = (
-                f" {json.dumps(key)}: {json.dumps(own, ensure_ascii=False)}" for key, own in value.items()
-            )
-            stream.write(("{\n" + ",\n".join(lines) + "\n}\n").encode())
+        try:
+            while left:
+                left = left[os.write(descriptor, left) :]
+        finally:
+            os.close(descriptor)
 
 
 @contextlib.contextmanager
@@ -112,9 +115,10 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         yield fresh
         fresh.replace(path)
-    finally:
-        if os.path.lexists(fresh):
+    except BaseException:
+        with contextlib.suppress(FileNotFoundError):
             fresh.unlink()
+        raise
 
 
 @contextlib.contextmanager
