@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator
+from pathlib import Path
 from typing import Annotated, Any, Final
 
 from anyio import CapacityLimiter
-from fastapi import Depends, Path, Request
+from fastapi import Depends, Request, Response
+from fastapi import Path as InPath
 
 from runner.archive.places import at_hand
 from runner.errors import RecordingError
@@ -44,7 +46,7 @@ MAX_WAITING: Final = 16
 """Calls with large temporary files that may wait for the one that runs."""
 RunName = Annotated[
     str,
-    Path(
+    InPath(
         max_length=200,
         description="A run: its id, the beginning of it, its name, `@latest` or `NAME@latest`.",
         examples=["@latest"],
@@ -86,40 +88,62 @@ def recording_state(run: Run) -> tuple[str, int, int]:
     return str(run.recording), stat.st_size, stat.st_mtime_ns
 
 
-def timed_recording_state(run: Run) -> tuple[str, int, int, str]:
-    """Return `recording_state` and the duration, which `run.json` may get after the recording is closed."""
-    return *recording_state(run), str(run.summary.seconds)
+def _state_of(argument: Any) -> Hashable:
+    """Return what changes with an argument of a computation: with the contents of recordings and runs."""
+    if isinstance(argument, Run):  # `run.json` may get the duration after the recording is closed
+        return *recording_state(argument), argument.summary.seconds
+    if isinstance(argument, Path):
+        stat = argument.stat()
+        return str(argument), stat.st_size, stat.st_mtime_ns
+    return tuple(map(_state_of, argument)) if isinstance(argument, list | tuple) else argument
 
 
 class Computation:
-    """Functions of a run's recording, called in a child process, their results cached."""
+    """Functions of runs and recordings, called in a child process, their results cached."""
 
-    def __init__(self, run: RecordedRun, cache: CacheOf, processes: ProcessesOf, spooling: Spooling) -> None:
-        self._run, self._cache, self._processes = run, cache, processes
-        self._spooling = spooling
+    def __init__(self, cache: CacheOf, processes: ProcessesOf, spooling: Spooling) -> None:
+        self._cache, self._processes, self._spooling = cache, processes, spooling
 
-    async def __call__(self, function: Callable[..., bytes], *args: Hashable, alone: bool = False) -> bytes:
-        """Return the result of a function of the recording's path and further arguments.
+    async def __call__(self, function: Callable[..., bytes], *args: Any, alone: bool = False) -> bytes:
+        """Return the result of a function.
 
-        Args:
-            function: the function.
-            args: its arguments after the path.
-            alone: whether it writes large temporary files: one such call at a time.
-
-        Raises:
-            Busy: too many calls are waiting.
+        With `alone` it writes large temporary files: one such call runs at a time, and of those that wait
+        for it, all beyond `MAX_WAITING` are refused as `Busy`.
         """
 
         async def call() -> bytes:
             if not alone:
-                return await self._processes(function, self._run.recording, *args)
+                return await self._processes(function, *args)
             if self._spooling.statistics().tasks_waiting >= MAX_WAITING:
                 raise Busy
             async with self._spooling:
-                return await self._processes(function, self._run.recording, *args)
+                return await self._processes(function, *args)
 
-        key = (function.__name__, recording_state(self._run), *args)
-        return await self._cache.get_or_await(key, call, ALWAYS)
+        return await self._cache.get_or_await((function, *map(_state_of, args)), call, ALWAYS)
+
+    async def json(self, function: Callable[..., bytes], *args: Any, alone: bool = False) -> Response:
+        """Return the JSON that a function returns as a response."""
+        return json_response(await self(function, *args, alone=alone))
 
 
 ComputationOf = Annotated[Computation, Depends()]
+
+
+class RunComputation(Computation):
+    """Functions of the recording of the run that the path names."""
+
+    def __init__(self, run: RecordedRun, cache: CacheOf, processes: ProcessesOf, spooling: Spooling) -> None:
+        super().__init__(cache, processes, spooling)
+        self._path = run.recording
+
+    async def __call__(self, function: Callable[..., bytes], *args: Any, alone: bool = False) -> bytes:
+        """Return the result of a function of the recording's path and further arguments."""
+        return await super().__call__(function, self._path, *args, alone=alone)
+
+
+RunComputationOf = Annotated[RunComputation, Depends()]
+
+
+def json_response(body: bytes) -> Response:
+    """Return a response of JSON that is encoded already."""
+    return Response(body, media_type="application/json")

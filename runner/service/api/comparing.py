@@ -5,7 +5,7 @@ from __future__ import annotations
 from http import HTTPStatus
 from typing import Annotated, Final
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Query, Response
 from fastapi import Path as InPath
 from starlette.concurrency import run_in_threadpool
 
@@ -25,19 +25,10 @@ from runner.service.api.reading import (
     Smooth,
 )
 from runner.service.catalogue import Catalogue
-from runner.service.dependencies import (
-    CacheOf,
-    CatalogueOf,
-    ProcessesOf,
-    SettingsOf,
-    recorded_run,
-    recording_state,
-    timed_recording_state,
-)
+from runner.service.dependencies import CatalogueOf, ComputationOf, SettingsOf, recorded_run
 from runner.service.problems import error_docs
-from runner.service.response_cache import ALWAYS
 from runner.service.settings import Settings
-from runner.util.values import Json, finite
+from runner.util.values import finite
 
 router = APIRouter(
     tags=["comparing"],
@@ -79,32 +70,29 @@ def found_explanation(pair: str, metric: str, settings: Settings) -> Explanation
     return read_explanation(name, folder)
 
 
-@router.get("/diff", summary="The differences between two runs, down to the first step that differs.")
+@router.get(
+    "/diff",
+    response_model=dict[str, object],
+    summary="The differences between two runs, down to the first step that differs.",
+)
 async def diff(
-    request: Request,
     catalogue: CatalogueOf,
-    cache: CacheOf,
-    processes: ProcessesOf,
+    compute: ComputationOf,
     a: Name,
     b: Name,
     ignore: Annotated[list[str] | None, Query(max_length=100, description="Paths, with * and ?.")] = None,
     target: Annotated[list[str] | None, Query(max_length=20, description="METRIC=LEVEL.")] = None,
     first: Annotated[bool, Query(description="Only settings, and the first step that differs.")] = False,
-) -> dict[str, object]:
+) -> Response:
     """Return what `dualtaxi diff --json` prints."""
     left, right = await found_runs(catalogue, [a, b])
-    key = ("diff", *map(timed_recording_state, (left, right)), request.url.query)
-    options = (left, right, ignore or [], first, target or [])
-    body = await cache.get_or_await(key, lambda: processes(computed.difference, *options), ALWAYS)
-    return Response(body, media_type="application/json")  # type: ignore[return-value]
+    return await compute.json(computed.difference, left, right, ignore or [], first, target or [])
 
 
 @router.get("/curves", response_model=Curves, summary="The curves of several runs, seeds as one curve.")
 async def curves(
-    request: Request,
     catalogue: CatalogueOf,
-    cache: CacheOf,
-    processes: ProcessesOf,
+    compute: ComputationOf,
     run: Runs,
     metric: Metrics = None,
     axis: AxisName = EPISODES.name,
@@ -115,20 +103,19 @@ async def curves(
     smooth: Smooth = 0,
 ) -> Response:
     """Return every metric over an axis, runs that differ in nothing but the seed as one curve with a band."""
-    runs = await found_runs(catalogue, run)
-    key = ("curves", *map(recording_state, runs), request.url.query)
-    paths, names = [found.recording for found in runs], tuple(metric or ())
-    options = (paths, axis, names, start, stop, points, lines, smooth)
-    body = await cache.get_or_await(key, lambda: processes(computed.curves, *options), ALWAYS)
-    return Response(body, media_type="application/json")
+    paths = [found.recording for found in await found_runs(catalogue, run)]
+    options = (axis, metric or [], start, stop, points, lines, smooth)
+    return await compute.json(computed.curves, paths, *options)
 
 
-@router.get("/compare", summary="A comparison of groups of runs, with statistics over seeds.")
+@router.get(
+    "/compare",
+    response_model=dict[str, object],
+    summary="A comparison of groups of runs, with statistics over seeds.",
+)
 async def compare(
-    request: Request,
     catalogue: CatalogueOf,
-    cache: CacheOf,
-    processes: ProcessesOf,
+    compute: ComputationOf,
     run: Runs,
     by: Annotated[str | None, Query(max_length=200, description="Group by this setting.")] = None,
     metric: Annotated[list[str] | None, Query(max_length=100)] = None,
@@ -146,13 +133,11 @@ async def compare(
             description="Over environments: `minmax`, or CSV with the columns task, random and expert.",
         ),
     ] = None,
-) -> Json:
+) -> Response:
     """Return what `dualtaxi compare --json` prints; a run's name stands for all runs of that name."""
-    runs = await found_runs(catalogue, run, several=True)
-    key = ("compare", *map(recording_state, runs), request.url.query)
-    options = ([found.recording for found in runs], by, metric or [], moment, target, axis, normalise)
-    body = await cache.get_or_await(key, lambda: processes(computed.comparison, *options), ALWAYS)
-    return Response(body, media_type="application/json")  # type: ignore[return-value]
+    paths = [found.recording for found in await found_runs(catalogue, run, several=True)]
+    options = (by, metric or [], moment, target, axis, normalise)
+    return await compute.json(computed.comparison, paths, *options)
 
 
 async def found_runs(catalogue: Catalogue, names: list[str], several: bool = False) -> list[Run]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from http import HTTPStatus
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Response
 from pydantic import BaseModel
@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from runner.analysis.step_reference import EXPECTED, StepRef
 from runner.service import computed, fragments
 from runner.service.api.replay import STEPS, Part, Start, Steps
-from runner.service.dependencies import ComputationOf
+from runner.service.dependencies import RunComputationOf
 from runner.service.problems import error_docs
 
 router = APIRouter(
@@ -77,22 +77,19 @@ class WhatIf(BaseModel):
 
 @router.get("/{at}", response_model=WhatIf, summary="Where each joint action at a step leads.")
 async def what_if(
-    compute: ComputationOf,
+    compute: RunComputationOf,
     at: At,
     action: Annotated[
         list[str] | None, Query(max_length=MAX_ACTIONS, description="Numbers or names; default: all.")
     ] = None,
-) -> dict[str, Any]:
+) -> Response:
     """Return what `dualtaxi branch --action all --json` prints; of a run that was trained here."""
-    step = StepRef.parse(at)
-    body = await compute(computed.where_actions_lead, step, tuple(action or ()))
-    return Response(body, media_type="application/json")  # type: ignore[return-value]
+    return await compute.json(computed.where_actions_lead, StepRef.parse(at), tuple(action or ()))
 
 
 @router.get("/{at}/{action}", response_model=Part, summary="A part of the episode to which an action leads.")
 async def branch(
-    compute: ComputationOf, at: At, action: ActionPath, start: Start = 0, steps: Steps = STEPS
+    compute: RunComputationOf, at: At, action: ActionPath, start: Start = 0, steps: Steps = STEPS
 ) -> Response:
     """Return steps in the form of a replay: those recorded up to the step, then those played."""
-    body = await compute(fragments.branch_part, StepRef.parse(at), action, start, steps)
-    return Response(body, media_type="application/json")
+    return await compute.json(fragments.branch_part, StepRef.parse(at), action, start, steps)

@@ -16,7 +16,14 @@ from runner.export.plots.metrics import CurveStyle
 from runner.recording.reader import Recording
 from runner.service import computed
 from runner.service.computed import too_many
-from runner.service.dependencies import ComputationOf, OpenRecording, ProcessesOf, RecordedRun, SettingsOf
+from runner.service.dependencies import (
+    OpenRecording,
+    ProcessesOf,
+    RecordedRun,
+    RunComputationOf,
+    SettingsOf,
+    json_response,
+)
 from runner.service.errors import Refused
 from runner.service.problems import error_docs, media_docs
 from runner.util.arrays import Array
@@ -184,7 +191,7 @@ class Columns(BaseModel):
 
 @router.get("/metrics", response_model=Curves, responses=BUSY, summary="The curves of a run's metrics.")
 async def metrics(
-    compute: ComputationOf,
+    compute: RunComputationOf,
     metric: Metrics = None,
     axis: AxisName = EPISODES.name,
     start: FirstPosition = 0,
@@ -197,8 +204,8 @@ async def metrics(
     With `points`, longer curves have the lowest and the highest value of each section only, and `thinned` is
     true; `start` and `stop` select a part at full resolution.
     """
-    names = tuple(metric or ())
-    return _json(await compute(computed.run_curves, axis, names, start, stop, points, False, smooth))
+    options = (axis, tuple(metric or ()), start, stop, points, False, smooth)
+    return await compute.json(computed.run_curves, *options)
 
 
 @router.get(
@@ -207,9 +214,9 @@ async def metrics(
     responses=BUSY,
     summary="Histograms over training, as heat maps.",
 )
-async def histograms(compute: ComputationOf, axis: AxisName = EPISODES.name) -> Response:
+async def histograms(compute: RunComputationOf, axis: AxisName = EPISODES.name) -> Response:
     """Return the counts of returns, lengths, actions and rewards in stretches of training."""
-    return _json(await compute(computed.run_histograms, axis))
+    return await compute.json(computed.run_histograms, axis)
 
 
 def _add_records_route(kind: computed.RecordKind, summary: str, description: str) -> None:
@@ -222,10 +229,10 @@ def _add_records_route(kind: computed.RecordKind, summary: str, description: str
         description=description,
     )
     async def records(
-        compute: ComputationOf, settings: SettingsOf, start: Start = 0, stop: Stop = None
+        compute: RunComputationOf, settings: SettingsOf, start: Start = 0, stop: Stop = None
     ) -> Response:
         stop = start + DEFAULT_RECORDS if stop is None else stop
-        return _json(await compute(computed.records, kind, start, stop, settings.limits.page_records))
+        return await compute.json(computed.records, kind, start, stop, settings.limits.page_records)
 
 
 _add_records_route(
@@ -299,44 +306,58 @@ def steps(
     return _columns(recording, columns, int(columns["step"][0]), total)
 
 
-@router.get("/qtable", responses=BUSY, summary="A summary of the Q-table at any step.")
+@router.get(
+    "/qtable",
+    response_model=dict[str, object],
+    responses=BUSY,
+    summary="A summary of the Q-table at any step.",
+)
 async def q_table(
-    compute: ComputationOf,
+    compute: RunComputationOf,
     step: Step = None,
     episode: Episode = None,
     state: Annotated[
         int | None, Query(ge=0, lt=2**31, description="Also the values of this state, with their history.")
     ] = None,
-) -> dict[str, object]:
+) -> Response:
     """Return size, fill and range of each learner's exact table, as `dualtaxi qtable --json` prints it."""
     _refuse_both(step, episode)
-    return _json(await compute(computed.q_table, step, episode, state, "json"))  # type: ignore[return-value]
+    return await compute.json(computed.q_table, step, episode, state, "json")
 
 
-@router.get("/when", responses=BUSY, summary="The training steps after which an expression holds.")
+@router.get(
+    "/when",
+    response_model=dict[str, object],
+    responses=BUSY,
+    summary="The training steps after which an expression holds.",
+)
 async def when(
-    compute: ComputationOf,
+    compute: RunComputationOf,
     expression: Expression,
     every: Annotated[bool, Query(alias="all", description="Find every interval.")] = False,
     first: Annotated[StepText, Query(alias="from")] = None,
     last: Annotated[StepText, Query(alias="to")] = None,
-) -> dict[str, object]:
+) -> Response:
     """Return what `dualtaxi when --json` prints; of a run that was trained here."""
-    return _json(await compute(computed.when, expression, every, first, last))  # type: ignore[return-value]
+    return await compute.json(computed.when, expression, every, first, last)
 
 
-@router.get("/why", responses=BUSY, summary="The rewards that a Q-value is the sum of.")
+@router.get(
+    "/why",
+    response_model=dict[str, object],
+    responses=BUSY,
+    summary="The rewards that a Q-value is the sum of.",
+)
 async def why(
-    compute: ComputationOf,
+    compute: RunComputationOf,
     state: StateName = None,
     action: ActionName = None,
     agent: AgentName = None,
     at: StepName = None,
     limit: Annotated[int, Query(ge=0, le=MAX_LIMIT, description="Most steps, 0 for all.")] = LIMIT,
-) -> dict[str, object]:
+) -> Response:
     """Return where a Q-value comes from, as `dualtaxi why --json` prints it; of a run trained here."""
-    body = await compute(computed.why, "json", state, action, agent, at, limit, alone=True)
-    return _json(body)  # type: ignore[return-value]
+    return await compute.json(computed.why, "json", state, action, agent, at, limit, alone=True)
 
 
 @router.get(
@@ -345,7 +366,7 @@ async def why(
     responses=media_docs(OCTETS) | BUSY,
     summary="The whole Q-table at any step.",
 )
-async def whole_q_table(compute: ComputationOf, step: Step = None, episode: Episode = None) -> Response:
+async def whole_q_table(compute: RunComputationOf, step: Step = None, episode: Episode = None) -> Response:
     """Return the exact table as a NumPy file: float64 [states, actions], or [learners, states, actions]."""
     _refuse_both(step, episode)
     body = await compute(computed.q_table, step, episode, None, "npy")
@@ -359,7 +380,7 @@ async def whole_q_table(compute: ComputationOf, step: Step = None, episode: Epis
     summary="Every metric in one figure.",
 )
 async def plot(
-    compute: ComputationOf,
+    compute: RunComputationOf,
     form: Literal["svg", "png", "pdf"],
     axis: AxisName = EPISODES.name,
     smooth: Smooth = 0,
@@ -384,11 +405,7 @@ def _stop(start: int, stop: int | None, total: int, limit: int) -> int:
     return stop
 
 
-def _json(body: bytes) -> Response:
-    return Response(body, media_type="application/json")
-
-
 def _columns(recording: Recording, columns: dict[str, Array], start: int, total: int) -> Response:
     lists = {name: values.tolist() for name, values in columns.items()}
     page = {"run_id": recording.run_id, "start": start, "total": total, "columns": lists}
-    return _json(computed.as_json(page))
+    return json_response(computed.as_json(page))

@@ -19,7 +19,7 @@ from runner.export.episodes import place_of
 from runner.export.reports.player_data import Playback
 from runner.recording.reader import open_recording
 from runner.service import fragments
-from runner.service.dependencies import CacheOf, PicturesOf, ProcessesOf, RecordedRun, recording_state
+from runner.service.dependencies import PicturesOf, RecordedRun, RunComputationOf, recording_state
 from runner.service.pictures import Make, PictureStreams
 from runner.service.problems import error_docs, media_docs
 
@@ -41,9 +41,6 @@ router = APIRouter(
 STEPS: Final = 500
 """Steps in a response by default."""
 MAX_STEPS: Final = 2000
-LONG: Final = 3600.0
-"""Seconds that a part is cached, unless the recording changes."""
-
 OCTETS: Final = "application/octet-stream"
 PICTURES: Final = 64
 """Pictures in a response by default."""
@@ -72,29 +69,18 @@ class Part(BaseModel):
 
 @router.get("/train/{episode}", response_model=Part, summary="A part of a training episode, to be replayed.")
 async def training(
-    run: RecordedRun,
-    cache: CacheOf,
-    processes: ProcessesOf,
-    episode: Number,
-    start: Start = 0,
-    steps: Steps = STEPS,
+    compute: RunComputationOf, episode: Number, start: Start = 0, steps: Steps = STEPS
 ) -> Response:
     """Return steps of a training episode: actions, rewards, and states or observations at each frame."""
-    return _json(await part_of(run, cache, processes, (episode,), start, steps))
+    return await compute.json(fragments.episode_part, (episode,), start, steps)
 
 
 @router.get("/eval/{after}/{trial}", response_model=Part, summary="A part of a trial, to be replayed.")
 async def trial(
-    run: RecordedRun,
-    cache: CacheOf,
-    processes: ProcessesOf,
-    after: After,
-    trial: Number,
-    start: Start = 0,
-    steps: Steps = STEPS,
+    compute: RunComputationOf, after: After, trial: Number, start: Start = 0, steps: Steps = STEPS
 ) -> Response:
     """Return steps of a trial of an evaluation, in the same form."""
-    return _json(await part_of(run, cache, processes, (after, trial), start, steps))
+    return await compute.json(fragments.episode_part, (after, trial), start, steps)
 
 
 @router.get(
@@ -163,17 +149,3 @@ def _pictured_episode(run: Run, which: tuple[int, ...]) -> _PicturedEpisode:
         length = len(recording.episode_span(place.phase, place.number))
     make = partial(encoded_pictures, run.recording, place.phase, place.number)
     return _PicturedEpisode((recording_state(run), place.phase, place.number), make, length)
-
-
-async def part_of(
-    run: Run, cache: CacheOf, processes: ProcessesOf, which: tuple[int, ...], start: int, steps: int = STEPS
-) -> bytes:
-    """Return a part of an episode as JSON; `which` as for `place_of`."""
-    key = ("replay part", recording_state(run), which, start, steps)
-    return await cache.get_or_await(
-        key, lambda: processes(fragments.episode_part, run.recording, which, start, steps), LONG
-    )
-
-
-def _json(body: bytes) -> Response:
-    return Response(body, media_type="application/json")

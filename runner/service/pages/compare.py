@@ -26,14 +26,7 @@ from runner.service import fragments
 from runner.service.addresses import link, places_in
 from runner.service.api.comparing import MAX_SCORES, found_runs
 from runner.service.api.reading import AxisName
-from runner.service.api.replay import LONG
-from runner.service.dependencies import (
-    CacheOf,
-    CatalogueOf,
-    ProcessesOf,
-    recording_state,
-    timed_recording_state,
-)
+from runner.service.dependencies import CatalogueOf, ComputationOf
 from runner.service.pages.frame import RunHead, has_tables, head_of, last_evaluation
 from runner.service.pages.panels import Panel, panel_of
 from runner.service.pages.rendering import page
@@ -189,27 +182,23 @@ def _tasks_address(runs: list[Run], scores: str) -> str:
 @router.get("/tasks")
 async def tasks(
     catalogue: CatalogueOf,
-    cache: CacheOf,
-    processes: ProcessesOf,
+    compute: ComputationOf,
     run: Names = None,
     scores: Scores = "",
     axis: AxisName = EPISODES.name,
 ) -> Response:
     """Return the comparison over environments by normalised scores, as a part of the page."""
-    runs = await _chosen(catalogue, run)
-    key = ("tasks", *map(recording_state, runs), scores, axis)
-    paths = [each.recording for each in runs]
-    body = await cache.get_or_await(key, lambda: processes(fragments.tasks, paths, axis, scores), LONG)
-    return HTMLResponse(body)
+    paths = [each.recording for each in await _chosen(catalogue, run)]
+    return HTMLResponse(await compute(fragments.tasks, paths, axis, scores))
 
 
 @router.get("/divergence")
 async def divergence(
-    request: Request, catalogue: CatalogueOf, cache: CacheOf, processes: ProcessesOf, run: Names = None
+    request: Request, catalogue: CatalogueOf, compute: ComputationOf, run: Names = None
 ) -> Response:
     """Show the first step at which two runs differ, and the cause."""
     runs = _two(await _chosen(catalogue, run))
-    found = await _difference(runs, cache, processes)
+    found = await _difference(runs, compute)
     compared = _compared(runs, "/divergence")
     view = _DivergenceView(compared, found["lead"], found["notes"], found["body"])
     return await run_in_threadpool(page, request, view)
@@ -217,11 +206,11 @@ async def divergence(
 
 @router.get("/tables")
 async def tables(
-    request: Request, catalogue: CatalogueOf, cache: CacheOf, processes: ProcessesOf, run: Names = None
+    request: Request, catalogue: CatalogueOf, compute: ComputationOf, run: Names = None
 ) -> Response:
     """Show the difference of the Q-tables of two runs."""
     runs = _two(await _chosen(catalogue, run))
-    body = (await _difference(runs, cache, processes))["tables"]
+    body = (await _difference(runs, compute))["tables"]
     return await run_in_threadpool(page, request, _TablesView(_compared(runs, "/tables"), body))
 
 
@@ -242,8 +231,7 @@ async def code(request: Request, catalogue: CatalogueOf, run: Names = None) -> R
 async def replay(
     request: Request,
     catalogue: CatalogueOf,
-    cache: CacheOf,
-    processes: ProcessesOf,
+    compute: ComputationOf,
     run: Names = None,
     at: Annotated[str, Query(max_length=60)] = "",
 ) -> Response:
@@ -252,7 +240,7 @@ async def replay(
     if at:
         step = StepRef.parse(at)
     else:
-        first = (await _difference(runs, cache, processes))["first_frame"]
+        first = (await _difference(runs, compute))["first_frame"]
         step = StepRef.parse(first) if first else StepRef(0)
     names, places = [each.run_id for each in runs], places_in(runs, step)
 
@@ -294,10 +282,9 @@ def _two(runs: list[Run]) -> list[Run]:
     return runs
 
 
-async def _difference(runs: list[Run], cache: CacheOf, processes: ProcessesOf) -> Json:
+async def _difference(runs: list[Run], compute: ComputationOf) -> Json:
     """Return the difference of two runs, see `fragments.difference`."""
-    key = ("difference", *map(timed_recording_state, runs))
-    body = await cache.get_or_await(key, lambda: processes(fragments.difference, *runs), LONG)
+    body = await compute(fragments.difference, *runs)
     found: Json = await run_in_threadpool(json.loads, body)
     return found
 

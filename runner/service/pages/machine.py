@@ -14,7 +14,7 @@ from runner.export.reports.rendering import View
 from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.addresses import link
-from runner.service.dependencies import ComputationOf, RecordedRun
+from runner.service.dependencies import RecordedRun, RunComputationOf
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import page
 
@@ -60,7 +60,7 @@ class _LinesView(View):
 
 
 @router.get("/system")
-async def system(request: Request, run: RecordedRun, compute: ComputationOf) -> Response:
+async def system(request: Request, run: RecordedRun, compute: RunComputationOf) -> Response:
     """Show steps a second, and the use of the machine, over time."""
     body = (await compute(fragments.system)).decode()
     live = _live(run, "system/part")
@@ -68,7 +68,7 @@ async def system(request: Request, run: RecordedRun, compute: ComputationOf) -> 
 
 
 @router.get("/system/part")
-async def system_part(run: RecordedRun, compute: ComputationOf, status: Status = "running") -> Response:
+async def system_part(run: RecordedRun, compute: RunComputationOf, status: Status = "running") -> Response:
     """Return what changes of the page; 204 if the run no longer has this status."""
     if run.status != status:
         return Response(status_code=HTTPStatus.NO_CONTENT)
@@ -76,7 +76,7 @@ async def system_part(run: RecordedRun, compute: ComputationOf, status: Status =
 
 
 @router.get("/pictures")
-async def pictures(request: Request, run: RecordedRun, compute: ComputationOf) -> Response:
+async def pictures(request: Request, run: RecordedRun, compute: RunComputationOf) -> Response:
     """Show the last pictures and films that were logged."""
     body = (await compute(fragments.pictures)).decode()
     return await run_in_threadpool(page, request, _SystemView(head_of(run), "pictures", body, ""))
@@ -84,7 +84,7 @@ async def pictures(request: Request, run: RecordedRun, compute: ComputationOf) -
 
 @router.get("/console")
 async def console(
-    request: Request, run: RecordedRun, compute: ComputationOf, sought: Sought = "", stream: Stream = ""
+    request: Request, run: RecordedRun, compute: RunComputationOf, sought: Sought = "", stream: Stream = ""
 ) -> Response:
     """Show the last lines of the output, or the last that have a text."""
     output = await _output(compute, sought, stream)
@@ -97,7 +97,7 @@ async def console(
 async def console_part(
     request: Request,
     run: RecordedRun,
-    compute: ComputationOf,
+    compute: RunComputationOf,
     sought: Sought = "",
     stream: Stream = "",
     status: Status = "running",
@@ -108,7 +108,7 @@ async def console_part(
     return page(request, _LinesView(await _output(compute, sought, stream)))
 
 
-async def _output(compute: ComputationOf, sought: str, stream: Stream) -> Output:
+async def _output(compute: RunComputationOf, sought: str, stream: Stream) -> Output:
     return Output(**json.loads(await compute(fragments.console, sought, stream)))
 
 

@@ -25,17 +25,9 @@ from runner.runs.branches import BranchOrigin, Origin, origin_in
 from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.addresses import link
-from runner.service.api.replay import part_of, prepare_pictures
+from runner.service.api.replay import STEPS, prepare_pictures
 from runner.service.catalogue import Catalogue
-from runner.service.dependencies import (
-    CacheOf,
-    CatalogueOf,
-    ComputationOf,
-    PicturesOf,
-    ProcessesOf,
-    RecordedRun,
-    recording_state,
-)
+from runner.service.dependencies import CatalogueOf, PicturesOf, RecordedRun, RunComputationOf
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.panels import Panel, panel_of
 from runner.service.pages.rendering import message_of, page
@@ -117,8 +109,7 @@ class _LatestView(View):
 @router.get("")
 async def chosen_replay(
     run: RecordedRun,
-    cache: CacheOf,
-    processes: ProcessesOf,
+    compute: RunComputationOf,
     phase: Literal["train", "eval"] | None = None,
     episode: str = "",
     after: str = "",
@@ -130,9 +121,7 @@ async def chosen_replay(
     elif phase == "eval" and after:
         place = f"eval/{_whole(after)}/{_whole(trial)}"
     else:
-        key = ("typical", recording_state(run))
-        found = await cache.get_or_await(key, lambda: processes(fragments.typical_episode, run.recording))
-        place = found.decode()
+        place = (await compute(fragments.typical_episode)).decode()
     return RedirectResponse(f"/runs/{run.run_id}/replay/{place}", HTTPStatus.FOUND)
 
 
@@ -140,7 +129,7 @@ async def chosen_replay(
 async def latest(
     request: Request,
     run: RecordedRun,
-    compute: ComputationOf,
+    compute: RunComputationOf,
     shown: Annotated[str, Query(max_length=40)] = "",
 ) -> Response:
     """Return the replay of the latest whole training episode as a part of a page.
@@ -168,23 +157,21 @@ async def latest(
 async def training_replay(
     request: Request,
     run: RecordedRun,
-    cache: CacheOf,
-    processes: ProcessesOf,
+    compute: RunComputationOf,
     streams: PicturesOf,
     catalogue: CatalogueOf,
     episode: Number,
     t: T = 0,
 ) -> Response:
     """Show a step of a training episode."""
-    return await _replay(request, run, cache, processes, streams, catalogue, (episode,), t)
+    return await _replay(request, run, compute, streams, catalogue, (episode,), t)
 
 
 @router.get("/eval/{after}/{trial}")
 async def trial_replay(
     request: Request,
     run: RecordedRun,
-    cache: CacheOf,
-    processes: ProcessesOf,
+    compute: RunComputationOf,
     streams: PicturesOf,
     catalogue: CatalogueOf,
     after: Number,
@@ -192,14 +179,13 @@ async def trial_replay(
     t: T = 0,
 ) -> Response:
     """Show a step of a trial of an evaluation."""
-    return await _replay(request, run, cache, processes, streams, catalogue, (after, trial), t)
+    return await _replay(request, run, compute, streams, catalogue, (after, trial), t)
 
 
 async def _replay(
     request: Request,
     run: Run,
-    cache: CacheOf,
-    processes: ProcessesOf,
+    compute: RunComputationOf,
     streams: PicturesOf,
     catalogue: CatalogueOf,
     which: tuple[int, ...],
@@ -208,7 +194,7 @@ async def _replay(
     part: bytes | RunnerError
     preparing = asyncio.create_task(prepare_pictures(run, streams, which, t))
     try:
-        part = await part_of(run, cache, processes, which, max(0, t - BEFORE))
+        part = await compute(fragments.episode_part, which, max(0, t - BEFORE), STEPS)
     except RunnerError as error:
         part = error
     await preparing

@@ -23,8 +23,7 @@ from runner.export.reports.rendering import View
 from runner.export.rerun import viewer as native_viewer
 from runner.service import fragments
 from runner.service.addresses import link
-from runner.service.api.replay import LONG
-from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
+from runner.service.dependencies import ComputationOf, RecordedRun
 from runner.service.guard import POLICY
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import page
@@ -78,14 +77,12 @@ def viewer(request: Request, run: RecordedRun, at: Annotated[str, Query(max_leng
 async def frame(
     request: Request,
     run: RecordedRun,
-    cache: CacheOf,
-    processes: ProcessesOf,
+    compute: ComputationOf,
     at: Annotated[str, Query(max_length=60)] = "",
 ) -> Response:
     """Show the viewer alone, opened at a step."""
     step = StepRef.parse(at) if at else None
-    key = ("timeline step", recording_state(run), step)
-    time = await cache.get_or_await(key, lambda: processes(fragments.timeline_step, run, step), LONG)
+    time = await compute(fragments.timeline_step, run, step)
     query: dict[str, int | None] = {}
     if step:
         query = {"episodes": step.episode} if step.after is None else {"evaluations": step.after}

@@ -30,18 +30,16 @@ from runner.runs.run import Run
 from runner.runs.shards import shards_in_words
 from runner.service import fragments
 from runner.service.api.reading import AxisName
-from runner.service.api.replay import LONG
 from runner.service.api.runs import LabelChanges, relabelled
 from runner.service.dependencies import (
-    CacheOf,
     CatalogueOf,
+    ComputationOf,
     FoundRun,
     JobsOf,
     OpenRecording,
-    ProcessesOf,
     RecordedRun,
+    RunComputationOf,
     SettingsOf,
-    recording_state,
 )
 from runner.service.pages.frame import RunView, has_tables, head_of, loop_results
 from runner.service.pages.rendering import Form, message_of, page
@@ -51,8 +49,6 @@ from runner.util.values import Json
 if TYPE_CHECKING:
     from runner.service.catalogue import Catalogue
     from runner.service.jobs.queue import JobQueue
-    from runner.service.processes import ProcessPool
-    from runner.service.response_cache import ResponseCache
     from runner.service.settings import Settings
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
@@ -120,11 +116,13 @@ async def overview(
     jobs: JobsOf,
     settings: SettingsOf,
     catalogue: CatalogueOf,
-    cache: CacheOf,
-    processes: ProcessesOf,
+    compute: ComputationOf,
 ) -> Response:
     """Show the status of a run, its metrics, and the tree of branches that it belongs to."""
-    random = await _random_policy(run, cache, processes)
+    try:
+        random = (await compute(fragments.random_policy, run.recording)).decode()
+    except (OSError, RunnerError):
+        random = ""  # the page itself shows the problem of the recording
     view = await run_in_threadpool(_overview, run, jobs, settings, catalogue, random)
     return await run_in_threadpool(page, request, view)
 
@@ -181,15 +179,9 @@ def status(
 
 
 @router.get("/distributions")
-async def distributions(
-    run: RecordedRun, cache: CacheOf, processes: ProcessesOf, axis: AxisName = EPISODES.name
-) -> Response:
+async def distributions(compute: RunComputationOf, axis: AxisName = EPISODES.name) -> Response:
     """Return the histograms of training, as a part of the run's page."""
-    key = ("distributions", recording_state(run), axis)
-    body = await cache.get_or_await(
-        key, lambda: processes(fragments.distributions, run.recording, axis), LONG
-    )
-    return HTMLResponse(body)
+    return HTMLResponse(await compute(fragments.distributions, axis))
 
 
 @router.get("/evaluations")
@@ -209,23 +201,10 @@ def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) ->
 
 
 @router.get("/learned")
-async def learned(request: Request, run: RecordedRun, cache: CacheOf, processes: ProcessesOf) -> Response:
+async def learned(request: Request, run: RecordedRun, compute: RunComputationOf) -> Response:
     """Show policy and values at stages of learning."""
-    key = ("maps", recording_state(run))
-    maps = await cache.get_or_await(key, lambda: processes(fragments.maps, run.recording), LONG)
-    return await run_in_threadpool(page, request, _LearnedView(head_of(run), "learned", maps.decode()))
-
-
-async def _random_policy(run: Run, cache: ResponseCache, processes: ProcessPool) -> str:
-    """Return a sentence on what a random policy achieves in a run's environment; empty if unknown."""
-    try:
-        key = ("random_policy", await run_in_threadpool(recording_state, run))
-        sentence = await cache.get_or_await(
-            key, lambda: processes(fragments.random_policy, run.recording), LONG
-        )
-    except (OSError, RunnerError):
-        return ""  # the page itself shows the problem of the recording
-    return sentence.decode()
+    maps = (await compute(fragments.maps)).decode()
+    return await run_in_threadpool(page, request, _LearnedView(head_of(run), "learned", maps))
 
 
 def _overview(

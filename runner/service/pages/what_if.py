@@ -11,10 +11,11 @@ from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.sections import Grid
 from runner.analysis.step_reference import StepRef
+from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.api.debugging import ActionPath, At
-from runner.service.api.replay import LONG, STEPS
-from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
+from runner.service.api.replay import STEPS
+from runner.service.dependencies import ComputationOf, RecordedRun
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import page
 from runner.service.pages.replay import BEFORE, ShownStep, T, shown_step
@@ -47,42 +48,32 @@ class _WhatIfView(RunView):
 
 @router.get("/{at}")
 async def what_if(
-    request: Request, run: RecordedRun, cache: CacheOf, processes: ProcessesOf, at: At, t: T | None = None
+    request: Request, run: RecordedRun, compute: ComputationOf, at: At, t: T | None = None
 ) -> Response:
     """Show where each joint action leads, and the replay of the recorded one."""
-    return await _what_if(request, run, cache, processes, at, None, t)
+    return await _what_if(request, run, compute, at, None, t)
 
 
 @router.get("/{at}/{action}")
 async def branch(
     request: Request,
     run: RecordedRun,
-    cache: CacheOf,
-    processes: ProcessesOf,
+    compute: ComputationOf,
     at: At,
     action: ActionPath,
     t: T | None = None,
 ) -> Response:
     """Show where each joint action leads, and the replay of one."""
-    return await _what_if(request, run, cache, processes, at, action, t)
+    return await _what_if(request, run, compute, at, action, t)
 
 
 async def _what_if(
-    request: Request,
-    run: RecordedRun,
-    cache: CacheOf,
-    processes: ProcessesOf,
-    at: str,
-    action: str | None,
-    t: int | None,
+    request: Request, run: Run, compute: ComputationOf, at: str, action: str | None, t: int | None
 ) -> Response:
     step = StepRef.parse(at)
     shown_t = step.t if t is None else t
     start = max(0, shown_t - BEFORE)
-    key = ("what if", recording_state(run), step, action, start)
-    body = await cache.get_or_await(
-        key, lambda: processes(fragments.what_if_page, run, step, action, start, STEPS), LONG
-    )
+    body = await compute(fragments.what_if_page, run, step, action, start, STEPS)
 
     def show() -> Response:
         found = json.loads(body)

@@ -13,7 +13,7 @@ from runner.analysis.sections import Grid
 from runner.debugging.expressions import MAX_CHARACTERS
 from runner.errors import RunnerError
 from runner.service import computed
-from runner.service.dependencies import ComputationOf, RecordedRun
+from runner.service.dependencies import RecordedRun, RunComputationOf
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import message_of, page
 
@@ -42,7 +42,7 @@ class _WhenView(RunView):
 async def when(
     request: Request,
     run: RecordedRun,
-    compute: ComputationOf,
+    compute: RunComputationOf,
     expression: Annotated[str, Query(max_length=MAX_CHARACTERS)] = "",
     every: Annotated[bool, Query(alias="all")] = False,
     first: Annotated[StepField, Query(alias="from")] = "",

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query, Request, Response
 
 from runner.errors import RunnerError
 from runner.service import computed
-from runner.service.dependencies import ComputationOf, OpenRecording, RecordedRun
+from runner.service.dependencies import OpenRecording, RecordedRun, RunComputationOf
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import message_of, page
 
@@ -38,7 +38,7 @@ async def why(
     request: Request,
     run: RecordedRun,
     recording: OpenRecording,
-    compute: ComputationOf,
+    compute: RunComputationOf,
     state: Name = "",
     action: Name = "",
     agent: Name = "",

@@ -9,6 +9,7 @@ import runner
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
+from runner.service.pages.why import STEPS
 from tests.runner.export.outline import Outline
 
 RUN = "/runs/first"
@@ -78,3 +79,12 @@ def test_a_loop_has_neither_the_page_nor_an_answer(loops_client, loops):
     answer = loops_client.get(f"/api/v1/runs/{run.run_id}/why?state=0&action=0")
     assert answer.status_code == 400
     assert "dualtaxi values" in answer.json()["error"]["message"]
+
+
+def test_the_page_and_the_api_do_not_share_what_is_cached(client, recordings):
+    _, asked = question(recordings)
+    assert client.get(f"{RUN}/why", params=asked).status_code == 200
+    answer = client.get(
+        f"/api/v1{RUN}/why", params={name: str(value) for name, value in asked.items()} | {"limit": STEPS}
+    )
+    assert answer.json()["run_id"]
