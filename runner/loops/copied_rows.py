@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
 from runner.loops.rows import Rows
+from runner.loops.single_rows import VariableRows
 from runner.recording import schema
 from runner.recording.messages import Message, encode
 from runner.recording.recorder import Recorder
@@ -109,12 +110,8 @@ class CopiedRows(_Copies):
         self._recorder.take(self._steps, np.arange(before + 1, before + n + 1, dtype=np.uint64))
 
 
-class CopiedMessages(_Copies):
+class CopiedMessages(_Copies, VariableRows):
     """Rows whose values vary in size, that are copied."""
-
-    def _open_steps(self) -> tuple[int, int]:
-        self._paid = np.zeros(4096)
-        return len(self._paid), len(self._paid)
 
     def put_reset(self, reset: Message, environment: int) -> None:
         """Copy a reset."""
@@ -136,17 +133,8 @@ class CopiedMessages(_Copies):
             self._paid[self.filled] = row["rewards"][0]
             self._count(row["rewards"][0], row["terminated"], row["truncated"])
 
-    def _put_reset(self, observation: object, seed: int | None) -> None:
-        """Do nothing: the message is complete."""
-
-    def _rewards(self, n: int) -> NDArray[np.float64]:
-        return self._paid[:n]
-
-    def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
-        """Do nothing: the messages are complete."""
-
-    def _finish_resets(self, begins: Ints, before: int) -> None:  # noqa: ARG002
-        self._reset_count += len(self._reset_rows)
+    def _put_reset(self, observation: object, seed: int | None) -> None:  # noqa: ARG002
+        self._reset_count += 1
 
 
 def _payload(message: Mapping[str, object]) -> dict[str, object]:

@@ -141,7 +141,8 @@ def record(
     """
     options = {"name": name, "seed": seed, "config": config, "info": info, "frames_every": frames_every}
     options |= {"frame_format": frame_format, "join": join, "shard": shard, "on_error": on_error, **packing}
-    if _is_vec_env(env):
+    sb3 = sys.modules.get("stable_baselines3.common.vec_env")  # is not imported for this
+    if sb3 is not None and isinstance(env, sb3.VecEnv):
         if into is not None:
             raise ConfigError("into: found it with a VecEnv, expected join=RUN")
         from runner.loops.recorded_vec_env import record_vec_env  # imports Stable-Baselines3
@@ -168,12 +169,6 @@ def record(
     maker = maker_of(env, checked_make(make))
     loop: Loop[Rows] = Loop(described, options_of(recordings, options), maker, ROWS[described.kind])
     return RecordedEnv(env, loop, phase)
-
-
-def _is_vec_env(env: object) -> bool:
-    """Return whether an environment is a `VecEnv` of Stable-Baselines3, without importing the library."""
-    module = sys.modules.get("stable_baselines3.common.vec_env")
-    return module is not None and isinstance(env, module.VecEnv)
 
 
 def _record_into_run(env: Env, into: RecordedEnv, phase: str, make: str) -> RecordedEnv:

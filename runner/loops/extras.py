@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import ConfigError, RunnerError
-from runner.loops.rows import PhaseRows
 from runner.loops.values import as_array
+from runner.loops.vector_rows import PhaseRows
 from runner.recording import schema
 from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAME_LENGTH, MAX_NAMES, ExtraLayout
 from runner.recording.gym_values import SCALARS

@@ -15,8 +15,8 @@ from runner.loops.flushing import FLUSHER
 from runner.loops.loop_run import LoopRun
 from runner.loops.messages import Messages
 from runner.loops.options import Options
-from runner.loops.rows import PhaseRows
 from runner.loops.values import check_phase, warn_user
+from runner.loops.vector_rows import PhaseRows
 from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.metadata import RECORDING_STOPPED

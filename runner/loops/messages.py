@@ -15,8 +15,9 @@ from runner.loops.checkpointing import content_of
 from runner.loops.options import ALL_INFO, Options, pillow
 from runner.loops.outcomes import Outcomes
 from runner.loops.pictures import Picture, image_bytes
-from runner.loops.rows import MAX_SEED, PhaseRows
+from runner.loops.rows import MAX_SEED
 from runner.loops.values import MAX_ARRAY_BYTES, arrays_of, check_log_name, logged_number
+from runner.loops.vector_rows import PhaseRows
 from runner.recording import schema
 from runner.recording.messages import encode, encode_image, encode_log, frame_id, scalar_encoder
 from runner.recording.recorder import Recorder

@@ -229,11 +229,6 @@ class RecordedAlone(Recorded[S]):
         super()._enter(phase)
         self._watch.due = 0
 
-    def _steps_so_far(self) -> int:
-        """Return the number of steps of the phase; another thread may be committing some of them."""
-        with self._loop.lock:
-            return self._rows.place[0]
-
     def _record_frame(self, is_reset: bool = False, is_over: bool = False) -> None:
         """Record a picture of the last step or reset, if the options include it."""
         self._until_frame -= 1
@@ -245,7 +240,9 @@ class RecordedAlone(Recorded[S]):
     def _recorded_reset(self, seed: int | None, options: dict[str, Any] | None) -> ResetResult:
         """Reset the environment, and record it: the seed, the options, the observation."""
         before = frozen_options(options or {})
-        state = self._watch.before(self._steps_so_far()) if seed is None else None
+        with self._loop.lock:  # another thread may be committing steps
+            steps = self._rows.place[0]
+        state = self._watch.before(steps) if seed is None else None
         result: ResetResult = self.env.reset(**given(seed=seed, options=options))
         try:
             state = self._watch.after(state, seed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
@@ -14,6 +14,15 @@ from runner.loops.vec_env import VecEnvVector
 from runner.loops.vector import record_vector
 
 _METHODS = ("reset", "step_async", "step_wait")
+
+
+def _passed_on(name: str) -> Callable[..., Any]:
+    """Return a method that calls the one of this name of the `VecEnv` inside."""
+
+    def method(self: RecordedVecEnv, *args: object, **keywords: object) -> Any:
+        return getattr(self.base, name)(*args, **keywords)
+
+    return method
 
 
 class RecordedVecEnv(VecEnv):  # type: ignore[misc]
@@ -92,43 +101,11 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         """Close the environments, and the recording as finished."""
         self.recorded.close()
 
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seeds of the next reset."""
-        return self.base.seed(seed)  # type: ignore[no-any-return]
-
-    def set_options(self, options: object = None) -> None:
-        """Set the options of the next reset."""
-        self.base.set_options(options)
-
-    def get_images(self) -> Any:
-        """Return a picture of each environment."""
-        return self.base.get_images()
-
-    def render(self, mode: str | None = None) -> Any:
-        """Return one picture of all environments, or show it."""
-        return self.base.render(mode)
-
-    def get_attr(self, attr_name: str, indices: object = None) -> Any:
-        """Return an attribute of each environment."""
-        return self.base.get_attr(attr_name, indices)
-
-    def has_attr(self, attr_name: str) -> bool:
-        """Return whether each environment has an attribute."""
-        return bool(self.base.has_attr(attr_name))
-
-    def set_attr(self, attr_name: str, value: object, indices: object = None) -> None:
-        """Set an attribute of each environment."""
-        self.base.set_attr(attr_name, value, indices)
-
-    def env_method(
-        self, method_name: str, *arguments: object, indices: object = None, **named: object
-    ) -> Any:
-        """Call a method of each environment."""
-        return self.base.env_method(method_name, *arguments, indices=indices, **named)
-
-    def env_is_wrapped(self, wrapper_class: type, indices: int | Iterable[int] | None = None) -> Any:
-        """Return for each environment whether it has a wrapper."""
-        return self.base.env_is_wrapped(wrapper_class, indices)
+    # What a VecEnv must have besides goes to the recorded one as it is.
+    seed, set_options = _passed_on("seed"), _passed_on("set_options")
+    render, get_images = _passed_on("render"), _passed_on("get_images")
+    get_attr, set_attr, has_attr = _passed_on("get_attr"), _passed_on("set_attr"), _passed_on("has_attr")
+    env_method, env_is_wrapped = _passed_on("env_method"), _passed_on("env_is_wrapped")
 
 
 def record_vec_env(env: VecEnv, options: dict[str, Any]) -> VecEnv:

@@ -7,7 +7,7 @@ state before each, the lengths of episodes) is computed for a whole block at onc
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final, Protocol, SupportsFloat
+from typing import Final, SupportsFloat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,31 +22,6 @@ from runner.util.arrays import Ints
 
 MAX_SEED: Final = 2**64 - 1
 """The largest seed that the record of a reset holds."""
-
-
-class PhaseRows(Protocol):
-    """The steps of one phase, as a loop uses them. Not thread-safe: the caller holds the loop's lock."""
-
-    @property
-    def filled(self) -> int:
-        """Steps that the recorder does not have yet."""
-
-    @property
-    def place(self) -> tuple[int, int]:
-        """The number of steps of the phase so far, and the number of the current episode."""
-
-    @property
-    def off_table(self) -> int:
-        """Steps whose reward the environment's table excludes; 0 without a table."""
-
-    def open(self) -> None:
-        """Take blocks from the recorder."""
-
-    def commit(self) -> None:
-        """Hand all steps to the recorder."""
-
-    def reshape(self, described: Described) -> None:
-        """Prepare for actions of another dtype, before the first step."""
 
 
 class Rows:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from runner.loops.description import Described
 from runner.loops.generators import States
-from runner.loops.rows import MAX_SEED
+from runner.loops.rows import MAX_SEED, Rows
 from runner.loops.values import require_reset, warn_user
 from runner.loops.vector_counts import EpisodeCounts, Flags, ResetsBetween, counts_of
 from runner.recording import schema
@@ -379,3 +379,7 @@ class VectorRows:
                 block[name] = values[part]
             self._recorder.take(topic, positions[part])
             done += len(block)
+
+
+PhaseRows = Rows | VectorRows
+"""The steps of one phase, as a loop uses them. Not thread-safe: the caller holds the loop's lock."""

@@ -156,11 +156,11 @@ def _batch(space: Any, values: Any) -> Any:
         return tuple(_batch(part, [own[i] for own in values]) for i, part in enumerate(space.spaces))
     if space.shape is None or np.dtype(space.dtype).kind not in "biuf" or registered(space) is not None:
         return tuple(_from_json(space, own) for own in values)
-    return np.array(_numbers(values), space.dtype).reshape(-1, *space.shape)
+    return np.array(numbers_in(values), space.dtype).reshape(-1, *space.shape)
 
 
-def _numbers(data: object) -> object:
+def numbers_in(data: object) -> object:
     """Return nested numbers; in JSON, NaN and infinities are text."""
     if isinstance(data, list):
-        return [_numbers(part) for part in data]
+        return [numbers_in(part) for part in data]
     return float(data) if isinstance(data, str) else data

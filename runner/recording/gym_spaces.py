@@ -17,7 +17,7 @@ from gymnasium import spaces
 
 from runner.environments.gym_types import Space
 from runner.errors import EnvironmentNotUsable
-from runner.recording.gym_json import registered, structure_of, text_of
+from runner.recording.gym_json import numbers_in, registered, structure_of, text_of
 from runner.recording.spaces import MAX_VALUE_BYTES, Description
 from runner.util.jsonable import as_json
 from runner.util.values import is_text
@@ -207,7 +207,7 @@ class _Box(_Kind[SpaceT]):
         else:
             least, most = (0, 1) if dtype.kind == "b" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
         low, high = (
-            np.broadcast_to(np.array(widest if bound is None else _numbers(bound), dtype), shape)
+            np.broadcast_to(np.array(widest if bound is None else numbers_in(bound), dtype), shape)
             for bound, widest in ((description["low"], least), (description["high"], most))
         )
         return spaces.Box(low, high, shape, dtype.type)
@@ -296,10 +296,3 @@ def _bound(bound: object) -> object:
     if (values == values.flat[0]).all():
         return as_json(values.flat[0].item())
     return as_json(values.tolist()) if values.size <= _MAX_BOUNDS else None
-
-
-def _numbers(bound: object) -> object:
-    """Return a bound as numbers; in JSON, infinities are text."""
-    if isinstance(bound, list):
-        return [_numbers(part) for part in bound]
-    return float(bound) if isinstance(bound, str) else bound
