@@ -60,7 +60,6 @@ def description_tables(mdp: Mdp, shape: Shape) -> dict[str, pa.Table]:
 
 
 def _transitions(mdp: Mdp, shape: Shape) -> pa.Table:
-    """Return a row for each possible outcome of a state and an action."""
     possible = mdp.probability > 0
     state, action, _ = np.nonzero(possible)
     columns: dict[str, object] = {
@@ -78,7 +77,6 @@ def _transitions(mdp: Mdp, shape: Shape) -> pa.Table:
 
 
 def _states(mdp: Mdp, shape: Shape) -> pa.Table:
-    """Return a row for each state: description, start probability, and positions of the things."""
     columns: dict[str, object] = {
         "state": np.arange(mdp.states, dtype=np.int32),
         "words": states_in_words(mdp).tolist(),
@@ -95,7 +93,6 @@ def _states(mdp: Mdp, shape: Shape) -> pa.Table:
 
 
 def _actions(mdp: Mdp, shape: Shape) -> pa.Table:
-    """Return a row for each joint action: description, and each agent's own action."""
     action = np.arange(mdp.joint_actions, dtype=np.int32)
     columns: dict[str, object] = {"action": action, "words": actions_in_words(mdp).tolist()}
     if shape.own_actions:

@@ -167,7 +167,6 @@ class Archive(RunDescription):
             raise RecordingError(f"{path}: cannot be read as a table ({error}).") from error
 
     def _check(self, file: pq.ParquetFile, path: Path, columns: pa.Schema, rows: int) -> None:
-        """Refuse a table with another footer than archives have."""
         about, size = file.metadata, path.stat().st_size
         found = file.schema_arrow.remove_metadata()
         earlier = pa.schema([column for column in columns if column.name != layout.FRAME_ID])

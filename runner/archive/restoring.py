@@ -192,7 +192,6 @@ class _Restorer:
         self._pipeline.send(topic, records, times, offsets, done=self._pending.release)
 
     def _rows(self, table: Table) -> Iterator[Json]:
-        """Yield the rows of a table."""
         limit = BLOCK_BYTES // layout.row_bytes(table.columns)
         has_bytes = any(map(pa.types.is_binary, table.columns.types))
         n = 1 if has_bytes else max(1, min(limit, _ROWS_AT_ONCE))
@@ -238,7 +237,6 @@ class _Restorer:
 
 
 def _packing_of(archive: Archive) -> Packing:
-    """Return the packing of the recording."""
     config = archive.config
     if archive.is_job:
         return from_mapping(config).recording.packing

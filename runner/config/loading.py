@@ -287,7 +287,6 @@ def _position(part: str | int, items: Sequence[object]) -> int | None:
 
 
 def _default(key: str) -> Json:
-    """Return the default of a section as plain values; empty for other keys."""
     field = ExperimentFile.model_fields.get(key)
     default = field.default if field else None
     return default.model_dump(mode="json", exclude_unset=True) if isinstance(default, Section) else {}

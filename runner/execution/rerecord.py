@@ -165,7 +165,6 @@ def evaluation_of(
 
 
 def _record(job: Job, run: Run, fresh: Path, report: Report, stop: Stop) -> dict[str, object]:
-    """Run the job again into a new file; return its summary, with the digest of the old recording."""
     mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
     with open_recording(run.recording) as recording:
         learner = Learner(job.config, mdp, job.seed, recorded_tables(recording))

@@ -337,7 +337,6 @@ def _set(tables: Tables, i: int, state: int, action: int, row: int, width: int, 
 
 @numba.njit(inline="always")
 def _best(q: NDArray[np.float64], row: int, width: int) -> int:
-    """Return the lowest action of the highest value in a row."""
     best = Index(0)
     highest = q[row]
     for action in range(Index(1), Index(width)):

@@ -287,7 +287,6 @@ def _numpy(values: object) -> object:
 
 
 def _arrays(values: object) -> Iterator[Any]:
-    """Yield the arrays of nested values."""
     if isinstance(values, Mapping | tuple):
         for part in values.values() if isinstance(values, Mapping) else values:
             yield from _arrays(part)

@@ -275,5 +275,4 @@ class _Player:
 
 
 def _text(action: object) -> str:
-    """Return an action as JSON."""
     return json.dumps(as_json(action))

@@ -172,7 +172,6 @@ def record(
 
 
 def _record_into_run(env: Env, into: RecordedEnv, phase: str, make: str) -> RecordedEnv:
-    """Return an environment recorded into the run of another one."""
     if not isinstance(into, RecordedEnv):
         raise ConfigError(f"into: found {type(into).__name__}, expected what runner.record returned")
     loop = into._loop

@@ -309,7 +309,6 @@ def _fitting(name: str, value: object, base: np.dtype[np.generic], shape: tuple[
 
 
 def _numbers(name: str, value: object) -> Array:
-    """Return a value as an array of numbers."""
     try:
         array = as_array(value)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:

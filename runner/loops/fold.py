@@ -105,14 +105,12 @@ class Fold:
             return result | {"seconds": before + round(time.monotonic() - started, 3), "bytes": file.size}
 
     def _errors(self) -> list[str]:
-        """Return the error of the process that began the run, and those of shards with their names."""
         own = self._run.file.summary.error
         failed = [shard for shard in shards_of(self._run) if shard.status == "failed"]
         others = [f"{shard.run_id} failed: {shard.summary.error or 'of unknown cause'}" for shard in failed]
         return ([own] if own else []) + others
 
     def _facts(self) -> dict[str, str]:
-        """Return the metadata record `run`."""
         shards = [
             Shard(source.name, source.n, source.recording.status, source.taken["train"], source.taken["eval"])
             for source in self._sources

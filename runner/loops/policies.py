@@ -113,7 +113,6 @@ def play_checkpoint(
 
 
 def _play(rec: Any, act: Policy, seed: int, name: str, is_game: bool) -> None:
-    """Play an episode."""
     observation, over = rec.reset(seed=seed)[0], False
     while not over:
         with from_policy(name):

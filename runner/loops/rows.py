@@ -167,7 +167,6 @@ class Rows:
         self._begins, self._ends, self._reset_rows, self._seeds = [], [], [], []
 
     def _finish_episodes(self, begins: Ints, starts: Ints, before: int) -> None:
-        """Hand the records of the episodes that ended to the recorder."""
         rows = np.array([end[0] for end in self._ends], np.int64)
         first = starts[np.searchsorted(begins, rows, side="right")]
         n = len(rows)
@@ -184,7 +183,6 @@ class Rows:
         self._ended += n
 
     def _finish_resets(self, begins: Ints, before: int) -> None:
-        """Complete the records of resets and hand them to the recorder."""
         n = len(self._reset_rows)
         rows = np.array(self._reset_rows, np.int64)
         block = self._recorder.block(self._resets)[:n]
@@ -203,11 +201,9 @@ class Rows:
         raise NotImplementedError
 
     def _put_reset(self, observation: object, seed: int | None) -> None:
-        """Put down the observation of a reset."""
         raise NotImplementedError
 
     def _rewards(self, n: int) -> NDArray[np.float64]:
-        """Return the rewards of the first n rows."""
         raise NotImplementedError
 
     def _transitions(self, n: int) -> tuple[Ints, Ints, Ints]:  # noqa: ARG002

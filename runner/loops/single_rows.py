@@ -253,7 +253,6 @@ class VariableRows(Rows):
 
     @property
     def _coming_episode(self) -> int:
-        """The number of the episode that the next step belongs to."""
         return self._episode + len(self._begins) + self._fresh
 
     def take(

@@ -270,7 +270,6 @@ class VectorRows:
         return counts_of(over, only_reset, self._rewards[:rows], self._length, self._return)
 
     def _put_records(self, counts: EpisodeCounts, first: int) -> None:
-        """Fill the recorder's blocks with the records of the steps."""
         rows, n = self._filled, self._n
         terminated, truncated = self._terminated[:rows], self._truncated[:rows]
         last = self._observations[:rows]

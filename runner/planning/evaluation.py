@@ -142,7 +142,6 @@ def joint_probabilities(policies: Sequence[NDArray[np.float64]]) -> NDArray[np.f
 
 
 def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> Outcome:
-    """Return the outcome of the chosen actions."""
     if not mdp.step_limit:
         raise EnvironmentNotUsable(
             f"{mdp.env_id}: found no step limit, expected one: without it some episodes never end."

@@ -65,7 +65,6 @@ class ExactEvaluator:
         return start_mean(self._mdp, values)
 
     def _optimum(self, discount: float) -> tuple[float, Outcome]:
-        """Return the value of the optimal joint policy, and its outcome."""
         if discount not in self._best:
             values = optimal_values(self._mdp, discount)
             policy = greedy_policy(self._mdp, discount, values)

@@ -67,7 +67,6 @@ def record_dtype(message: MessageType, sizes: Sizes) -> np.dtype[np.void]:
 
 
 def _value_dtypes(message: MessageType, sizes: Sizes) -> list[np.dtype[np.generic]]:
-    """Return the dtype of each field's value."""
     remaining = iter(sizes)
     values = []
     for field in message.fields:
@@ -105,7 +104,6 @@ def blank_records(topic: Topic, sizes: Sizes, n: int) -> NDArray[np.void]:
 
 @lru_cache(64)
 def _blank_record(topic: Topic, sizes: Sizes) -> NDArray[np.uint8]:
-    """Return the bytes of such a record."""
     dtype = record_dtype(topic.message, sizes)
     one = np.zeros((), dtype=dtype)
     one["opcode"] = MESSAGE

@@ -75,7 +75,6 @@ def _is_path(path: str) -> bool:
 
 
 def _new_file(path: str, text: str) -> str:
-    """Return the part of a patch that creates a file."""
     name = f'"b/{path}"' if " " in path or '"' in path or "\\" in path else f"b/{path}"
     head = f"diff --git {name.replace('b/', 'a/', 1)} {name}\nnew file mode 100644\n"
     if not text:

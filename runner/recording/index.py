@@ -193,7 +193,6 @@ def _from_summary(stream: BinaryIO, footer: Footer, size: int) -> Index:
 
 
 def _add_summary_record(index: Index, opcode: int, offset: int, body: bytes, data_end: int) -> None:
-    """Add one record of the summary to the index."""
     if opcode == Opcode.CHUNK_INDEX:
         chunk = _chunk_entry(body, offset)
         _check_place("chunk", chunk.offset, chunk.length, data_end)
@@ -247,7 +246,6 @@ def _add_record(index: Index, stream: BinaryIO, opcode: int, offset: int, length
 
 
 def _add_schema_or_channel(index: Index, opcode: int, offset: int, body: bytes) -> None:
-    """Add a schema or a channel to the index."""
     if opcode == Opcode.CHANNEL:
         channel = _parse(Channel, body, offset)
         _add_once(index.channels, channel.id, channel, "channel")
@@ -257,7 +255,6 @@ def _add_schema_or_channel(index: Index, opcode: int, offset: int, body: bytes) 
 
 
 def _records(stream: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
-    """Yield (opcode, offset, body) of the records in a part of the file."""
     at = stream.seek(start)
     while at < end:
         available = end - at - RECORD_HEAD.size
@@ -297,7 +294,6 @@ def _chunk_entry(body: bytes, offset: int) -> ChunkEntry:
 
 
 def _parse(kind: type[T], body: bytes, offset: int) -> T:
-    """Return the record in these bytes."""
     try:
         return kind.read(ReadDataStream(BytesIO(body)))  # type: ignore[attr-defined, no-any-return]
     except (McapError, struct.error, UnicodeDecodeError, ValueError) as error:

@@ -122,7 +122,6 @@ class Blocks:
             )
 
     def _block(self, first: int, rows: NDArray[np.void]) -> Block:
-        """Return steps with the resets before them."""
         n, count, times = self._n, len(rows), len(rows) // self._n
         order = np.arange(count).reshape(times, n).T.ravel()
         rows = rows[order] if n > 1 else rows

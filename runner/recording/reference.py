@@ -117,7 +117,6 @@ class Reference:
 
 
 def _block_difference(topic: Topic, found: NDArray[np.void], expected: NDArray[np.void]) -> Diverged:
-    """Return the error that names the first record and field in which two blocks differ."""
     rows = len(found)
     differs = {}
     for name in sorted(found.dtype.names or (), key=lambda name: name.startswith("tag_")):
@@ -132,7 +131,6 @@ def _block_difference(topic: Topic, found: NDArray[np.void], expected: NDArray[n
 
 
 def _message_difference(topic: Topic, found: tuple[int, bytes], expected: tuple[int, bytes]) -> Diverged:
-    """Return the error that names the first field in which two messages differ."""
     was, should = decode(topic.message, found[1]), decode(topic.message, expected[1])
     place: dict[str, int] = {key: should[key] for key in ("step", "episode") if key in should}
     if found[0] != expected[0]:
@@ -162,6 +160,5 @@ def _both_nan(left: object, right: object) -> bool:
 
 
 def _place(record: np.void) -> dict[str, int]:
-    """Return the episode and step of a step or episode record."""
     step = "step" if "step" in (record.dtype.names or ()) else "last_step"
     return {"episode": int(record["episode"]), "step": int(record[step])}

@@ -102,7 +102,6 @@ def repair(path: Path, report: Report = lambda *_: None) -> Repair:
 
 
 def _salvage(path: Path, fresh: Path, report: Report) -> Repair:
-    """Write the good records of a file into a new one."""
     try:
         stream = open_regular(path)
     except OSError as error:
@@ -114,7 +113,6 @@ def _salvage(path: Path, fresh: Path, report: Report) -> Repair:
 
 
 def _kind(file: DamagedFile, path: Path) -> str:
-    """Return the kind of a damaged recording."""
     for opcode, _, body in file.good_records():
         if opcode == Opcode.METADATA:
             name, entries = metadata_of(body)

@@ -108,7 +108,6 @@ class TopicReader(RunDescription):
         return self._store.attachment(name, *self._place("attachment", self._index.attachments, name))[1]
 
     def _place(self, kind: str, places: Mapping[str, tuple[int, int]], name: str) -> tuple[int, int]:
-        """Return where a named record is in the file."""
         if name not in places:
             raise RecordingError(
                 f"{self.path}: has no {kind} {name!r}; it was cut off, or not written by dualtaxi."

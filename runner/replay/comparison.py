@@ -158,7 +158,6 @@ class Comparison:
         return first_differing_row(recorded, results.first_observations[:done], self._tolerance)
 
     def _row_difference(self, part: Part, recorded: Values, row: int, name: str) -> Difference:
-        """Return the difference in a field of a row."""
         phase, environment, rows, _, results = part
         episode, t, step = (int(rows[row][each]) for each in ("episode", "t", "step"))
         if name == "digest":

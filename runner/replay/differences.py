@@ -120,7 +120,6 @@ def _leaves(place: str, recorded: Value, got: Value) -> Iterator[tuple[str, Arra
 
 
 def _plain(value: object) -> object:
-    """Return a value as JSON can hold it."""
     return as_json(value.item() if isinstance(value, np.ndarray | np.generic) and not value.shape else value)
 
 

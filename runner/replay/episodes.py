@@ -132,7 +132,6 @@ def _target(recording: Recording, phase: str, number: int) -> _Target:
 
 
 def _step_time(recording: Recording, phase: str, step: int) -> int:
-    """Return the `log_time` of a step of a phase."""
     topic = recording.topic(f"/{phase}/step")
     if recording.has_actions_alone(phase):
         found = (block[block["step"] == step] for block in recording.actions(phase))
@@ -247,7 +246,6 @@ def _approach(
 
 
 def _has(piece: Piece, phase: str, reset: RecordedReset) -> bool:
-    """Return whether a reset of a phase is in a piece."""
     return piece.phase == phase and any(each.number == reset.number for each in piece.resets)
 
 

@@ -148,7 +148,6 @@ def _made_vector(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
 
 
 def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
-    """Return an environment that is registered with Gymnasium."""
     import gymnasium
 
     spec, registered = _registered(maker, trust)
@@ -216,7 +215,6 @@ def _registered(maker: EnvironmentMaker, trust: bool) -> tuple[EnvironmentSpec, 
 
 
 def _made_game(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
-    """Return a PettingZoo environment."""
     module, function, kwargs = parse_game(maker.spec)
     if not trust:
         check_plain("keyword argument", kwargs, {})
@@ -270,7 +268,6 @@ def _attribute(name: str) -> Any:
 
 
 def _name_of(entry_point: str | Callable[..., object] | None) -> str:
-    """Return an entry point as `module:attribute`."""
     if entry_point is None or isinstance(entry_point, str):
         return entry_point or ""
     return f"{entry_point.__module__}:{getattr(entry_point, '__qualname__', '')}"

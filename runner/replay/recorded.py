@@ -129,7 +129,6 @@ def resets_of(
 
 
 def _reset_rows(recording: Recording, topic: schema.Topic, times: range) -> Iterator[_Row]:
-    """Yield the resets of a phase."""
     names = ("reset", "environment", "episode", "step", "log_time", "seed", "seeded")
     if topic in recording.dtypes:
         for block in recording.blocks_between(topic, times.start, times.stop):
@@ -322,7 +321,6 @@ def _variable_blocks(recording: Recording, topic: schema.Topic, times: range) ->
 
 
 def _row_dtype(recording: Recording, phase: str) -> np.dtype[np.void]:
-    """Return the dtype of the steps in pieces."""
     topic = recording.topic(f"/{phase}/step")
     if recording.has_actions_alone(phase):
         return kept_dtype(recording.dtypes[topic])

@@ -187,7 +187,6 @@ def _snapshot_before(
 
 
 def _snapshot_steps(recording: Recording) -> list[int]:
-    """Return the steps of the complete snapshots, ascending."""
     tables = len(recording.agents) * len(kinds_of(from_mapping(recording.config)))
     counts: dict[int, int] = {}
     for snapshot in recording.snapshots(0, tables):

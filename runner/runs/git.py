@@ -214,7 +214,6 @@ class _Git:
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """Kill git and what it started."""
     with contextlib.suppress(OSError):
         if hasattr(os, "killpg"):
             os.killpg(process.pid, signal.SIGKILL)

@@ -76,7 +76,6 @@ def _is_run(facts: dict[str, object]) -> bool:
 
 
 def _from_recording(path: Path) -> Run:
-    """Return the run that a recording describes."""
     from runner.recording.reader import open_recording
 
     with open_recording(path) as recording:

@@ -144,7 +144,6 @@ class Folders:
         return running, [entry for entry, _, stable in found if not stable]
 
     def _row(self, root: str, entry: str) -> dict[str, object]:
-        """Read a run's folder into a row."""
         mark, changed = _mark(root, entry)  # before the files: later changes are found next time
         seen = _state_of(root, entry) or State("", 0, None)
         stable = max(changed, seen.changed) + _STABLE_NS < time.time_ns()
