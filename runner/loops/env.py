@@ -10,7 +10,7 @@ from typing import Any, Literal, Unpack
 import gymnasium
 from gymnasium.vector import VectorEnv
 
-from runner.environments.gym_types import Env, ResetResult, StepResult
+from runner.environments.gym_types import Env, ResetOptions, ResetResult, StepResult
 from runner.errors import ConfigError
 from runner.loops.description import describe
 from runner.loops.generators import GeneratorWatch
@@ -70,7 +70,7 @@ class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
             self._loop.fail(error)
         return result
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
+    def reset(self, *, seed: int | None = None, options: ResetOptions | None = None) -> ResetResult:
         """Reset the environment, and record it: the seed, the options, the observation."""
         return self._recorded_reset(seed, options)
 

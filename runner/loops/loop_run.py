@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from blake3 import blake3
@@ -43,6 +42,7 @@ from runner.runs.provenance import provenance_entries
 from runner.runs.redaction import LineRedactor
 from runner.runs.run import RECORDING_FILE, Run, new_run, recordings_folder, unless_empty
 from runner.runs.shards import RUN_VARIABLE, new_shard
+from runner.util.values import JsonView
 
 
 class LoopRun:
@@ -101,7 +101,7 @@ class LoopRun:
         if not is_shard:
             os.environ[RUN_VARIABLE] = self._absolute
 
-    def _new_run(self, folder: Path | None, facts: Mapping[str, Any]) -> Run:
+    def _new_run(self, folder: Path | None, facts: JsonView) -> Run:
         """Create the folder of the run, or of the shard of the run that is joined."""
         options, config = self._options, self._config
         if options.join is None:

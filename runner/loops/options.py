@@ -135,12 +135,12 @@ def options_of(
     `frames_of`: the environments of a vector of which frames are recorded.
     `valid`: the names of the arguments that the function has.
     """
-    options: dict[str, Any] = dict(given)
+    options: Json = dict(given)
     if unknown := sorted(set(options) - {*valid}):
         names = [name for name in valid if name != "run_id"]
         hint = nearest(unknown[0], (*names, *_ARGUMENTS))
         raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {', '.join(names)}.{hint}")
-    packing: dict[str, Any] = {name: options[name] for name in PACKING if name in options}
+    packing: Json = {name: options[name] for name in PACKING if name in options}
     if options.get("steps") == "actions":  # an index of messages would take more than they do
         packing = {"index": "chunk"} | packing
     info, config, seed = options.get("info", ()), options.get("config"), options.get("seed")

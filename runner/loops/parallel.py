@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from numbers import Integral
 from typing import Any, Unpack
 
+from runner.environments.gym_types import ResetOptions
 from runner.environments.mdp import MAX_AGENTS
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, kind_of
@@ -20,6 +21,7 @@ from runner.loops.values import check_phase
 from runner.loops.vector import by_field, require_fixed
 from runner.replay.stepping import game_spaces
 from runner.replay.turns import ByAgent, GameStepResult, Turns, is_in_turns
+from runner.util.values import JsonView
 
 
 class RecordedParallel(RecordedAlone[AgentRows]):
@@ -68,7 +70,7 @@ class RecordedParallel(RecordedAlone[AgentRows]):
             self._loop.fail(error)
         return result  # type: ignore[no-any-return]
 
-    def _extras_by_name(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _extras_by_name(self, values: JsonView) -> JsonView:
         """Return the values of agents as `agent/name`."""
         agents = self._loop.described.agents
         for agent, own in values.items():
@@ -79,9 +81,7 @@ class RecordedParallel(RecordedAlone[AgentRows]):
                 )
         return {f"{agent}/{name}": value for agent, own in values.items() for name, value in own.items()}
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[ByAgent, ByAgent]:
+    def reset(self, seed: int | None = None, options: ResetOptions | None = None) -> tuple[ByAgent, ByAgent]:
         """Reset the environment, and record it."""
         return self._recorded_reset(seed, options)
 
@@ -111,7 +111,7 @@ class RecordedAec(RecordedParallel):
             super().step({agent: action}, None if extras is None else {agent: extras})
 
     def reset(  # type: ignore[override]
-        self, seed: int | None = None, options: dict[str, Any] | None = None
+        self, seed: int | None = None, options: ResetOptions | None = None
     ) -> None:
         """Reset the game, and record it."""
         self._recorded_reset(seed, options)

@@ -8,7 +8,7 @@ import weakref
 from collections.abc import Iterator, Mapping
 from typing import Any, Generic, Literal, Self, TypeVar
 
-from runner.environments.gym_types import ResetResult
+from runner.environments.gym_types import ResetOptions, ResetResult
 from runner.errors import ConfigError
 from runner.loops.generators import GeneratorWatch
 from runner.loops.loop import Loop, R
@@ -237,7 +237,7 @@ class RecordedAlone(Recorded[S]):
             self._until_frame = every
             self._messages.frame(self._phase, self.env.render(), is_reset)
 
-    def _recorded_reset(self, seed: int | None, options: dict[str, Any] | None) -> ResetResult:
+    def _recorded_reset(self, seed: int | None, options: ResetOptions | None) -> ResetResult:
         """Reset the environment, and record it: the seed, the options, the observation."""
         before = frozen_options(options or {})
         with self._loop.lock:  # another thread may be committing steps

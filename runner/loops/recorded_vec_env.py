@@ -12,6 +12,7 @@ from runner.loops.recorded import Recorded
 from runner.loops.values import warn_user
 from runner.loops.vec_env import VecEnvVector
 from runner.loops.vector import record_vector
+from runner.util.values import Json
 
 _METHODS = ("reset", "step_async", "step_wait")
 
@@ -37,7 +38,7 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         options: the arguments of `record_vector`.
     """
 
-    def __init__(self, base: VecEnv, options: dict[str, Any]) -> None:
+    def __init__(self, base: VecEnv, options: Json) -> None:
         self.base = base
         self._vector = VecEnvVector(base)
         try:
@@ -108,7 +109,7 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
     env_method, env_is_wrapped = _passed_on("env_method"), _passed_on("env_is_wrapped")
 
 
-def record_vec_env(env: VecEnv, options: dict[str, Any]) -> VecEnv:
+def record_vec_env(env: VecEnv, options: Json) -> VecEnv:
     """Return a `VecEnv` whose environments are recorded, as they are inside of all wrappers.
 
     `env`: the `VecEnv`; of one with wrappers, the innermost wrapper gets the recorded environments.

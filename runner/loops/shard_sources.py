@@ -135,14 +135,14 @@ class Source:
 
     # --- what a unit holds, read in the order of the run ----------------------------------------------
 
-    def reset(self, phase: str, unit: Any) -> Any:
+    def reset(self, phase: str, unit: np.void) -> Any:
         """Return the reset of a unit."""
         topic, number = self._topic(phase, "reset"), int(unit["reset"])
         if self._is_fixed:
             return next(self.recording.blocks(topic, number, number + 1))[0]
         return next(self._stream(f"/{phase}/reset"))
 
-    def steps(self, phase: str, unit: Any) -> Iterator[tuple[Any, NDArray[np.int64]]]:
+    def steps(self, phase: str, unit: np.void) -> Iterator[tuple[Any, NDArray[np.int64]]]:
         """Yield the steps of a unit in pieces, with their numbers in the phase of its process."""
         first, stop = int(unit["first"]), int(unit["stop"])
         if first >= stop:
@@ -175,7 +175,7 @@ class Source:
         offset = min(max(offset, 0), max(int(unit["steps"]) - 1, 0))
         return int(unit["new_step"]) + offset, int(unit["new_position"]) + offset + 1
 
-    def resets_at(self, phase: str, step: int) -> Sequence[Any]:
+    def resets_at(self, phase: str, step: int) -> Sequence[np.void]:
         """Return the units that began after this number of steps of a phase."""
         units = self.units[phase]
         return list(units[units["first"] - units["environment"] == step])

@@ -10,7 +10,6 @@ from typing import Any, Final
 
 import numpy as np
 from gymnasium.error import ResetNeeded
-from numpy.typing import NDArray
 
 from runner.errors import ConfigError, RecordingError
 from runner.recording import schema
@@ -33,7 +32,7 @@ def whole_number(value: object, what: str) -> int:
     return int(_lone(value, what, "iub", "a whole number of its Discrete space"))
 
 
-def _lone(value: object, what: str, kinds: str, expected: str) -> NDArray[Any]:
+def _lone(value: object, what: str, kinds: str, expected: str) -> Array:
     array = np.asarray(value)
     if array.size != 1 or array.dtype.kind not in kinds:
         raise RecordingError(f"found the {what} {value!r}, expected {expected}.")
@@ -85,7 +84,7 @@ def arrays_of(name: str, value: object) -> Iterator[tuple[str, Array]]:
     yield name, values.astype(values.dtype.newbyteorder("<"), copy=False)
 
 
-def as_array(value: Any) -> NDArray[Any]:
+def as_array(value: Any) -> Array:
     """Return an array or tensor as NumPy's; the short floats that NumPy lacks become float32, exactly."""
     if callable(detach := getattr(value, "detach", None)):
         value = detach().cpu()

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
-from runner.environments.gym_types import AnyVectorEnv, ResetResult, VectorStepResult
+from runner.environments.gym_types import AnyVectorEnv, ResetOptions, ResetResult, VectorStepResult
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, describe
 from runner.loops.generators import States, VectorWatch
@@ -26,6 +26,7 @@ from runner.loops.values import check_phase, frozen_options
 from runner.loops.vector_counts import Flags
 from runner.loops.vector_rows import VectorRows
 from runner.replay.stepping_vector import final_observations, spaces_of_one
+from runner.util.values import Json, JsonView
 
 if TYPE_CHECKING:
     _Wrapper = VectorWrapper[Any, Any, Any, Any, Any]
@@ -130,7 +131,7 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
             self._messages.frame(self._phase, images[i], bool(resets[i]), i)
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: ResetOptions | None = None
     ) -> ResetResult:
         """Reset all environments, or those of `options["reset_mask"]`, and record it."""
         n, mask = self.env.num_envs, (options or {}).get("reset_mask")
@@ -276,7 +277,7 @@ def first_of(envs: AnyVectorEnv) -> Iterator[object]:
         yield envs
 
 
-def _by_environment(infos: Any) -> Mapping[str, Any]:
+def _by_environment(infos: Any) -> JsonView:
     """Return infos by field; SuperSuit returns a list of them, one for each environment."""
     if isinstance(infos, Mapping):
         return infos
@@ -292,9 +293,9 @@ def require_fixed(described: Described) -> None:
         )
 
 
-def by_field(infos: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def by_field(infos: JsonView) -> dict[str, Json]:
     """Return the infos of agents by field, then by agent."""
-    fields: dict[str, dict[str, Any]] = {}
+    fields: dict[str, Json] = {}
     for agent, info in infos.items():
         for key, value in info.items():
             fields.setdefault(key, {})[agent] = value

@@ -53,6 +53,10 @@ _CONTROL: Final = re.compile(
 _NOTE: Final = f"Console output beyond {MAX_CONSOLE_BYTES >> 20} MB is not recorded."
 
 
+Write = Callable[..., object]
+"""A method `write` of a stream."""
+
+
 class Tee:
     """Keeps what is written to `sys.stdout` and `sys.stderr`, between `start` and `stop`."""
 
@@ -86,11 +90,11 @@ class Tee:
                     stream.write = write
                     self._patched.append((stream, own, write))
 
-    def _writer(self, number: int, original: Callable[..., Any]) -> Callable[..., Any]:
+    def _writer(self, number: int, original: Write) -> Write:
         """Return a method `write` that calls the original one, and keeps the text."""
         local = self._local
 
-        def write(text: str, *more: Any, **options: Any) -> Any:
+        def write(text: str, *more: object, **options: object) -> object:
             if getattr(local, "is_writing", False):  # another such method calls this one
                 return original(text, *more, **options)
             local.is_writing = True

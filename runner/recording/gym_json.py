@@ -15,6 +15,7 @@ from gymnasium.vector.utils import iterate
 
 from runner.environments.gym_types import Space
 from runner.errors import ConfigError
+from runner.recording.spaces import Value
 from runner.util.jsonable import as_json
 
 _MAX_REPR: Final = 1000
@@ -22,14 +23,14 @@ _MAX_REPR: Final = 1000
 
 class _Registered(NamedTuple):
     to_json: Callable[[object], object]
-    from_json: Callable[[Any], object]
+    from_json: Callable[[Value], object]
 
 
 _REGISTERED: Final[dict[type[Space], _Registered]] = {}
 
 
 def register_space(
-    cls: type[Space], *, to_json: Callable[[object], object], from_json: Callable[[Any], object]
+    cls: type[Space], *, to_json: Callable[[object], object], from_json: Callable[[Value], object]
 ) -> None:
     """Record the values of a space of your own exactly, so that episodes with such actions can be repeated.
 
@@ -99,7 +100,7 @@ def structure_of(space: Space, describe: Callable[[Space], object]) -> Mapping[s
     return own
 
 
-def _to_json(space: Any, value: Any) -> Any:  # noqa: PLR0911 - one for each kind of space
+def _to_json(space: Any, value: Value) -> Value:  # noqa: PLR0911 - one for each kind of space
     if (kind := registered(space)) is not None:
         return as_json(_REGISTERED[kind].to_json(value))
     if isinstance(space, spaces.Dict):
@@ -121,7 +122,7 @@ def _to_json(space: Any, value: Any) -> Any:  # noqa: PLR0911 - one for each kin
     return as_json(value)
 
 
-def _from_json(space: Any, data: Any) -> Any:  # noqa: PLR0911 - one for each kind of space
+def _from_json(space: Any, data: Value) -> Value:  # noqa: PLR0911 - one for each kind of space
     if (kind := registered(space)) is not None:
         return _REGISTERED[kind].from_json(data)
     if isinstance(space, spaces.Dict):
@@ -148,7 +149,7 @@ def _from_json(space: Any, data: Any) -> Any:  # noqa: PLR0911 - one for each ki
     return _batch(space, [data])[0]
 
 
-def _batch(space: Any, values: Any) -> Any:
+def _batch(space: Any, values: Value) -> Value:
     """Return many values as Gymnasium batches them."""
     if isinstance(space, spaces.Dict):
         return {key: _batch(part, [own[str(key)] for own in values]) for key, part in space.spaces.items()}

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from runner.environments.gym_types import Space
 from runner.errors import RecordingError
 from runner.recording.gym_spaces import Part, parts_of
-from runner.recording.spaces import MAX_VALUE_BYTES, encode_text
+from runner.recording.spaces import MAX_VALUE_BYTES, Value, encode_text
 from runner.util.arrays import Array
 
 SCALARS: Final = (np.bool_, *(np.dtype(code).type for code in "bBhHiIlLqQefd"))
 
 OnRounded = Callable[[str], None]
 """Called with a warning: values are recorded rounded."""
-Put = Callable[[int, Any], None]
+Put = Callable[[int, Value], None]
 """Puts a value into a row of a column."""
 
 
@@ -89,7 +89,7 @@ def leaves_of(space: Space, what: str, where: str = "", on_rounded: OnRounded = 
     return [Leaf(part, what, on_rounded) for part in parts_of(space, where or f"the {what} space")]
 
 
-def filler(leaves: Sequence[Leaf], column: NDArray[Any], batch: tuple[int, ...] = ()) -> Put:
+def filler(leaves: Sequence[Leaf], column: Array, batch: tuple[int, ...] = ()) -> Put:
     """Return a function that puts a value of a space into a row of a column.
 
     `column`: [rows, *batch] values of the space.
@@ -99,7 +99,7 @@ def filler(leaves: Sequence[Leaf], column: NDArray[Any], batch: tuple[int, ...] 
         return _leaf_filler(leaves[0], column, batch)
     fillers = [(leaf, leaf.part.keys, _leaf_filler(leaf, _column_of(leaf, column), batch)) for leaf in leaves]
 
-    def put(row: int, value: Any) -> None:
+    def put(row: int, value: Value) -> None:
         for leaf, keys, put_leaf in fillers:
             inside = value
             try:
@@ -112,11 +112,11 @@ def filler(leaves: Sequence[Leaf], column: NDArray[Any], batch: tuple[int, ...] 
     return put
 
 
-def _leaf_filler(leaf: Leaf, column: NDArray[Any], batch: tuple[int, ...]) -> Put:
+def _leaf_filler(leaf: Leaf, column: Array, batch: tuple[int, ...]) -> Put:
     base, shape, array = leaf.base, batch + leaf.shape, np.ndarray
     scalars = frozenset() if batch else leaf.exact_scalars
 
-    def put(row: int, value: Any) -> None:
+    def put(row: int, value: Value) -> None:
         kind = value.__class__
         try:
             if kind is array:  # the usual case costs two comparisons
@@ -148,7 +148,7 @@ def fitted(leaves: Sequence[Leaf], value: object, batch: tuple[int, ...]) -> lis
     return arrays
 
 
-def put_fitted(leaves: Sequence[Leaf], arrays: Sequence[NDArray[Any]], at: Any, column: NDArray[Any]) -> None:
+def put_fitted(leaves: Sequence[Leaf], arrays: Sequence[Array], at: Any, column: Array) -> None:
     """Put the part of `fitted` arrays that an index chooses into a column of values of the space."""
     for leaf, array in zip(leaves, arrays, strict=True):
         _column_of(leaf, column)[...] = array[at]
@@ -167,7 +167,7 @@ def leaves_by_agent(space: Any, what: str, on_rounded: OnRounded = lambda _: Non
 
 
 def filler_by_agent(
-    leaves: Mapping[str, Sequence[Leaf]], column: NDArray[Any]
+    leaves: Mapping[str, Sequence[Leaf]], column: Array
 ) -> Callable[[int, Mapping[str, Any]], None]:
     """Return a function that puts the values of some agents into a row, and zeros for the others."""
     fillers = {agent: filler(own, column) for agent, own in leaves.items()}

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.messages import decode, encode
+from runner.util.values import Json, JsonView
 
 STEPS_BETWEEN: Final = 1_000
 """The least steps of an environment from one recorded state to the next."""
@@ -59,7 +60,7 @@ class ResetState(NamedTuple):
         )
 
 
-def packed_generator(state: Mapping[str, Any]) -> bytes:
+def packed_generator(state: JsonView) -> bytes:
     """Return the state of a PCG64 as bytes."""
     inner = state["state"]
     return _PCG64.pack(
@@ -79,7 +80,7 @@ def decode_reset_state(payload: bytes) -> ResetState:
             f"found a reset state with a seed of {len(seed)} bytes, a generator of {len(packed)} and an "
             f"emulator of {len(ale):,}; expected {SEED_BYTES}, {_PCG64.size}, at most {MAX_ALE_STATE:,}"
         )
-    generator: dict[str, Any] | None = None
+    generator: Json | None = None
     if packed:
         state, increment, uinteger, has_uint32 = _PCG64.unpack(packed)
         inner = {"state": int.from_bytes(state, "little"), "inc": int.from_bytes(increment, "little")}

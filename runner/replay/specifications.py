@@ -17,11 +17,11 @@ import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Final
+from typing import Final
 
 from runner.errors import CannotRedo
 from runner.recording.maker import EnvironmentMaker, VectorMaker
-from runner.util.values import is_whole
+from runner.util.values import Json, is_whole
 
 PACKAGES: Final = (
     *("ale_py", "dualtaxi", "gymnasium", "gymnasium_robotics", "highway_env"),
@@ -48,7 +48,7 @@ class EnvironmentSpec:
 
     id: str
     entry_point: str
-    kwargs: dict[str, Any]
+    kwargs: Json
     max_episode_steps: int | None
     wrappers: tuple[Wrapper, ...]
     """From the innermost out."""

@@ -26,6 +26,7 @@ from runner.runs.store import DIGEST, Store
 from runner.util.arrays import Array
 from runner.util.extras import require
 from runner.util.files import hash_of, open_regular
+from runner.util.values import Json
 
 MAX_NAME_LENGTH: Final = 200
 FORMATS: Final = ("bytes", "file", "safetensors", "pickle")
@@ -138,7 +139,7 @@ class Checkpoint:
 
         return pickle.loads(self.read())
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> Json:
         """Return it as JSON can hold it."""
         keys = ("name", "phase", "step", "episode", "format", "size", "digest")
         return {key: getattr(self, key) for key in keys} | {"here": self.is_here, "path": str(self.path)}
