@@ -72,12 +72,7 @@ def training(run: Source) -> pd.DataFrame:
         return _frame([_flat(record.as_json()) for record in training_records(recording)])
 
 
-def episodes(
-    run: Source,
-    phase: Phase = "train",
-    start: int = 0,
-    stop: int | None = None,
-) -> pd.DataFrame:
+def episodes(run: Source, phase: Phase = "train", start: int = 0, stop: int | None = None) -> pd.DataFrame:
     """Return a row for each episode of a phase, number `start` up to `stop`.
 
     Columns: episode, length, penalties, success, terminated, truncated, last_step, `return.AGENT`, and a

@@ -137,12 +137,7 @@ class Client(Connection):
         return upload
 
     def _deliver(
-        self,
-        path: Path,
-        announced: Json,
-        about: Json,
-        report: Report,
-        begun: UploadStatus | None,
+        self, path: Path, announced: Json, about: Json, report: Report, begun: UploadStatus | None
     ) -> UploadStatus:
         """Take the next step of an upload until it is stored or refused, and return it.
 

@@ -161,10 +161,7 @@ class Connection:
     @contextlib.contextmanager
     def stream(self, path: str, headers: Mapping[str, str]) -> Iterator[httpx2.Response]:
         """Yield a response that is read as it arrives; errors as for `request`, also while it is read."""
-        with (
-            self._transport_errors(),
-            self._http.stream("GET", path, headers=dict(headers)) as response,
-        ):
+        with self._transport_errors(), self._http.stream("GET", path, headers=dict(headers)) as response:
             if not response.is_success:
                 response.read()
             self._check(response)

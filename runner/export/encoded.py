@@ -19,12 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import CannotRedo
-from runner.export.painting import (
-    EnvironmentDiffers,
-    Painted,
-    paint_observation,
-    paint_redrawn,
-)
+from runner.export.painting import EnvironmentDiffers, Painted, paint_observation, paint_redrawn
 from runner.export.pictures import Source, source_of, source_of_recorded
 from runner.export.reports.rendering import sentence
 from runner.recording.reader import Recording, open_recording

@@ -192,8 +192,4 @@ def _lines(shown: Pictures, picture: Picture) -> list[str]:
             for name, reward in zip(shown.learners, picture.rewards, strict=True)
         )
         rewards = f"sum {total:+.5g}; {', '.join(each)}"
-    return [
-        f"{step}: {picture.action}",
-        rewards,
-        ", ".join(filter(None, [picture.events, picture.ended])),
-    ]
+    return [f"{step}: {picture.action}", rewards, ", ".join(filter(None, [picture.events, picture.ended]))]

@@ -116,13 +116,7 @@ def run_histograms(path: Path, axis: str) -> bytes:
 
 
 def _shown_curve(
-    panel: Panel,
-    curve: Curve,
-    start: float,
-    stop: float | None,
-    points: int,
-    lines: bool,
-    memory: float,
+    panel: Panel, curve: Curve, start: float, stop: float | None, points: int, lines: bool, memory: float
 ) -> dict[str, object]:
     inside = np.flatnonzero((curve.places >= start) & (curve.places < (math.inf if stop is None else stop)))
     chosen = inside[thinned(curve.middle[inside], points)]

@@ -92,9 +92,7 @@ def error_body(error: RunnerError, settings: Settings) -> ErrorBody:
         return ErrorBody(message=message)
     problems = [
         Problem(
-            path=found.path or None,
-            line=found.line or None,
-            message=settings.without_folders(found.message),
+            path=found.path or None, line=found.line or None, message=settings.without_folders(found.message)
         )
         for found in error.problems
     ]

@@ -41,10 +41,7 @@ def curve_of(recording: Recording, metric: str) -> Curve:
 
 
 def readings(
-    metrics: Message,
-    exact: Message | None,
-    agents: Sequence[str],
-    events: Sequence[str],
+    metrics: Message, exact: Message | None, agents: Sequence[str], events: Sequence[str]
 ) -> dict[str, float]:
     """Return the readings of an evaluation by name; `mean_return` without an agent if there is but one."""
     record = evaluation_record(metrics, agents, events)

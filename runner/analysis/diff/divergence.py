@@ -194,9 +194,7 @@ def _trial_steps(recording: Recording, first: int, trials: int) -> Iterator[Bloc
 
 
 def _divergence(
-    phase: str,
-    found: tuple[int, Block | None, Block | None] | None,
-    fields: tuple[str, ...] = FIELDS,
+    phase: str, found: tuple[int, Block | None, Block | None] | None, fields: tuple[str, ...] = FIELDS
 ) -> Divergence | None:
     """Return what `first_difference` found of two streams of steps."""
     if found is None:

@@ -217,9 +217,7 @@ def _compare_tasks(
 )
 @all_option
 @click.option(
-    "--first",
-    is_flag=True,
-    help="Compare only settings and where training first diverges, not the tables.",
+    "--first", is_flag=True, help="Compare only settings and where training first diverges, not the tables."
 )
 @target_option(multiple=True)
 @click.pass_context

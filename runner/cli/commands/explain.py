@@ -33,9 +33,7 @@ class _Planned(Exception):
 @click.argument("a", metavar="A")
 @click.argument("b", metavar="B")
 @click.option(
-    "--metric",
-    metavar="METRIC",
-    help="A metric; of evaluations.  [default: success_percent, or mean_return]",
+    "--metric", metavar="METRIC", help="A metric; of evaluations.  [default: success_percent, or mean_return]"
 )
 @click.option(
     "--at",

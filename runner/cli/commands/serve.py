@@ -51,10 +51,7 @@ from runner.util.files import storage_errors
     help="Run jobs on this Ray cluster, which must see the recordings under the same path.",
 )
 @click.option(
-    "--log",
-    type=FILE,
-    metavar="FILE",
-    help="Append the log to this file, as JSON lines.  [default: stderr]",
+    "--log", type=FILE, metavar="FILE", help="Append the log to this file, as JSON lines.  [default: stderr]"
 )
 def serve_command(
     recordings: tuple[Path, ...],

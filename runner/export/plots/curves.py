@@ -20,15 +20,7 @@ from runner.analysis.groups import Group
 from runner.analysis.series import values_left_out
 from runner.drawing import palette
 from runner.environments.naming import spoken
-from runner.export.plots.chart import (
-    SMALL,
-    Canvas,
-    Chart,
-    Scale,
-    labelled,
-    series_colour,
-    series_marker,
-)
+from runner.export.plots.chart import SMALL, Canvas, Chart, Scale, labelled, series_colour, series_marker
 from runner.export.plots.metrics import (
     PLAIN,
     Curve,

@@ -120,12 +120,7 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
 class _Reader:
     """Reads steps of a phase."""
 
-    def __init__(
-        self,
-        recording: Recording,
-        phase: str,
-        observed: Sequence[_ShownPart],
-    ) -> None:
+    def __init__(self, recording: Recording, phase: str, observed: Sequence[_ShownPart]) -> None:
         self._recording, self._phase, self._observed = recording, phase, observed
 
     def part(self, episode: int, span: range, first: int, limit: int) -> tuple[NDArray[np.float64], _Steps]:

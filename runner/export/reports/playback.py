@@ -99,8 +99,7 @@ def tabular_playback(recording: Recording, episode: Episode) -> Playback:
         choices=[actions_in_words(mdp).tolist()] if len(agents) == 1 else numbered_actions(mdp),
         values=[
             _highest(
-                values,
-                [own[i] for own in chosen] if len(episode.values) > 1 else episode.actions.tolist(),
+                values, [own[i] for own in chosen] if len(episode.values) > 1 else episode.actions.tolist()
             )
             for i, values in enumerate(episode.values)
         ],

@@ -267,9 +267,7 @@ def _maps(recording: Recording, episode: tuple[int, ...] | None) -> list[MapRow]
 
 
 def _replay(
-    recording: Recording,
-    episodes: Mapping[tuple[int, ...], list[str]],
-    progress: Callable[[str], None],
+    recording: Recording, episodes: Mapping[tuple[int, ...], list[str]], progress: Callable[[str], None]
 ) -> Replay | None:
     """Return what the page replays; None if no episode can be."""
     shown = []

@@ -146,8 +146,7 @@ class MapWriter(Sender):
         here = rr.Boxes2D.from_fields(colors=[rgba(palette.BAD)], radii=0.1, draw_order=50.0)
         letters = rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=45.0)
         self.send_static(
-            self._name,
-            rr.DepthImage.from_fields(format=pixels, colormap=rr.components.Colormap.Viridis),
+            self._name, rr.DepthImage.from_fields(format=pixels, colormap=rr.components.Colormap.Viridis)
         )
         self.send_static(f"{self._name}/moves", arrows)
         self.send_static(f"{self._name}/here", here)

@@ -12,15 +12,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from runner.drawing import palette
-from runner.export.rerun.columns import (
-    MAX_ROWS,
-    Batch,
-    Sender,
-    instances,
-    repeated_point,
-    rgba,
-    texts,
-)
+from runner.export.rerun.columns import MAX_ROWS, Batch, Sender, instances, repeated_point, rgba, texts
 from runner.export.rerun.labels import Labels
 from runner.export.rerun.layout import RunView
 from runner.export.rerun.metrics import MetricWriter

@@ -68,8 +68,7 @@ AgentName = Annotated[
     str | None, Query(max_length=200, description="Whose Q-table, where each agent has its own.")
 ]
 StepName = Annotated[
-    str | None,
-    Query(max_length=60, description="The value before this step, EPISODE:T or eval:N:TRIAL:T."),
+    str | None, Query(max_length=60, description="The value before this step, EPISODE:T or eval:N:TRIAL:T.")
 ]
 AxisName = Annotated[str, Query(max_length=20, description=f"The horizontal axis: one of {', '.join(AXES)}.")]
 Metrics = Annotated[list[str] | None, Query(max_length=100, description="Default: all.")]

@@ -179,13 +179,7 @@ class JobStore:
             return self._jobs[number]
 
     def add(
-        self,
-        kind: Kind,
-        name: str,
-        runs: int,
-        submitted: str,
-        values: JsonView,
-        keep: Container[int] = (),
+        self, kind: Kind, name: str, runs: int, submitted: str, values: JsonView, keep: Container[int] = ()
     ) -> Job:
         """Append a job to the queue, on disk, and return it.
 

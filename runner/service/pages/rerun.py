@@ -75,10 +75,7 @@ def viewer(request: Request, run: RecordedRun, at: Annotated[str, Query(max_leng
 
 @router.get("/runs/{run}/rerun/frame")
 async def frame(
-    request: Request,
-    run: RecordedRun,
-    compute: ComputationOf,
-    at: Annotated[str, Query(max_length=60)] = "",
+    request: Request, run: RecordedRun, compute: ComputationOf, at: Annotated[str, Query(max_length=60)] = ""
 ) -> Response:
     """Show the viewer alone, opened at a step."""
     step = StepRef.parse(at) if at else None

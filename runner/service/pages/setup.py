@@ -142,9 +142,7 @@ def code(request: Request, run: RecordedRun, recording: OpenRecording) -> Respon
 def _log(recording: Recording) -> list[LogLine]:
     return [
         LogLine(
-            line["log_time"] // schema.STEP_NANOSECONDS,
-            log_level(line["level"]).lower(),
-            line["message"],
+            line["log_time"] // schema.STEP_NANOSECONDS, log_level(line["level"]).lower(), line["message"]
         )
         for line in deque(recording.decoded(schema.LOG_TOPIC), MAX_LINES)
     ]

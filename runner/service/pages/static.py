@@ -24,12 +24,7 @@ router = APIRouter(include_in_schema=False)
 
 FOLDER: Final = files("runner.service.pages") / "static"
 UPLOT: Final = "vendor/uplot-1.6.32"
-_TYPES: Final = {
-    "css": "text/css",
-    "js": "text/javascript",
-    "svg": "image/svg+xml",
-    "LICENSE": "text/plain",
-}
+_TYPES: Final = {"css": "text/css", "js": "text/javascript", "svg": "image/svg+xml", "LICENSE": "text/plain"}
 _FOREVER: Final = "public, max-age=31536000, immutable"
 
 

@@ -56,12 +56,7 @@ async def what_if(
 
 @router.get("/{at}/{action}")
 async def branch(
-    request: Request,
-    run: RecordedRun,
-    compute: ComputationOf,
-    at: At,
-    action: ActionPath,
-    t: T | None = None,
+    request: Request, run: RecordedRun, compute: ComputationOf, at: At, action: ActionPath, t: T | None = None
 ) -> Response:
     """Show where each joint action leads, and the replay of one."""
     return await _what_if(request, run, compute, at, action, t)
