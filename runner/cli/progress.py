@@ -69,10 +69,11 @@ def count_line(what: str, total: int) -> Iterator[Callable[[int], None]]:
 
 
 @contextlib.contextmanager
-def total_line(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Yield a function that is called with the number done and their total, which may grow."""
-    with _line("", [_BAR, f"{{task.completed:,}}/{{task.total:,}} {what}", "left"], total=0) as update:
-        yield lambda done, total: update(completed=done, total=total)
+def total_line() -> Iterator[Callable[[int, int, str], None]]:
+    """Yield a function that is called with the number done, their total, which may change, and of what."""
+    columns = [_BAR, "{task.completed:,}/{task.total:,} {task.fields[what]}", "left"]
+    with _line("", columns, total=0, what="") as update:
+        yield lambda done, total, what: update(completed=done, total=total, what=what)
 
 
 @contextlib.contextmanager

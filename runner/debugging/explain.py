@@ -34,7 +34,7 @@ from runner.debugging.explanation import (
     Setting,
     Side,
 )
-from runner.debugging.explanation_files import FOLDER, write_explanation
+from runner.debugging.explanation_files import FOLDER, LOCK, write_explanation
 from runner.debugging.factors import MAX_ALL, Mixing, mix
 from runner.debugging.first_step import first_step
 from runner.debugging.mixtures import Measured, Measurement, Mixtures, Readings, measure
@@ -56,6 +56,10 @@ _PROBES: Final = 2
 """Seeds of A and of B that are trained first, to see how long a run takes; the first one loads kernels."""
 
 
+class ExplanationBusy(RunnerError):
+    """Another process computes the explanation."""
+
+
 @dataclass(frozen=True)
 class Plan:
     """What an explanation will train."""
@@ -67,7 +71,7 @@ class Plan:
     """The same, at most; delta debugging depends on what it finds."""
     seeds: int
     known: int
-    """Runs that need not be trained: they were trained before."""
+    """Runs that were trained before; delta debugging need not use all of them."""
     run_seconds: float
     """The time that one run takes of a worker; 0 if all are known."""
     workers: int
@@ -87,6 +91,12 @@ class Plan:
         return _START_SECONDS + left * self.run_seconds / self.workers if left > 0 else 0.0
 
 
+Report = Callable[[int, int, str], None]
+"""Called several times a second with how many are done, of how many, and of what: `RUNS`, then `EPISODES`."""
+RUNS: Final = "runs trained"
+EPISODES: Final = "episodes of two short runs recorded"
+
+
 def explain(
     a: Source,
     b: Source,
@@ -97,8 +107,9 @@ def explain(
     workers: int | None = None,
     ray: str | None = None,
     recordings: str | os.PathLike[str] | None = None,
-    report: Callable[[int, int], None] = lambda *_: None,
+    report: Report = lambda *_: None,
     planned: Callable[[Plan], None] = lambda _: None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Explanation:
     """Train mixtures of two configurations, and return which settings make the difference between them.
 
@@ -114,42 +125,108 @@ def explain(
         workers: maximum number of processes; one per processor by default.
         ray: the address of a cluster of Ray, or empty for this machine; None for no Ray.
         recordings: the recordings folder: $DUALTAXI_RECORDINGS, or ./recordings, by default.
-        report: called several times a second with the number of runs trained, and of those to train.
+        report: called several times a second with how many runs are trained, of how many, and what is
+            counted; at last with the episodes of the two short runs that show the first step.
         planned: called with what will be trained, before it is.
+        stop: called several times a second; return True to stop.
 
     Raises:
         RunnerError: nothing differs, or too much; they cannot be mixed; a mixture does not have the metric.
-        KeyboardInterrupt: it was interrupted.
+        KeyboardInterrupt: it was interrupted, or `stop` returned True.
     """
-    began, folder = time.monotonic(), recordings_folder(recordings)
-    question = _question(a, b, metric, at, seeds, folder)
-    mixing, own = question.mixing, folder / FOLDER / question.name
-    busy = RunnerError("another process computes the same explanation; try again when it has finished.")
-    lock = acquired(own / "owner.lock", busy)
+    question = ask(a, b, metric=metric, at=at, seeds=seeds, recordings=recordings_folder(recordings))
     pool: Workers[Measurement, Measured]
+    with worker_pool(workers, ray, 2**MAX_ALL) as pool:
+        return answer(question, pool, report, planned, stop)
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is to be explained."""
+
+    name: str
+    """The folder of what is known of the two."""
+    a: Side
+    b: Side
+    mixing: Mixing
+    seeds: tuple[int, ...]
+    metric: str | None
+    at: int | None
+    recordings: Path
+    notes: tuple[str, ...]
+
+    @property
+    def mixtures(self) -> tuple[int, int]:
+        """How many mixtures are run, at least and at most."""
+        count = len(self.mixing.factors)
+        if count <= MAX_ALL:
+            return 2**count, 2**count
+        return 2 + math.ceil(math.log2(count)), 2 + 3 * count + count**2 + 2**MAX_ALL
+
+
+def ask(
+    a: Source, b: Source, *, metric: str | None, at: int | None, seeds: int, recordings: Path
+) -> Question:
+    """Return what is to be explained; arguments and errors as for `explain`."""
+    if not 1 <= seeds <= MAX_SEEDS:
+        raise RunnerError(f"--seeds: found {seeds}, expected 1 to {MAX_SEEDS:,}.")
+    (side_a, config_a, first), (side_b, config_b, other) = (
+        _resolved(source, recordings) for source in (a, b)
+    )
+    mixing = mix(config_a, config_b, at, exact=(metric or "").startswith("exact."))
+    notes = list(mixing.notes)
+    if first != other:
+        notes.append(f"all mixtures have the same seeds, though A has seed {first} and B seed {other}")
+    values = [mixing.a.to_mapping(), mixing.b.to_mapping()]
+    digest = blake3(json.dumps(values, sort_keys=True).encode()).hexdigest()[:8]
+    names = [re.sub(r"[^A-Za-z0-9_.-]", "_", side.name).lstrip(".-")[:40] for side in (side_a, side_b)]
+    chosen = tuple(range(first, first + seeds) if first + seeds <= 2**64 else range(seeds))
+    name = f"{'-'.join(names)}-{digest}"
+    return Question(name, side_a, side_b, mixing, chosen, metric, at, recordings, tuple(notes))
+
+
+def answer(
+    question: Question,
+    pool: Workers[Measurement, Measured],
+    report: Report = lambda *_: None,
+    planned: Callable[[Plan], None] = lambda _: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Explanation:
+    """Return the explanation of a question, trained by some workers; see `explain`."""
+    began, mixing, folder = time.monotonic(), question.mixing, question.recordings
+    own = folder / FOLDER / question.name
+    busy = ExplanationBusy("another process computes the same explanation; try again when it has finished.")
+    lock = acquired(own / LOCK, busy)
+
+    def report_runs(done: int, total: int) -> None:
+        if stop():
+            raise KeyboardInterrupt("what was trained is kept")
+        report(done, total, RUNS)
+
     try:
-        mixtures = Mixtures(mixing, question.seeds, folder, own, report)
-        if metric is not None and not mixtures.known(mixtures.ends):
-            _check_metric(mixing, metric, folder)
-        with worker_pool(workers, ray, 2**MAX_ALL) as pool:
-            mixtures.measure(mixtures.ends, pool, _PROBES)
-            sides = [mixtures.readings(side)[0] for side in mixtures.ends]
-            game = _Game(question, mixtures, pool, _metric_of(sides, metric))
-            planned(game.plan())
-            players = game.players()
-        strongest = None
+        mixtures = Mixtures(mixing, question.seeds, folder, own, report_runs)
+        if not mixtures.known(mixtures.ends):
+            check_metric(question)
+        mixtures.measure(mixtures.ends, pool, _PROBES)
+        sides = [mixtures.readings(side)[0] for side in mixtures.ends]
+        game = _Game(question, mixtures, pool, _metric_of(sides, question.metric))
+        planned(game.plan())
+        players = game.players()
         settings = _settings(game, players)
+        step = None
         if settings[0].share is not None:
             strongest = next(i for i, each in enumerate(mixing.factors) if each.name == settings[0].name)
-        step = (
-            None if strongest is None else first_step(mixing, strongest, question.seeds[0], folder, own.name)
-        )
+            step = first_step(
+                *(mixing, strongest, question.seeds[0], folder, own.name),
+                lambda done, total: report(done, total, EPISODES),
+                stop,
+            )
         explanation = Explanation(
             name=f"{question.name}/{re.sub(r'[^A-Za-z0-9_.-]+', '_', game.metric)}",
             a=question.a,
             b=question.b,
             metric=game.metric,
-            at=at,
+            at=question.at,
             episodes=mixing.a.episodes,
             seeds=question.seeds,
             method="all mixtures" if len(mixing.factors) <= MAX_ALL else "delta debugging",
@@ -171,36 +248,6 @@ def explain(
         lock.release()
 
 
-@dataclass(frozen=True)
-class _Question:
-    """What is to be explained."""
-
-    name: str
-    """The folder of what is known of the two."""
-    a: Side
-    b: Side
-    mixing: Mixing
-    seeds: tuple[int, ...]
-    notes: tuple[str, ...]
-
-
-def _question(
-    a: Source, b: Source, metric: str | None, at: int | None, seeds: int, folder: Path
-) -> _Question:
-    if not 1 <= seeds <= MAX_SEEDS:
-        raise RunnerError(f"--seeds: found {seeds}, expected 1 to {MAX_SEEDS:,}.")
-    (side_a, config_a, first), (side_b, config_b, other) = (_resolved(source, folder) for source in (a, b))
-    mixing = mix(config_a, config_b, at, exact=(metric or "").startswith("exact."))
-    notes = list(mixing.notes)
-    if first != other:
-        notes.append(f"all mixtures have the same seeds, though A has seed {first} and B seed {other}")
-    values = [mixing.a.to_mapping(), mixing.b.to_mapping()]
-    digest = blake3(json.dumps(values, sort_keys=True).encode()).hexdigest()[:8]
-    names = [re.sub(r"[^A-Za-z0-9_.-]", "_", side.name).lstrip(".-")[:40] for side in (side_a, side_b)]
-    chosen = range(first, first + seeds) if first + seeds <= 2**64 else range(seeds)
-    return _Question(f"{'-'.join(names)}-{digest}", side_a, side_b, mixing, tuple(chosen), tuple(notes))
-
-
 def _resolved(source: Source, recordings: Path) -> tuple[Side, ExperimentConfig, int]:
     """Return a name, the configuration and the seed of a run or a configuration.
 
@@ -218,7 +265,7 @@ def _resolved(source: Source, recordings: Path) -> tuple[Side, ExperimentConfig,
                 source = find_run(os.fspath(source), recordings)
             except RunNotFound as error:
                 hint = nearest(path.name, known) or " `dualtaxi config ls` lists those that are shipped."
-                raise RunnerError(f"{error} There is no configuration of this name either.{hint}") from error
+                raise RunNotFound(f"{error} There is no configuration of this name either.{hint}") from error
     if isinstance(source, ExperimentConfig):
         return Side(source.name), resolve_initial_q(source, recordings), source.seeds[0]
     if "made_by" in source.file.config:
@@ -231,21 +278,22 @@ def _resolved(source: Source, recordings: Path) -> tuple[Side, ExperimentConfig,
     return Side(source.name, source.run_id), resolve_initial_q(config, recordings), source.seed
 
 
-def _check_metric(mixing: Mixing, metric: str, folder: Path) -> None:
-    """Check that evaluations of A and of B have a metric, by an episode of each.
+def check_metric(question: Question) -> None:
+    """Check that evaluations of A and of B have the metric, by an episode of each.
 
     Rewards are not checked: `training.reward.VALUE` depends on what was received.
 
     Raises:
         RunnerError: there is no such metric.
     """
-    if metric.startswith("training.reward"):
+    mixing, metric = question.mixing, question.metric
+    if metric is None or metric.startswith("training.reward"):
         return
     sides = []
     for number in (0, mixing.everything):
         values = mixing.config(number).to_mapping()
         short = from_mapping(values | {"episodes": 1, "evaluation": values["evaluation"] | {"trials": 1}})
-        sides.append(dict.fromkeys(measure(short, 0, folder) or (), 0.0))
+        sides.append(dict.fromkeys(measure(short, 0, question.recordings) or (), 0.0))
     _metric_of(sides, metric)
 
 
@@ -276,23 +324,20 @@ class _Game:
 
     def __init__(
         self,
-        question: _Question,
+        question: Question,
         mixtures: Mixtures,
         pool: Workers[Measurement, Measured],
         metric: str,
     ) -> None:
-        self.mixing, self.metric = question.mixing, metric
+        self.question, self.mixing, self.metric = question, question.mixing, metric
         self._mixtures, self._pool, self._seeds = mixtures, pool, len(question.seeds)
         self._count = len(self.mixing.factors)
 
     def plan(self) -> Plan:
         """Return what will be trained."""
-        count = self._count
-        least = most = 2**count
-        if count > MAX_ALL:
-            least, most = 2 + math.ceil(math.log2(count)), 2 + 3 * count + count**2 + 2**MAX_ALL
-        known = self._mixtures.known(range(2**count))
-        return Plan(count, least, most, self._seeds, known, self._mixtures.seconds, max(1, self._pool.idle))
+        mixtures, pool, (least, most) = self._mixtures, self._pool, self.question.mixtures
+        known = mixtures.known(range(least)) if least == most else mixtures.in_file
+        return Plan(self._count, least, most, self._seeds, known, mixtures.seconds, max(1, pool.idle))
 
     def players(self) -> list[int]:
         """Return the numbers of the settings among which the difference is shared; measure their mixtures.

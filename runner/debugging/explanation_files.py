@@ -7,16 +7,25 @@ recordings/.explain/runs/                               the short runs that show
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from runner.debugging.explanation import Explanation
 from runner.errors import RunnerError, nearest
+from runner.runs.catalogue.removal import Removal, plan, remove
+from runner.runs.listing import list_runs
+from runner.runs.locking import acquired
+from runner.runs.run import UNLISTED
 from runner.util.files import open_regular, replacing, storage_errors
 
 FOLDER: Final = ".explain"
+LOCK: Final = "owner.lock"
+TAG: Final = "explain={}"
+"""The tag of the short runs of an explanation, with its name."""
 MAX_BYTES: Final = 32 << 20
 """The largest file of a result that is read."""
 MAX_VALUE: Final = 1e15
@@ -37,6 +46,61 @@ def write_explanation(explanation: Explanation, recordings: Path) -> None:
 def explanations_in(recordings: Path) -> list[str]:
     """Return the names of the results in a recordings folder."""
     return sorted(f"{file.parent.name}/{file.stem}" for file in (recordings / FOLDER).glob("*/*.json"))
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What an explanation trained, and its results: what may be removed."""
+
+    name: str
+    """The folder of the pair."""
+    folder: Path
+    files: tuple[Path, ...]
+    runs: tuple[Removal, ...]
+    """The short runs that show its first step."""
+
+    @property
+    def bytes(self) -> int:
+        """The bytes that removing it frees; runs that are kept or in use stay."""
+        own = sum(file.stat().st_size for file in self.files)
+        return own + sum(each.freed for each in self.runs if not each.refusal)
+
+
+def trained_in(recordings: Path) -> list[Trained]:
+    """Return what explanations trained in a recordings folder."""
+    runs = list_runs(recordings / UNLISTED)
+    return [
+        Trained(
+            folder.name,
+            folder,
+            tuple(file for file in sorted(folder.iterdir()) if file.suffix in (".json", ".jsonl")),
+            tuple(plan(run, run.folder.parent) for run in runs if TAG.format(folder.name) in run.tags),
+        )
+        for folder in sorted((recordings / FOLDER).glob("*"))
+        if folder.is_dir() and not folder.is_symlink() and folder.name != UNLISTED.name
+    ]
+
+
+def remove_trained(trained: Trained) -> None:
+    """Remove what an explanation trained, but runs that are kept or in use.
+
+    Raises:
+        RunnerError: it is being computed.
+        StorageError: a file cannot be removed.
+    """
+    lock = acquired(trained.folder / LOCK, RunnerError(f"{trained.name} is being computed; it stays."))
+    try:
+        for run in trained.runs:
+            if not run.refusal:
+                remove(run)
+        with storage_errors(trained.folder):
+            for file in trained.files:
+                file.unlink(missing_ok=True)
+    finally:
+        lock.release()
+    with contextlib.suppress(OSError):  # other files, or another process has begun to use it
+        (trained.folder / LOCK).unlink(missing_ok=True)
+        trained.folder.rmdir()
 
 
 def read_explanation(name: str, recordings: Path) -> Explanation:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
-import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -16,20 +17,31 @@ from runner.archive.places import at_hand
 from runner.config import from_mapping
 from runner.config.job import Job, identity_of
 from runner.debugging.explanation import FirstStep
+from runner.debugging.explanation_files import TAG
 from runner.debugging.factors import Mixing
 from runner.environments.naming import spoken
+from runner.errors import RunnerError
 from runner.execution.session import run_job
 from runner.recording import schema
 from runner.recording.labels import Labels
 from runner.recording.reader import Recording, open_recording
+from runner.runs.catalogue.removal import plan, remove
 from runner.runs.listing import list_runs
-from runner.runs.run import UNLISTED, Run, new_run, unless_empty
+from runner.runs.run import UNLISTED, Run, new_run
 
 _EPISODES: Final = (100, 1000, 10_000)
 """Training episodes in which the step is looked for, one after the other."""
 
 
-def first_step(mixing: Mixing, number: int, seed: int, recordings: Path, name: str) -> FirstStep:
+def first_step(
+    mixing: Mixing,
+    number: int,
+    seed: int,
+    recordings: Path,
+    name: str,
+    report: Callable[[int, int], None],
+    stop: Callable[[], bool],
+) -> FirstStep:
     """Record A with and without one setting of B, until they differ; return where they do.
 
     If they do not, all settings of B with and without this one are recorded. The runs are not listed among
@@ -41,12 +53,15 @@ def first_step(mixing: Mixing, number: int, seed: int, recordings: Path, name: s
         seed: the seed of the runs.
         recordings: the recordings folder.
         name: the name of the explanation, which the runs have as a tag.
+        report: called a few times a second with the episodes recorded, and of how many.
+        stop: called every few milliseconds; return True to stop.
 
     Raises:
+        KeyboardInterrupt: `stop` returned True.
         StorageError: the recordings folder cannot be written.
     """
     bit, setting, folder = 1 << number, mixing.factors[number].name, recordings / UNLISTED
-    tag = f"explain={name}"
+    tag = TAG.format(name)
     made = {identity_of(run.file.config, run.seed): run for run in list_runs(folder) if tag in run.tags}
     pairs = [(0, bit, f"Changing {setting} alone in A")]
     if mixing.everything != bit:
@@ -56,31 +71,39 @@ def first_step(mixing: Mixing, number: int, seed: int, recordings: Path, name: s
     for before, after, what in pairs:
         for episodes in (*(count for count in _EPISODES if count < limit), min(limit, _EPISODES[-1])):
             runs = []
-            for mixture, word in ((before, "without"), (after, "with")):
+            for part, (mixture, word) in enumerate(((before, "without"), (after, "with"))):
                 plain = {"episodes": episodes, "evaluation": None, "recording": {"console": False}}
                 job = Job(from_mapping(mixing.config(mixture).to_mapping() | plain), seed)
                 run = made.get(job.identity)
-                if run is None or run.status != "finished":
+                if run is not None and run.status != "finished":
+                    _discard(run, folder)
+                    run = None
+                if run is None:
                     title = re.sub(r"[^A-Za-z0-9_.]+", "-", f"{word}-{setting}")[:100]
-                    run = _record(job, folder, title, tag)
+                    labels = Labels(tags=(tag,))
+                    run = new_run(folder, job.config.to_mapping(), seed, title, labels=labels)
+                    done, total = part * episodes, 2 * episodes
+                    run = run_job(job, run, lambda now: report(done + now.episode, total), stop)  # noqa: B023
+                    if run.status != "finished":
+                        _discard(run, folder)
+                        raise KeyboardInterrupt("what was trained is kept")
                 runs.append(run)
             found = _found(runs[0], runs[1], setting, what)
             if found.sentences:
                 return found
             for run in runs:
                 made.pop(identity_of(run.file.config, run.seed), None)
-                shutil.rmtree(run.folder)
+                _discard(run, folder)
     sentence = (
         f"Neither alone nor last did {setting} change a step in {min(limit, _EPISODES[-1]):,} episodes."
     )
     return FirstStep(setting, "", "", None, None, None, (sentence,))
 
 
-def _record(job: Job, folder: Path, title: str, tag: str) -> Run:
-    """Record a job with every step in a folder of runs, as a run with a tag."""
-    run = new_run(folder, job.config.to_mapping(), job.seed, title, labels=Labels(tags=(tag,)))
-    with unless_empty(run):
-        return run_job(job, run)
+def _discard(run: Run, folder: Path) -> None:
+    """Remove a run that shows nothing; one that a user keeps, or another process uses, stays."""
+    with contextlib.suppress(RunnerError):
+        remove(plan(run, folder))
 
 
 def _found(before: Run, after: Run, setting: str, what: str) -> FirstStep:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 from blake3 import blake3
@@ -177,6 +177,8 @@ class Mixtures:
         self._mixing, self._seeds, self._recordings = mixing, tuple(seeds), recordings
         self._path, self._report = folder / VALUES, report
         self._kept = dict(_kept(self._path))
+        self.in_file = sum(known.seed in self._seeds for known in self._kept.values())
+        """Runs in the file that have one of the seeds, of whatever mixtures."""
         self._found: dict[tuple[int, int], Readings] = {}
         self._batch = 1
         self.trained = 0
@@ -265,8 +267,8 @@ class Mixtures:
             for seed in seeds:
                 known = self._kept.get(self._identity(config, seed))
                 if known is not None:
-                    self._found[mixture, seed], before = known
-                    self._seconds.setdefault(mixture, before)
+                    self._found[mixture, seed] = known.readings
+                    self._seconds.setdefault(mixture, known.seconds)
                 elif (mixture, seed) not in self._found:
                     missing.append(seed)
             for start in range(0, len(missing), batch):
@@ -279,8 +281,8 @@ class Mixtures:
         lines = []
         for seed, read in measured.readings.items():
             self._found[task.mixture, seed] = read
-            line = {"job": self._identity(config, seed), "seconds": measured.seconds, "readings": read}
-            lines.append(json.dumps(line) + "\n")
+            line = {"job": self._identity(config, seed), "seed": seed, "seconds": measured.seconds}
+            lines.append(json.dumps(line | {"readings": read}) + "\n")
         with storage_errors(self._path), self._path.open("a", encoding="utf-8") as file:
             file.writelines(lines)
 
@@ -296,14 +298,25 @@ class Mixtures:
         return RunnerError(f"the mixture with these settings of B: {names}: {reason}")
 
 
-def _kept(path: Path) -> Iterator[tuple[str, tuple[Readings, float]]]:
-    """Yield by the identity of a job its readings and seconds in a file, without damaged lines."""
+class _Known(NamedTuple):
+    """A run in the file of values."""
+
+    readings: Readings
+    seconds: float
+    seed: object
+
+
+def _kept(path: Path) -> Iterator[tuple[str, _Known]]:
+    """Yield by the identity of a job what a file has of it, without damaged lines."""
     try:
         with path.open("rb") as file:
             while file.tell() < MAX_BYTES and (line := file.readline(MAX_LINE)):
                 try:
                     values = json.loads(line)
-                    yield str(values["job"]), (_checked(values["readings"]), _finite(values["seconds"]))
+                    known = _Known(
+                        _checked(values["readings"]), _finite(values["seconds"]), values.get("seed")
+                    )
+                    yield str(values["job"]), known
                 except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
                     continue
     except OSError:

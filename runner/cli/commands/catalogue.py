@@ -95,6 +95,10 @@ _FREED_BY: Final = {
     ),
     "left_over": ("left over", "damaged originals kept by repairs, and files of interrupted commands"),
     "cached": ("cached", "made again when needed; remove the folder dualtaxi in your cache"),
+    "explanations": (
+        "explanations",
+        "what `dualtaxi explain` trained; `dualtaxi prune --explanations` removes it",
+    ),
     "half_removed": ("half removed", "the next `dualtaxi rm` or `prune` removes the rest"),
 }
 """Reason why bytes can be freed -> its name, and how to free them."""

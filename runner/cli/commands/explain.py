@@ -96,7 +96,7 @@ def explain_command(
     try:
         with (
             contextlib.redirect_stdout(sys.stderr),  # Ray prints messages about workers that died
-            total_line("runs trained") as report,
+            total_line() as report,
         ):
             explanation = explain(
                 a,

@@ -21,7 +21,7 @@ from runner.errors import RunnerError
 from runner.runs.catalogue.columns import STATUSES
 from runner.runs.listing import run_in
 from runner.runs.run import recordings_folder
-from runner.util.humanize import UNKNOWN, age, number, size
+from runner.util.humanize import UNKNOWN, age, counted, number, size
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.removal import Removal
@@ -92,6 +92,9 @@ def rm_command(
     type=click.Choice([status for status in STATUSES if status != "running"]),
     help="Runs with this status; may be repeated. Archived runs are removed only with --status archived.",
 )
+@click.option(
+    "--explanations", is_flag=True, help="Instead of runs: what `dualtaxi explain` trained, and its results."
+)
 @_dry_run_option
 @_yes_option
 @_foreign_option
@@ -102,6 +105,7 @@ def prune_command(
     older_than: str | None,
     keep_last: int | None,
     statuses: tuple[str, ...],
+    explanations: bool,
     dry_run: bool,
     yes: bool,
     foreign: bool,
@@ -116,11 +120,17 @@ def prune_command(
     Examples:
       dualtaxi prune --older-than 30d --keep-last 5 --status interrupted --dry-run
       dualtaxi prune 'config:quick success_percent:<50' --yes
+      dualtaxi prune --explanations --dry-run
     """
     from runner.runs.catalogue.filters import parse, seconds_of
     from runner.runs.catalogue.index import look
     from runner.runs.catalogue.removal import Criteria, plan, plan_row, unwanted
 
+    if explanations:
+        if words or older_than is not None or keep_last is not None or statuses or foreign:
+            raise click.UsageError("--explanations removes all of them: leave out FILTER and other criteria.")
+        _prune_explanations(recordings, dry_run, yes, as_json)
+        return
     try:
         seconds = None if older_than is None else seconds_of(older_than)
     except ValueError:
@@ -149,6 +159,47 @@ def prune_command(
     _carry_out(removals, kept, foreign, yes, dry_run, as_json)
 
 
+def _prune_explanations(recordings: Sequence[Path], dry_run: bool, yes: bool, as_json: bool) -> None:
+    """Show what explanations trained, ask, and remove it."""
+    from runner.debugging.explanation_files import remove_trained, trained_in
+
+    found = [each for folder in recordings for each in trained_in(folder)]
+    freed = sum(each.bytes for each in found)
+    if not found and not as_json:
+        say("There is nothing to remove.")
+        return
+    if not as_json:
+        grid = table("explanation", "runs", "frees", left=("explanation",))
+        for each in found:
+            grid.add_row(each.name, f"{len(each.runs):,}", size(each.bytes))
+        draw(grid)
+        for run in (run for each in found for run in each.runs if run.refusal):
+            say(f"Run {run.run_id} stays: {run.refusal}.")
+    if found and not dry_run:
+        _confirm(f"Remove {counted(len(found), 'explanation')} for good, and free {size(freed)}?", yes)
+        for each in found:
+            remove_trained(each)
+    if as_json:
+        rows = [{"name": each.name, "bytes": each.bytes} for each in found]
+        print_json({"dry_run": dry_run, "freed": freed, "removed": rows})
+    elif dry_run:
+        say(f"Nothing was removed; it would free {size(freed)}.")
+    else:
+        click.echo(f"Removed {counted(len(found), 'explanation')}, freed {size(freed)}.")
+
+
+def _confirm(question: str, yes: bool) -> None:
+    """Ask before something is removed.
+
+    Raises:
+        RunnerError: there is no terminal to ask on.
+    """
+    if not yes and not sys.stdin.isatty():
+        raise RunnerError("there is no terminal to ask on; --yes removes without asking, --dry-run shows.")
+    if not yes:
+        click.confirm(question, abort=True, err=True)
+
+
 def _carry_out(
     removals: Sequence[Removal], kept: dict[str, str], foreign: bool, yes: bool, dry_run: bool, as_json: bool
 ) -> None:
@@ -165,13 +216,8 @@ def _carry_out(
         if contents:
             say(f"Checkpoints that no other run refers to go too: {size(contents)}.")
     if removals and not dry_run:
-        if not yes and not sys.stdin.isatty():
-            raise RunnerError(
-                "there is no terminal to ask on; --yes removes without asking, --dry-run shows."
-            )
         runs = "this run" if len(removals) == 1 else f"these {len(removals):,} runs"
-        if not yes:
-            click.confirm(f"Remove {runs} for good, and free {size(freed)}?", abort=True, err=True)
+        _confirm(f"Remove {runs} for good, and free {size(freed)}?", yes)
         for removal in removals:
             remove(removal, foreign)
         for root in {removal.root for removal in removals}:

@@ -22,7 +22,7 @@ from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import Index
 from runner.runs.catalogue.rows import Expression, Row
 from runner.runs.locking import RUN_LOCK
-from runner.runs.run import RECORDING_FILE, RUN_FILE
+from runner.runs.run import RECORDING_FILE, RUN_FILE, UNLISTED
 from runner.runs.store import Store
 from runner.util.files import EXPORTS, RESTORED, RUN_SEPARATOR, TABLES, cache_folder
 
@@ -175,6 +175,7 @@ class Sums:
             "unfinished": self.unfinished,
             "left_over": self.left_over,
             "cached": self.exports + self.restored,
+            "explanations": sum(_size_within(str(root / UNLISTED.parent)) for root in recordings),
             "half_removed": sum(contents.recording + contents.other for contents in interrupted),
         }
 

@@ -11,12 +11,14 @@ from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
 from runner.config.document import write_yaml
+from runner.debugging.explain import DEFAULT_SEEDS, MAX_SEEDS
 from runner.runs.run import Run
 from runner.service.api.jobs import JobResponse, job_response
 from runner.service.dependencies import JobsOf, RecordedRun
 from runner.service.errors import Refused
 from runner.service.jobs.branches import BranchQuestion, check_branch
 from runner.service.jobs.checking import CheckedJob
+from runner.service.jobs.explanations import ExplainQuestion, check_explanation
 from runner.service.jobs.queue import JobQueue
 from runner.service.jobs.store import Job
 from runner.service.problems import error_docs
@@ -52,6 +54,35 @@ async def branch(
     job = await queue_branch(run, jobs, BranchQuestion(**dict(sent)))
     response.headers["location"] = f"{request.app.url_path_for('list_jobs')}/{job.number}"
     return await run_in_threadpool(job_response, job, jobs)
+
+
+class ExplainRequest(BaseModel, extra="forbid"):
+    """Two runs or configurations; as the options of `dualtaxi explain`."""
+
+    a: Text = Field(description="A run here, or the name of a shipped configuration.")
+    b: Text = Field(description="Another.")
+    metric: Text | None = Field(default=None, description="A metric of evaluations.")
+    at: int | None = Field(default=None, ge=1, description="Training episodes; the end of each by default.")
+    seeds: int = Field(default=DEFAULT_SEEDS, ge=1, le=MAX_SEEDS)
+
+
+@router.post(
+    "/explanations",
+    status_code=HTTPStatus.CREATED,
+    response_model=JobResponse,
+    summary="Find which settings make the difference between two runs or configurations.",
+)
+async def explain(jobs: JobsOf, sent: ExplainRequest, request: Request, response: Response) -> JobResponse:
+    """Queue an explanation, as `dualtaxi explain` computes it."""
+    job = await queue_explanation(jobs, ExplainQuestion(**dict(sent)))
+    response.headers["location"] = f"{request.app.url_path_for('list_jobs')}/{job.number}"
+    return await run_in_threadpool(job_response, job, jobs)
+
+
+async def queue_explanation(jobs: JobQueue, question: ExplainQuestion) -> Job:
+    """Check an explanation, and queue it."""
+    what = f"{question.a} and {question.b}"
+    return await _queue(jobs, await jobs.checker.call(what, check_explanation, question, jobs.recordings))
 
 
 async def queue_branch(run: Run, jobs: JobQueue, question: BranchQuestion) -> Job:

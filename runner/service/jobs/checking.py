@@ -115,11 +115,16 @@ def _refuse_paths(starts: Mapping[tuple[str | int, ...], object], document: Docu
     problems = []
     for where, start in starts.items():
         run = start.get("run") if isinstance(start, Mapping) else start
-        if isinstance(run, str) and ("/" in run or "\\" in run or run.endswith(".mcap")):
+        if isinstance(run, str) and is_path(run):
             place = (*where, "run") if isinstance(start, Mapping) else where
             problems.append(Problem(place, f"found the path {run!r}, expected the id or name of a run here"))
     if problems:
         raise refuse(problems, document)
+
+
+def is_path(name: str) -> bool:
+    """Return whether a name of a run or configuration is that of a file."""
+    return "/" in name or "\\" in name or name.endswith((".mcap", ".yaml", ".yml"))
 
 
 class JobChecker:

@@ -39,7 +39,9 @@ from runner.util.values import JsonView
 if TYPE_CHECKING:
     from filelock import FileLock
 
-Kind = Literal["config", "sweep", "branch"]
+Kind = Literal["config", "sweep", "branch", "explain"]
+WITHOUT_RUNS: Final = ("sweep", "explain")
+"""Kinds of jobs that are no runs, of seeds, but tasks for several workers."""
 State = Literal["queued", "running", "interrupted", "finished", "failed", "cancelled"]
 
 FOLDER: Final = ".jobs"

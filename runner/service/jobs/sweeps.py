@@ -6,6 +6,7 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator
+from typing import Generic
 
 from runner.client.jobs import BestTrial, LogEvent, SweepProgress
 from runner.service.jobs.channel import (
@@ -20,7 +21,7 @@ from runner.service.jobs.channel import (
 from runner.sweep import state, sweeps_in
 from runner.sweep.cluster import RayWorkers
 from runner.sweep.loading import from_values
-from runner.sweep.local import LocalWorkers, Workers
+from runner.sweep.local import LocalWorkers, R, T, Workers
 from runner.sweep.plan import limit_of, plan_of, require_disk
 from runner.sweep.running import INTERRUPTED, SweepStatus, run_sweep
 from runner.sweep.task import Result, Task
@@ -39,7 +40,8 @@ def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
         plan = plan_of(sweep)
         require_disk(plan, before, spec.recordings)
         reporter = _SweepReporter(channel)
-        with _workers(spec, channel, plan.runs) as workers:
+        workers: Workers[Task, Result]
+        with slotted_workers(spec, channel, plan.runs) as workers:
             _, status = run_sweep(
                 sweep,
                 spec.recordings,
@@ -76,20 +78,20 @@ def _locked_sweep(spec: JobSpec, stop: Callable[[], bool]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _workers(spec: JobSpec, channel: PipeChannel, runs: int) -> Iterator[Workers[Task, Result]]:
-    """Yield what runs the sweep's tasks: processes of this machine within the slots, or a cluster."""
+def slotted_workers(spec: JobSpec, channel: PipeChannel, runs: int) -> Iterator[Workers[T, R]]:
+    """Yield what runs the job's tasks: processes of this machine within the slots, or a cluster."""
     if spec.ray is not None:
-        with RayWorkers[Task, Result](None, spec.ray, runs) as remote:
+        with RayWorkers[T, R](None, spec.ray, runs) as remote:
             yield remote
         return
-    with LocalWorkers[Task, Result](runs) as local:
+    with LocalWorkers[T, R](runs) as local:
         yield SlottedWorkers(local, channel)
 
 
-class SlottedWorkers:
+class SlottedWorkers(Generic[T, R]):
     """Workers of which at most as many are busy as the server grants slots at the moment."""
 
-    def __init__(self, workers: Workers[Task, Result], channel: PipeChannel) -> None:
+    def __init__(self, workers: Workers[T, R], channel: PipeChannel) -> None:
         self._workers, self._channel = workers, channel
         self._busy, self._sent = 0, (0, 0)
 
@@ -100,13 +102,13 @@ class SlottedWorkers:
         self._report(slots)
         return max(0, min(self._workers.idle, slots - self._busy))
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: T) -> None:
         """Start a task on an idle worker."""
         self._busy += 1
         self._report(self._channel.slots)
         self._workers.submit(task)
 
-    def collect(self, seconds: float) -> list[tuple[Task, Result | None]]:
+    def collect(self, seconds: float) -> list[tuple[T, R | None]]:
         """Return what is done, waiting that long for it; None for a worker that died and was replaced."""
         done = self._workers.collect(seconds)
         self._busy -= len(done)

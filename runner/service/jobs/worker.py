@@ -28,6 +28,7 @@ from runner.service.jobs.channel import (
     PipeChannel,
     wait_for_owners,
 )
+from runner.service.jobs.explanations import run_explain_job
 from runner.service.jobs.sweeps import run_sweep_job
 from runner.service.processes import NICENESS
 from runner.service.settings import without_folders
@@ -46,7 +47,8 @@ def work(pipe: Connection, spec: JobSpec) -> None:
     signal.signal(signal.SIGTERM, channel.request_stop)
     try:
         with announced(lambda: channel.send((LogEvent(MESSAGE),))):
-            outcome = (run_sweep_job if spec.kind == "sweep" else run_config_job)(spec, channel)
+            run = {"sweep": run_sweep_job, "explain": run_explain_job}.get(spec.kind, run_config_job)
+            outcome = run(spec, channel)
     except RunnerError as error:
         message = "\n".join([str(error), *getattr(error, "__notes__", [])])
         outcome = Outcome("failed", without_folders(message, spec.recordings))

@@ -18,7 +18,7 @@ from runner.errors import StorageError
 from runner.execution.estimate import free_bytes
 from runner.runs.run import new_run_id
 from runner.service.jobs.channel import JobSpec, Message, Outcome, Slots
-from runner.service.jobs.store import Job, JobStore, now
+from runner.service.jobs.store import WITHOUT_RUNS, Job, JobStore, now
 from runner.service.jobs.worker import work
 from runner.service.logs import LOG
 
@@ -177,7 +177,7 @@ class WorkerPool:
 
     def _reserved_runs(self, job: Job, values: dict[str, object]) -> dict[int, str]:
         """Return the run id of each seed, stored before the run exists: so no run is started twice."""
-        if job.kind == "sweep":
+        if job.kind in WITHOUT_RUNS:
             return {}
         run_ids = self._store.run_ids(job.number, started=False)
         seeds = [seed for seed in from_mapping(values).seeds if seed not in run_ids]
@@ -194,7 +194,7 @@ class WorkerPool:
         spare = max(0, self.size - len(self._busy) - is_waiting)
         for number, worker in sorted(self._busy.items()):
             slots = 1
-            if jobs[number].kind == "sweep":
+            if jobs[number].kind in WITHOUT_RUNS:
                 slots, spare = 1 + spare, 0
             if slots != worker.slots:
                 worker.slots = slots

@@ -19,7 +19,7 @@ from runner.service.api.questions import queue_branch
 from runner.service.dependencies import JobsOf, RecordedRun
 from runner.service.jobs.branches import BranchQuestion
 from runner.service.pages.frame import RunView, head_of
-from runner.service.pages.rendering import Form, message_of, page
+from runner.service.pages.rendering import Form, message_of, number_in, page
 
 router = APIRouter(prefix="/runs/{run}/branch", include_in_schema=False)
 
@@ -54,9 +54,6 @@ async def branch(request: Request, run: RecordedRun, sent: Form, jobs: JobsOf) -
 
 def _question(given: Mapping[str, str]) -> BranchQuestion:
     """Return the branch that the fields of the form describe."""
-    episodes = given.get("episodes", "")
-    if episodes and not (episodes.isdecimal() and len(episodes) < 16):
-        raise RunnerError(f"found {episodes[:40]!r}, expected a number of training episodes.")
     prefix = "action."
     own = {
         name.removeprefix(prefix): text for name, text in given.items() if name.startswith(prefix) and text
@@ -65,7 +62,7 @@ def _question(given: Mapping[str, str]) -> BranchQuestion:
         at=given.get("at", ""),
         action=own or None,
         overrides=tuple(filter(None, map(str.strip, given.get("overrides", "").splitlines()))),
-        episodes=int(episodes) if episodes else None,
+        episodes=number_in(given, "episodes"),
         name=given.get("name") or None,
     )
 

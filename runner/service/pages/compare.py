@@ -72,6 +72,8 @@ class Compared:
     tabs: list[tuple[str, str, str]]
     """Path, title and address."""
     here: str
+    can_explain: bool
+    """Whether mixtures of both can be trained."""
 
     @property
     def title(self) -> str:
@@ -299,7 +301,9 @@ def _compared(runs: list[Run], here: str) -> Compared:
     ]
     if not any(map(has_tables, runs)):
         tabs = [tab for tab in tabs if tab[0] != "/tables"]
-    return Compared(compared, tabs if len(runs) == 2 else [], here)
+    return Compared(
+        compared, tabs if len(runs) == 2 else [], here, len(runs) == 2 and all(map(has_tables, runs))
+    )
 
 
 def _flat(run: Run) -> dict[str, str]:

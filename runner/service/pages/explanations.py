@@ -1,23 +1,31 @@
-"""The explanations of differences that `dualtaxi explain` left in a recordings folder."""
+"""Explanations of the difference between two runs: a form, which queues a job, and the results."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from http import HTTPStatus
+from typing import Annotated, ClassVar
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import RedirectResponse
+from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.sections import Section
 from runner.analysis.step_reference import StepRef
+from runner.debugging.explain import DEFAULT_SEEDS
 from runner.debugging.explanation import Explanation, plots, sections
+from runner.errors import RunnerError
 from runner.export.plots.curves import Plot
 from runner.export.reports.rendering import Link, View
 from runner.service.api.comparing import Part, found_explanation
-from runner.service.dependencies import SettingsOf
-from runner.service.pages.rendering import page
+from runner.service.api.questions import queue_explanation
+from runner.service.dependencies import JobsOf, SettingsOf
+from runner.service.jobs.explanations import ExplainQuestion
+from runner.service.pages.rendering import Form, message_of, number_in, page
 
-router = APIRouter(prefix="/sweeps/explanations", include_in_schema=False)
+router = APIRouter(include_in_schema=False)
+Name = Annotated[str, Query(max_length=200)]
 
 
 @dataclass(frozen=True)
@@ -30,7 +38,41 @@ class _ExplanationView(View):
     parts_of_answer: Sequence[Section]
 
 
-@router.get("/{pair}/{metric}")
+@dataclass(frozen=True)
+class _ExplainView(View):
+    TEMPLATE: ClassVar = "explain.html"
+    form: Mapping[str, str]
+    """The fields as they were sent."""
+    problem: str = ""
+
+
+@router.get("/explain")
+def form(request: Request, a: Name = "", b: Name = "") -> Response:
+    """Show the form."""
+    return page(request, _ExplainView({"a": a, "b": b}))
+
+
+@router.post("/explain")
+async def explain(request: Request, sent: Form, jobs: JobsOf) -> Response:
+    """Queue the explanation, or show what is wrong."""
+    given = {name: text.strip() for name, text in sent.items()}
+    try:
+        numbers = {name: number_in(given, name) for name in ("at", "seeds")}
+        question = ExplainQuestion(
+            a=given.get("a", ""),
+            b=given.get("b", ""),
+            metric=given.get("metric") or None,
+            at=numbers["at"],
+            seeds=numbers["seeds"] or DEFAULT_SEEDS,
+        )
+        job = await queue_explanation(jobs, question)
+    except RunnerError as error:
+        view = _ExplainView(given, message_of(error, request))
+        return await run_in_threadpool(page, request, view, HTTPStatus.UNPROCESSABLE_ENTITY)
+    return RedirectResponse(f"/queue/{job.number}", HTTPStatus.SEE_OTHER)
+
+
+@router.get("/sweeps/explanations/{pair}/{metric}")
 def explanation(request: Request, pair: Part, metric: Part, settings: SettingsOf) -> Response:
     """Show an explanation."""
     found = found_explanation(pair, metric, settings)

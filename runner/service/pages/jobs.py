@@ -12,6 +12,7 @@ from fastapi.responses import RedirectResponse
 
 from runner.client.client import UploadStatus
 from runner.client.jobs import JobEvent, SweepProgress
+from runner.debugging.explanation_files import explanations_in
 from runner.export.reports.rendering import View
 from runner.service.addresses import Paging
 from runner.service.api.jobs import JobResponse, Number, job_response
@@ -68,6 +69,8 @@ class _JobView(View):
     submitted: str
     is_over: bool
     seconds: float | None
+    explanations: list[str]
+    """Names of the explanations that it has computed."""
 
 
 @router.get("")
@@ -98,6 +101,13 @@ def job(request: Request, jobs: JobsOf, number: Number) -> Response:
         submitted=jobs.store.submitted(number),
         is_over=found.is_over,
         seconds=_seconds(found),
+        explanations=[
+            name
+            for name in (
+                explanations_in(jobs.recordings) if found.kind == "explain" and found.is_over else ()
+            )
+            if name.startswith(f"{found.name}/")
+        ],
     )
     return page(request, view)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from http import HTTPStatus
@@ -112,6 +112,14 @@ async def form_of(request: Request) -> dict[str, str]:
 
 
 Form = Annotated[dict[str, str], Depends(form_of)]
+
+
+def number_in(form: Mapping[str, str], name: str) -> int | None:
+    """Return a whole number of a form; None for an empty field."""
+    text = form.get(name, "")
+    if text and not (text.isdecimal() and len(text) < 16):
+        raise RunnerError(f"{name}: found {text[:40]!r}, expected a whole number.")
+    return int(text) if text else None
 
 
 def message_of(error: RunnerError, request: Request) -> str:

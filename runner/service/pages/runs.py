@@ -58,6 +58,10 @@ FREED_BY: Final = {
     ),
     "left_over": ("Left over", "Damaged originals that a repair kept, and files of interrupted commands."),
     "cached": ("Cached", "Created again when needed."),
+    "explanations": (
+        "Explanations",
+        "What was trained for them: `dualtaxi prune --explanations` removes it.",
+    ),
     "half_removed": ("Half removed", "The next `dualtaxi rm` or `prune` removes the rest."),
 }
 """What could be freed, with its heading and how to do it."""

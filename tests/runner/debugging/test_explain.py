@@ -10,12 +10,13 @@ from click.testing import CliRunner
 import runner
 from runner.cli import cli
 from runner.config import from_mapping
+from runner.debugging.explain import EPISODES, RUNS
 from runner.debugging.explanation import plots, sections
 from runner.debugging.explanation_files import explanations_in, read_explanation
 from runner.debugging.factors import mix
 from runner.errors import RunnerError
 from runner.runs.listing import list_runs
-from runner.runs.run import UNLISTED
+from runner.runs.run import UNLISTED, label
 
 LAKE = {
     "env": {"id": "FrozenLake-v1", "kwargs": {"is_slippery": False}},
@@ -82,7 +83,7 @@ def test_the_values_are_those_of_recorded_runs(tmp_path):
 def test_what_was_trained_is_kept(tmp_path):
     b = LAKE | PLANTED | {"step_size": 0.5}
 
-    def interrupt(done, total):
+    def interrupt(done, total, what):
         if done >= 12:
             raise KeyboardInterrupt
 
@@ -261,3 +262,42 @@ def test_a_run_is_explained_by_its_configuration_and_seed(tmp_path):
     assert any("same seeds" in note for note in found.notes)
     assert "<svg" in found._repr_html_()
     assert plots(found)[0].title == "Shares"
+
+
+def test_the_first_step_reports_its_progress_and_can_be_stopped(tmp_path):
+    reports = []
+
+    def stop():
+        return any(what == EPISODES for _, _, what in reports)
+
+    with pytest.raises(KeyboardInterrupt):
+        explained(LAKE, LAKE | PLANTED, tmp_path, report=lambda *now: reports.append(now), stop=stop)
+    assert {what for _, _, what in reports} == {RUNS, EPISODES}
+    left = list_runs(tmp_path / UNLISTED)
+    assert [run.status for run in left] == ["finished"][: len(left)]  # no half of a run stays
+    found = explained(LAKE, LAKE | PLANTED, tmp_path)
+    assert found.trained == 0
+    assert len(list_runs(tmp_path / UNLISTED)) == 2
+
+
+def test_prune_removes_what_was_trained_but_what_is_kept(tmp_path):
+    found = explained(LAKE, LAKE | PLANTED, tmp_path, seeds=2)
+    kept, other = list_runs(tmp_path / UNLISTED)
+    label(kept, tag=["keep"])
+
+    def command(*words):
+        return CliRunner().invoke(cli, [*words, "--recordings", str(tmp_path)])
+
+    listed = json.loads(command("du", "--json").stdout)["freeable"]["explanations"]
+    assert listed > other.recording.stat().st_size
+    shown = command("prune", "--explanations", "--dry-run")
+    assert "Nothing was removed" in shown.stderr
+    assert other.recording.is_file()
+    assert command("prune", "--explanations").exit_code == 2  # nobody to ask
+    assert command("prune", "--explanations", "status:failed", "--yes").exit_code == 2
+    removed = command("prune", "--explanations", "--yes")
+    assert removed.exit_code == 0, removed.output
+    assert f"Run {kept.run_id} stays" in removed.stderr
+    assert explanations_in(tmp_path) == []
+    assert [run.run_id for run in list_runs(tmp_path / UNLISTED)] == [kept.run_id]
+    assert not (tmp_path / ".explain" / found.name.split("/")[0]).exists()

@@ -1,0 +1,90 @@
+"""A job that explains the difference between two runs or configurations: checked, and run."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from runner.client.jobs import LogEvent, SweepProgress
+from runner.config.sections import RunTable
+from runner.debugging.explain import (
+    DEFAULT_SEEDS,
+    EPISODES,
+    ExplanationBusy,
+    Question,
+    answer,
+    ask,
+    check_metric,
+)
+from runner.debugging.explanation import summary
+from runner.debugging.mixtures import Measured, Measurement
+from runner.errors import ConfigError
+from runner.service.jobs.channel import OTHER_OWNER_SECONDS, REPORT_SECONDS, JobSpec, Outcome, PipeChannel
+from runner.service.jobs.checking import MAX_RUNS, CheckedJob, is_path
+from runner.service.jobs.sweeps import slotted_workers
+from runner.sweep.local import Workers
+
+
+@dataclass(frozen=True)
+class ExplainQuestion:
+    """What is to be explained; the fields are the arguments of `runner.explain`."""
+
+    a: str
+    b: str
+    metric: str | None = None
+    at: int | None = None
+    seeds: int = DEFAULT_SEEDS
+
+
+def check_explanation(given: ExplainQuestion, recordings: Path) -> CheckedJob:
+    """Return the job of an explanation, with runs by their ids."""
+    for name, source in (("a", given.a), ("b", given.b)):
+        if is_path(source):
+            raise ConfigError(
+                f"{name}: found the path {source!r}, expected a run here or a shipped configuration."
+            )
+    question = _question(given, recordings)
+    for config in (question.mixing.a, question.mixing.b):
+        if isinstance(config.initial_q, RunTable) and is_path(config.initial_q.run):
+            raise ConfigError(
+                f"initial_q: found the path {config.initial_q.run!r}, expected that of a run here."
+            )
+    check_metric(question)
+    runs = question.mixtures[1] * given.seeds
+    if runs > MAX_RUNS:
+        raise ConfigError(f"seeds: makes {runs:,} runs, expected at most {MAX_RUNS:,} in a job.")
+    sides = {"a": question.a.run_id or question.a.name, "b": question.b.run_id or question.b.name}
+    return CheckedJob("explain", question.name, runs, 0, asdict(given) | sides)
+
+
+def run_explain_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
+    """Train what is left of an explanation, and store it."""
+    question = _question(ExplainQuestion(**spec.values), spec.recordings)  # type: ignore[arg-type]
+    deadline, stages = time.monotonic() + OTHER_OWNER_SECONDS, set[str]()
+
+    def report(done: int, total: int, what: str) -> None:
+        channel.send(SweepProgress(done, total, 0, 0, 0, 0, None))
+        if what == EPISODES and what not in stages:
+            stages.add(what)
+            channel.send((LogEvent("two short runs are recorded to find the first step that differs"),))
+
+    workers: Workers[Measurement, Measured]
+    try:
+        with slotted_workers(spec, channel, question.mixtures[1]) as workers:
+            while True:
+                try:
+                    found = answer(question, workers, report, stop=channel.stop)
+                    break
+                except ExplanationBusy:  # perhaps by the worker of a server that was killed
+                    if time.monotonic() > deadline or channel.stop():
+                        raise
+                    time.sleep(REPORT_SECONDS)
+    except KeyboardInterrupt:
+        return Outcome("interrupted")
+    channel.send(tuple(map(LogEvent, summary(found))))
+    return Outcome("finished")
+
+
+def _question(given: ExplainQuestion, recordings: Path) -> Question:
+    return ask(given.a, given.b, metric=given.metric, at=given.at, seeds=given.seeds, recordings=recordings)
