@@ -6,7 +6,8 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator
-from typing import Generic
+from contextlib import AbstractContextManager
+from typing import Generic, Self
 
 from runner.client.jobs import BestTrial, LogEvent, SweepProgress
 from runner.service.jobs.channel import (
@@ -77,23 +78,27 @@ def _locked_sweep(spec: JobSpec, stop: Callable[[], bool]) -> Iterator[None]:
         yield
 
 
-@contextlib.contextmanager
-def slotted_workers(spec: JobSpec, channel: PipeChannel, runs: int) -> Iterator[Workers[T, R]]:
-    """Yield what runs the job's tasks: processes of this machine within the slots, or a cluster."""
+def slotted_workers(
+    spec: JobSpec, channel: PipeChannel, runs: int
+) -> AbstractContextManager[Workers[T, R], None]:
+    """Return what runs the job's tasks: processes of this machine within the slots, or a cluster."""
     if spec.ray is not None:
-        with RayWorkers[T, R](None, spec.ray, runs) as remote:
-            yield remote
-        return
-    with LocalWorkers[T, R](runs) as local:
-        yield SlottedWorkers(local, channel)
+        return RayWorkers(None, spec.ray, runs)
+    return SlottedWorkers(LocalWorkers(runs), channel)
 
 
 class SlottedWorkers(Generic[T, R]):
     """Workers of which at most as many are busy as the server grants slots at the moment."""
 
-    def __init__(self, workers: Workers[T, R], channel: PipeChannel) -> None:
+    def __init__(self, workers: LocalWorkers[T, R], channel: PipeChannel) -> None:
         self._workers, self._channel = workers, channel
         self._busy, self._sent = 0, (0, 0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._workers.__exit__(*error)
 
     @property
     def idle(self) -> int:
