@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final, TypeVar
 
 import numpy as np
@@ -25,7 +26,7 @@ from runner.errors import RunnerError, shortened
 from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.metrics import LARGEST, METRIC_OF, METRICS, SHARES, finite_mean, is_usable
-from runner.recording.reader import Recording
+from runner.recording.reader import Recording, open_recording
 from runner.util.values import JsonView
 
 Readings = dict[str, dict[str, float]]
@@ -169,6 +170,15 @@ def parse_target(text: str) -> tuple[str, float]:
 
 
 # --- reading ------------------------------------------------------------------------------------------
+
+
+def series_of(paths: Iterable[Path], axis: Axis = EPISODES) -> list[RunSeries]:
+    """Return the metrics of recordings over an axis, see `read_series`."""
+    series = []
+    for path in paths:
+        with open_recording(path) as recording:
+            series.append(read_series(recording, axis))
+    return series
 
 
 def read_series(recording: Recording, axis: Axis = EPISODES) -> RunSeries:

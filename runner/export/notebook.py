@@ -139,18 +139,14 @@ def plot(
     """
     from runner.analysis.axes import axis_of
     from runner.analysis.groups import groups_of
-    from runner.analysis.series import read_series
+    from runner.analysis.series import series_of
     from runner.archive.places import at_hand
     from runner.export.plots.curves import curves_sheet
     from runner.export.plots.image import write_image
     from runner.export.plots.metrics import CurveStyle, panels_of
-    from runner.recording.reader import open_recording
 
     style, over = CurveStyle(lines, smooth, log_x, log_y), axis_of(axis)
-    series = []
-    for run in runs:
-        with open_recording(at_hand(run).recording) as recording:
-            series.append(read_series(recording, over))
+    series = series_of((at_hand(run).recording for run in runs), over)
     groups = groups_of(series)
     buffer = io.BytesIO()
     write_image(curves_sheet(groups, panels_of(groups), style), buffer, "png", dpi=110)

@@ -18,24 +18,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis import diff as differences
-from runner.analysis.axes import AXES, EPISODES, Axis, axes_of, axis_of
+from runner.analysis.axes import AXES, EPISODES, axes_of, axis_of
 from runner.analysis.compare import compare
 from runner.analysis.compare.moments import moment_of
 from runner.analysis.compare.score_table import MIN_MAX, parse_table
 from runner.analysis.compare.statistics import require_scipy
-from runner.analysis.compare.tasks import compare_tasks, metric_of_tasks
+from runner.analysis.compare.tasks import compare_algorithms
 from runner.analysis.evaluations import evaluation_records, training_records
 from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.analysis.groups import grouped, groups_of, metrics_of, require_two
 from runner.analysis.histograms import histograms
 from runner.analysis.qtable import describe_tables, one_array, replay_at
-from runner.analysis.series import RunSeries, parse_target, read_series
+from runner.analysis.series import parse_target, read_series, series_of
 from runner.analysis.step_reference import StepRef
 from runner.debugging.q_value import why_body
 from runner.debugging.what_if import what_if_in
 from runner.debugging.when import section_of, when_in
 from runner.debugging.why import why_in
-from runner.errors import RunnerError
 from runner.export.plots.curves import curves_sheet
 from runner.export.plots.image import check_suffix, save
 from runner.export.plots.metrics import Curve, CurveStyle, NoMetrics, Panel, panels_of, smoothed
@@ -244,7 +243,7 @@ def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:
 def plot(path: Path, form: str, axis: str, style: CurveStyle) -> bytes:
     """Return every metric of a run over an axis in one figure, as `svg`, `png` or `pdf`."""
     check_suffix(Path(f"plot.{form}"))
-    groups = groups_of(_series([path], axis_of(axis)))
+    groups = groups_of(series_of([path], axis_of(axis)))
     with tempfile.TemporaryDirectory() as folder:
         picture = Path(folder, f"plot.{form}")
         save(curves_sheet(groups, panels_of(groups), style), picture)
@@ -277,11 +276,11 @@ def comparison(
     require_scipy()
     over = axis_of(axis)
     chosen, names = moment_of(moment, parse_target(target) if target else None, metrics, over)
-    groups, notes = grouped(_series(paths, over), by, across_tasks=normalise is not None)
+    series = series_of(paths, over)
     if normalise is not None:
         table = None if normalise == MIN_MAX else parse_table(normalise, TABLE_NAME)
-        tasks = compare_tasks(groups, metric_of_tasks(groups, names), chosen, table, notes)
-        return as_json(dataclasses.asdict(tasks))
+        return as_json(dataclasses.asdict(compare_algorithms(series, table, by, names, chosen)))
+    groups, notes = grouped(series, by)
     require_two(groups, by)
     return as_json(dataclasses.asdict(compare(groups, metrics_of(groups, names), chosen, notes)))
 
@@ -301,13 +300,3 @@ def replay(runs: Sequence[Run], request: Request) -> bytes:
 def as_json(value: object) -> bytes:
     """Return a value as JSON; NaN and infinity become null."""
     return json.dumps(finite(value), allow_nan=False, ensure_ascii=False).encode(errors="replace")
-
-
-def _series(paths: Sequence[Path], axis: Axis = EPISODES) -> list[RunSeries]:
-    found = []
-    for path in paths:
-        with open_recording(path) as recording:
-            found.append(read_series(recording, axis))
-    if not found:
-        raise RunnerError("found no run, expected at least one.")
-    return found

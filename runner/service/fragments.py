@@ -13,15 +13,13 @@ from typing import Final
 from markupsafe import Markup
 
 from runner.analysis.axes import axis_of
-from runner.analysis.compare.moments import Moment
 from runner.analysis.compare.score_table import parse_table
 from runner.analysis.compare.task_sections import EXPLANATION as TASKS_EXPLANATION
 from runner.analysis.compare.task_sections import task_sections
-from runner.analysis.compare.tasks import compare_tasks, metric_of_tasks
+from runner.analysis.compare.tasks import compare_algorithms
 from runner.analysis.diff import diff, with_seconds, without_ignored
-from runner.analysis.groups import grouped
 from runner.analysis.histograms import histograms
-from runner.analysis.series import read_series
+from runner.analysis.series import series_of
 from runner.analysis.step_reference import StepRef
 from runner.analysis.summary import random_policy_sentence
 from runner.debugging.what_if import branch_playback, what_if_in
@@ -159,13 +157,8 @@ def distributions(path: Path, axis: str) -> bytes:
 
 def tasks(paths: Sequence[Path], axis: str, scores: str) -> bytes:
     """Return the comparison of runs over environments as HTML; `scores` is a table as CSV, or empty."""
-    series = []
-    for path in paths:
-        with open_recording(path) as recording:
-            series.append(read_series(recording, axis_of(axis)))
-    groups, notes = grouped(series, across_tasks=True)
     table = parse_table(scores, TABLE_NAME) if scores.strip() else None
-    found = compare_tasks(groups, metric_of_tasks(groups, ()), Moment("last"), table, notes)
+    found = compare_algorithms(series_of(paths, axis_of(axis)), table)
     shown = partials()
     plots = [Plot(chart.title, chart.svg(), False) for chart in task_charts(found)]
     html = [shown.charts("tasks", "Normalised scores", TASKS_EXPLANATION, plots, tasks_legend(found))]

@@ -84,7 +84,14 @@ class Picture:
 
 def picture_of(results: Results) -> Picture:
     """Return the trials of a sweep that can be drawn."""
-    drawn = tuple(trial for trial in results.ranking if _is_drawable(trial))
+    drawn = tuple(
+        trial
+        for trial in results.ranking
+        if all(
+            value is not None and math.isfinite(value) and abs(value) < NEVER
+            for value in (trial.median, trial.low, trial.high)
+        )
+    )
     if not drawn:
         raise RunnerError(_nothing_to_draw(results))
     parameters, objective = results.sweep.file.parameters, results.sweep.objective
@@ -128,11 +135,6 @@ def _nothing_to_draw(results: Results) -> str:
     if finished:
         reason = f"none of its {finished:,} finished trials reached {results.sweep.objective.description}"
     return f"the sweep {results.sweep.name!r}: nothing to draw, as {reason}."
-
-
-def _is_drawable(trial: Ranked) -> bool:
-    values = (trial.median, trial.low, trial.high)
-    return all(value is not None and math.isfinite(value) and abs(value) < NEVER for value in values)
 
 
 def _axis(path: str, parameter: Range | list[Any], trials: Sequence[Ranked]) -> Axis:

@@ -28,7 +28,7 @@ from runner.analysis.compare.moments import (
 )
 from runner.analysis.compare.score_table import MIN_MAX, Bounds
 from runner.analysis.compare.statistics import Estimate, Values
-from runner.analysis.groups import Group, metrics_of
+from runner.analysis.groups import Group, grouped, metrics_of
 from runner.analysis.series import RunSeries, points_of, title_of
 from runner.errors import RunnerError
 from runner.util.humanize import listed
@@ -100,6 +100,18 @@ def metric_of_tasks(groups: Sequence[Group], chosen: Sequence[str]) -> tuple[str
             f"--metric: found {listed(names)}, expected one, as environments are compared by it."
         )
     return pairs[0]
+
+
+def compare_algorithms(
+    series: Sequence[RunSeries],
+    table: Mapping[str, Bounds] | None,
+    by: str | None = None,
+    chosen: Sequence[str] = (),
+    moment: Moment = Moment("last"),  # noqa: B008 - frozen
+) -> TaskComparison:
+    """Return the comparison of runs, grouped over environments, by the metric chosen or the return."""
+    groups, notes = grouped(series, by, across_tasks=True)
+    return compare_tasks(groups, metric_of_tasks(groups, chosen), moment, table, notes)
 
 
 def compare_tasks(

@@ -108,8 +108,7 @@ def compare_command(
     from runner.analysis.axes import EPISODES, STEPS
     from runner.analysis.compare.moments import moment_of
     from runner.analysis.compare.statistics import require_scipy
-    from runner.analysis.series import read_series
-    from runner.recording.reader import open_recording
+    from runner.analysis.series import series_of
 
     require_one_form(as_json, as_markdown)
     require_scipy()
@@ -124,11 +123,8 @@ def compare_command(
         moment, axis = str(at_step), STEPS
     read_at, chosen = moment_of(moment, target, metrics, axis)
     runs = find_all_recorded(run_names, recordings)
-    series = []
     with stage_line("reading runs") as stage:
-        for run in runs:
-            with open_recording(run.recording) as recording:
-                series.append(read_series(recording, axis))
+        series = series_of((run.recording for run in runs), axis)
         stage("computing intervals")
         made = (
             _compare_groups(series, by, chosen, read_at, html is not None)
@@ -186,18 +182,15 @@ def _compare_tasks(
 ) -> _Made:
     from runner.analysis.compare.score_table import scores_of
     from runner.analysis.compare.task_sections import task_sections
-    from runner.analysis.compare.tasks import compare_tasks, metric_of_tasks
-    from runner.analysis.groups import grouped
+    from runner.analysis.compare.tasks import compare_algorithms
 
-    table = scores_of(normalise)
-    groups, notes = grouped(series, by, across_tasks=True)
-    comparison = compare_tasks(groups, metric_of_tasks(groups, chosen), moment, table, notes)
+    comparison = compare_algorithms(series, scores_of(normalise), by, chosen, moment)
     page = ""
     if with_page:
         from runner.export.reports.compare import render_tasks
 
         page = render_tasks(comparison)
-    contents = f"{len(groups)} groups in {len(comparison.tasks)} environments"
+    contents = f"{len(comparison.algorithms)} groups in {len(comparison.tasks)} environments"
     return _Made(comparison, task_sections(comparison), contents, page)
 
 

@@ -109,17 +109,14 @@ def plot_command(
 
 
 def _plot_tasks(series: list[RunSeries], normalise: str, output: Path, force: bool, as_json: bool) -> None:
-    from runner.analysis.compare.moments import Moment
     from runner.analysis.compare.score_table import scores_of
-    from runner.analysis.compare.tasks import compare_tasks, metric_of_tasks
-    from runner.analysis.groups import grouped
+    from runner.analysis.compare.tasks import compare_algorithms
     from runner.export.plots.image import save
     from runner.export.plots.tasks import tasks_sheet
 
     table = scores_of(normalise)
-    groups, notes = grouped(series, across_tasks=True)
     with stage_line("computing intervals") as stage:
-        found = compare_tasks(groups, metric_of_tasks(groups, ()), Moment("last"), table, notes)
+        found = compare_algorithms(series, table)
         stage("drawing")
         write_new(output, force, lambda path: save(tasks_sheet(found), path))
     for note in found.notes:

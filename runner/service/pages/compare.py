@@ -252,10 +252,15 @@ async def replay(
         return link("/compare/replay", {"run": names, "at": str(other)}) if has_one else ""
 
     def show() -> Response:
-        head = _compared(runs, "/replay")
+        head, shown = _compared(runs, "/replay"), []
+        for one, place in zip(head.runs, places, strict=True):
+            source = f"/api/v1/runs/{one.head.id}/replay/{place.episode_path}"
+            with open_recording(one.recording) as recording:
+                phase = "train" if place.after is None else "eval"
+                shown.append(panel_of(recording, phase, source, one.label, one.number))
         view = _ReplaysView(
             head,
-            shown=[_panel(compared, place) for compared, place in zip(head.runs, places, strict=True)],
+            shown=shown,
             episode=step.episode_name,
             prefix=step.episode_text,
             t=step.t,
@@ -333,11 +338,3 @@ def _results(runs: list[Run]) -> Rows:
         ("Training steps", [humanize.number(each.summary.train_steps, 0) for each in runs]),
         ("Content digest", digests),
     ]
-
-
-def _panel(compared: ComparedRun, step: StepRef) -> Panel:
-    """Return the replay of an episode of a run."""
-    source = f"/api/v1/runs/{compared.head.id}/replay/{step.episode_path}"
-    with open_recording(compared.recording) as recording:
-        phase = "train" if step.after is None else "eval"
-        return panel_of(recording, phase, source, compared.label, compared.number)

@@ -235,6 +235,9 @@ def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:
     if run.status == "running" and planned is not None and episodes is not None:
         share = min(1.0, episodes / planned)
         progress = f"{episodes:,} of {planned:,} training episodes"
+    stop: Literal["", "possible", "requested"] = ""
+    if run.status == "running" and not run.can_train_again:
+        stop = "requested" if run.is_stop_requested else "possible"
     return Status(
         facts=facts,
         share=share,
@@ -243,7 +246,7 @@ def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:
         job=number,
         is_live=run.status == "running" or (number is not None and run.status != "finished"),
         run_id=run.run_id,
-        stop=_stop_of(run),
+        stop=stop,
     )
 
 
@@ -252,12 +255,6 @@ def _done_by(run: Run) -> Json:
     with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
         return {**recording.done(), "bytes": recording.size}
     return {}
-
-
-def _stop_of(run: Run) -> Literal["", "possible", "requested"]:
-    if run.can_train_again or run.status != "running":
-        return ""
-    return "requested" if run.is_stop_requested else "possible"
 
 
 def _results(run: Run, last: EvaluationMetrics) -> dict[str, str]:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from fastapi import APIRouter, Request, Response
+from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.sections import Grid
 from runner.analysis.step_reference import StepRef
-from runner.runs.run import Run
 from runner.service import fragments
-from runner.service.api.debugging import ActionPath, At
+from runner.service.api.debugging import At
 from runner.service.api.replay import STEPS
 from runner.service.dependencies import ComputationOf, RecordedRun
 from runner.service.pages.frame import RunView, head_of
@@ -21,6 +21,7 @@ from runner.service.pages.rendering import page
 from runner.service.pages.replay import BEFORE, ShownStep, T, shown_step
 
 router = APIRouter(prefix="/runs/{run}/what-if", include_in_schema=False)
+Action = Annotated[str, Field(max_length=200)]
 
 
 @dataclass(frozen=True)
@@ -47,24 +48,16 @@ class _WhatIfView(RunView):
 
 
 @router.get("/{at}")
-async def what_if(
-    request: Request, run: RecordedRun, compute: ComputationOf, at: At, t: T | None = None
-) -> Response:
-    """Show where each joint action leads, and the replay of the recorded one."""
-    return await _what_if(request, run, compute, at, None, t)
-
-
 @router.get("/{at}/{action}")
-async def branch(
-    request: Request, run: RecordedRun, compute: ComputationOf, at: At, action: ActionPath, t: T | None = None
+async def what_if(
+    request: Request,
+    run: RecordedRun,
+    compute: ComputationOf,
+    at: At,
+    action: Action | None = None,
+    t: T | None = None,
 ) -> Response:
-    """Show where each joint action leads, and the replay of one."""
-    return await _what_if(request, run, compute, at, action, t)
-
-
-async def _what_if(
-    request: Request, run: Run, compute: ComputationOf, at: str, action: str | None, t: int | None
-) -> Response:
+    """Show where each joint action leads, and the replay of one: the recorded one unless it is named."""
     step = StepRef.parse(at)
     shown_t = step.t if t is None else t
     start = max(0, shown_t - BEFORE)
