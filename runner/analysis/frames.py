@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.evaluations import evaluation_records, training_records
+from runner.archive.places import at_hand
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.environments.naming import actions_in_words, states_in_words
@@ -196,17 +197,8 @@ def _opened(run: Source) -> Iterator[Recording]:
     if isinstance(run, Recording):
         yield run
         return
-    with open_recording(_at_hand(run).recording if isinstance(run, Run) else Path(run)) as recording:
+    with open_recording(at_hand(run).recording if isinstance(run, Run) else Path(run)) as recording:
         yield recording
-
-
-def _at_hand(run: Run) -> Run:
-    """Return a run whose recording can be read, also if it is in an archive alone."""
-    if run.status != "archived":
-        return run
-    from runner.archive.places import at_hand
-
-    return at_hand(run)
 
 
 def _frame(data: object) -> pd.DataFrame:

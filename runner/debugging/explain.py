@@ -44,8 +44,8 @@ from runner.execution.initial_tables import resolve_initial_q
 from runner.runs.locking import acquired
 from runner.runs.resolve import find_run
 from runner.runs.run import Run, recordings_folder
+from runner.sweep.cluster import worker_pool
 from runner.sweep.local import Workers
-from runner.sweep.pool import worker_pool
 
 Source = str | os.PathLike[str] | Mapping[str, Any] | ExperimentConfig | Run
 DEFAULT_SEEDS: Final = 20

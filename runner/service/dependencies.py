@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -88,7 +88,7 @@ def recording_state(run: Run) -> tuple[str, int, int]:
     return str(run.recording), stat.st_size, stat.st_mtime_ns
 
 
-def _state_of(argument: Any) -> Hashable:
+def _state_of(argument: object) -> object:
     """Return what changes with an argument of a computation: with the contents of recordings and runs."""
     if isinstance(argument, Run):  # `run.json` may get the duration after the recording is closed
         return *recording_state(argument), argument.summary.seconds
@@ -104,7 +104,7 @@ class Computation:
     def __init__(self, cache: CacheOf, processes: ProcessesOf, spooling: Spooling) -> None:
         self._cache, self._processes, self._spooling = cache, processes, spooling
 
-    async def __call__(self, function: Callable[..., bytes], *args: Any, alone: bool = False) -> bytes:
+    async def __call__(self, function: Callable[..., bytes], *args: object, alone: bool = False) -> bytes:
         """Return the result of a function.
 
         With `alone` it writes large temporary files: one such call runs at a time, and of those that wait
@@ -121,7 +121,7 @@ class Computation:
 
         return await self._cache.get_or_await((function, *map(_state_of, args)), call, ALWAYS)
 
-    async def json(self, function: Callable[..., bytes], *args: Any, alone: bool = False) -> Response:
+    async def json(self, function: Callable[..., bytes], *args: object, alone: bool = False) -> Response:
         """Return the JSON that a function returns as a response."""
         return json_response(await self(function, *args, alone=alone))
 
@@ -136,7 +136,7 @@ class RunComputation(Computation):
         super().__init__(cache, processes, spooling)
         self._path = run.recording
 
-    async def __call__(self, function: Callable[..., bytes], *args: Any, alone: bool = False) -> bytes:
+    async def __call__(self, function: Callable[..., bytes], *args: object, alone: bool = False) -> bytes:
         """Return the result of a function of the recording's path and further arguments."""
         return await super().__call__(function, self._path, *args, alone=alone)
 

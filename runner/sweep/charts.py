@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.groups import Group
-from runner.analysis.series import read_series
+from runner.analysis.series import series_of
 from runner.archive.places import at_hand
 from runner.drawing import palette
 from runner.errors import RunnerError
 from runner.export.plots.chart import SMALL, Canvas, Chart, Scale, labelled, series_colour
 from runner.export.plots.curves import HEIGHT, WIDTH, Plot, panel_chart
 from runner.export.plots.metrics import Panel, panels_of
-from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 from runner.sweep.model import Range
 from runner.sweep.results import Ranked, Results, value_text, values_text
@@ -114,10 +113,8 @@ def learning(results: Results, recordings: Path) -> tuple[list[Group], list[Pane
         raise RunnerError(_nothing_to_draw(results))
     groups = []
     for name, trial in (("median", finished[len(finished) // 2]), ("best", finished[0])):
-        series = []
-        for run_id in trial.runs.values():
-            with open_recording(at_hand(find_run(run_id, recordings)).recording) as recording:
-                series.append(read_series(recording))
+        found = (at_hand(find_run(run_id, recordings)) for run_id in trial.runs.values())
+        series = series_of(run.recording for run in found)
         values = values_text(trial.values)
         groups.append(Group(f"{name}, trial {trial.number}: {values}", tuple(series)))
     return groups, panels_of(groups)

@@ -10,10 +10,11 @@ import os
 import socket
 import threading
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any, Concatenate, Final, Generic, ParamSpec, Self, TypeVar
 
 from runner.errors import RunnerError
-from runner.sweep.local import CLOSE_SECONDS, R, Work
+from runner.sweep.local import CLOSE_SECONDS, LocalWorkers, R, Work, Workers
 from runner.sweep.local import T as TaskT
 from runner.util.extras import require
 
@@ -145,3 +146,16 @@ class RayWorkers(Generic[TaskT, R]):
         if self._busy:
             self._ray.wait(list(self._busy), num_returns=len(self._busy), timeout=CLOSE_SECONDS)
         self._ray.shutdown()
+
+
+def worker_pool(
+    count: int | None, ray: str | None, tasks: int
+) -> AbstractContextManager[Workers[TaskT, R], None]:
+    """Return workers, at most one per task; Ray prints messages about workers that died on stdout.
+
+    There are at most `count`, None for one per processor. `ray` is the address of a cluster, empty for Ray on
+    this machine; None for processes without Ray.
+    """
+    if ray is None:
+        return LocalWorkers(min(count or os.cpu_count() or 1, tasks))
+    return RayWorkers(count, ray or None, tasks)

@@ -113,14 +113,13 @@ def branch_command(
         )
     if run.can_train_again and ("all" in actions or (not isinstance(at, int) and at.after is not None)):
         from runner.analysis.step_reference import reference_to, training_step
-        from runner.cli.what_if import print_what_if
         from runner.recording.reader import open_recording
 
         _refuse_what_training_takes(ctx)
         if isinstance(at, int):
             with open_recording(run.recording) as recording:
                 at = reference_to(recording, training_step(recording, at))
-        print_what_if(run, at, actions, as_json)
+        _print_what_if(run, at, actions, as_json)
         return
     from runner.api import interruptible
     from runner.debugging.branch import branch
@@ -208,3 +207,21 @@ def _print_episode(parent: Run, branch: Branch, as_json: bool) -> None:
         grid.add_row(title, run_id, returns(each), f"{each.length:,}", each.end)
     rows = run_facts(branch.run) | {"branched": f"run {parent.run_id} {branch.origin}"}
     draw(facts(rows), grid, facts({"next": command_for(parent, "diff", branch.run.run_id)}))
+
+
+def _print_what_if(run: Run, at: StepRef, actions: tuple[str, ...], as_json: bool) -> None:
+    """Print where joint actions at a step lead: each of those that are named, or all."""
+    from runner.debugging.what_if import what_if
+
+    with compilation_notice():
+        found = what_if(run, at=at, actions=actions)
+    if as_json:
+        print_json(found.as_json())
+        return
+    grid = found.grid
+    drawn = table(*grid.headings, left=("action", "end"))
+    for row in grid.rows:
+        drawn.add_row(*row)
+    draw(facts({"run": f"{run.run_id}  {run.title}"} | found.facts), "", drawn)
+    for note in found.notes:
+        say(f"Note: {note}.")

@@ -96,9 +96,9 @@ def run(
     """
     from runner.api import interruptible
     from runner.sweep import state
+    from runner.sweep.cluster import worker_pool
     from runner.sweep.loading import load_sweep
     from runner.sweep.plan import limit_of, plan_of, require_disk
-    from runner.sweep.pool import worker_pool
     from runner.sweep.running import run_sweep
     from runner.sweep.search import require_optuna
 
