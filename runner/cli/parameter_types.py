@@ -45,7 +45,7 @@ class Parsed(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generi
     def __init__(self, name: str, expected: str, parse: Callable[[str], Any]) -> None:
         self.name, self.expected, self.parse = name, expected, parse
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the parsed value."""
         try:
             return self.parse(value) if isinstance(value, str) else value

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from runner.client.connection import READ_BYTES, Connection, Report, ServerError, ServerUnavailable
 from runner.client.jobs import JobEvent, RemoteJob, watch
@@ -207,7 +207,7 @@ class Client(Connection):
         """Delete an upload; errors as for `request`."""
         self.request("DELETE", f"/uploads/{upload.id}")
 
-    def _upload(self, method: str, path: str, **options: Any) -> UploadStatus:
+    def _upload(self, method: str, path: str, **options: object) -> UploadStatus:
         response = self.request_object(method, path, **options)
         try:
             return UploadStatus(**{field.name: response[field.name] for field in fields(UploadStatus)})

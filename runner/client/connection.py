@@ -150,7 +150,7 @@ class Connection:
             self._check(response)
             return response
 
-    def request_object(self, method: str, path: str, **options: Any) -> Json:
+    def request_object(self, method: str, path: str, **options: object) -> Json:
         """Return the JSON object that a server responds with; errors as for `request`."""
         response = self.request(method, path, **options)
         try:

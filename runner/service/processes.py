@@ -131,7 +131,7 @@ class ProcessPool:
         future.add_done_callback(lambda _: self._places.release())
         return future
 
-    def _call(self, seconds: float, function: Callable[..., Any], args: Any, keywords: Any) -> Any:
+    def _call(self, seconds: float, function: Callable[..., Any], args: object, keywords: object) -> Any:
         child: ChildProcess | None = self._thread.__dict__.pop("child", None)
         if child is not None and time.monotonic() - self._thread.used < self._keep_seconds:
             with contextlib.suppress(ProcessDied):  # perhaps while it was idle; a new process shows why

@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,7 +134,7 @@ def _nothing_to_draw(results: Results) -> str:
     return f"the sweep {results.sweep.name!r}: nothing to draw, as {reason}."
 
 
-def _axis(path: str, parameter: Range | list[Any], trials: Sequence[Ranked]) -> Axis:
+def _axis(path: str, parameter: Range | list[object], trials: Sequence[Ranked]) -> Axis:
     if isinstance(parameter, Range):
         return Axis(path, (), parameter.log, tuple(float(trial.values[path]) for trial in trials))
     choices = [json.dumps(choice) for choice in parameter]

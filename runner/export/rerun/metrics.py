@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import rerun as rr
@@ -153,7 +153,7 @@ class MetricWriter:
     def _learner_lines(self, phase: str) -> list[str]:
         return [f"{phase} {name}" for name in self._learners] if len(self._learners) > 1 else [phase]
 
-    def _series(self, path: str, rows: Rows, values: Any, names: Sequence[str]) -> None:
+    def _series(self, path: str, rows: Rows, values: object, names: Sequence[str]) -> None:
         self._send(path, _times(rows), np.asarray(values, np.float64), names)
 
     def _send(

@@ -228,7 +228,7 @@ class JobStore:
                     self._insert_state(job)
             return job
 
-    def set_state(self, number: int, state: State, **changes: Any) -> Job:
+    def set_state(self, number: int, state: State, **changes: object) -> Job:
         """Do as `update`; if the disk is full, the change holds until the next start."""
         with contextlib.suppress(StorageError):
             return self.update(number, state=state, **changes)
