@@ -1,32 +1,7 @@
 """The files of an archive, the columns of the tables that are the same in every archive, and encodings.
 
-    <run id>/steps.parquet           every step, in the order taken
-    <run id>/episodes.parquet        the ends of episodes
-    <run id>/train_metrics.parquet   reports on training
-    <run id>/eval_metrics.parquet    evaluations
-    <run id>/optimality.parquet      exact measures of evaluated policies
-    <run id>/q_tables.parquet        snapshots; only position and hash of those that a replay computes
-    <run id>/resets.parquet          of a user's own loop: the resets,
-    <run id>/infos.parquet           the chosen fields of infos,
-    <run id>/scalars.parquet         the logged numbers,
-    <run id>/arrays.parquet          the recorded arrays,
-    <run id>/frames.parquet          the pictures,
-    <run id>/extra_columns.parquet   the names of the values that the loop recorded with its steps,
-    <run id>/extras.parquet          these values,
-    <run id>/reset_states.parquet    what resets without a seed depend on,
-    <run id>/checkpoints.parquet     the references to checkpoints,
-    <run id>/checkpoints/<digest>    and their contents
-    <run id>/log.parquet             lines of text
-    <run id>/clock.parquet           the time that had passed after some steps,
-    <run id>/host.parquet            what was used of the machine,
-    <run id>/console.parquet         the output
-    <run id>/run.parquet             one row: what the run is, its configuration and provenance
-    <run id>/transitions.parquet     the environment's possible outcomes, with their events
-    <run id>/states.parquet          a description of each state
-    <run id>/actions.parquet         a description of each joint action
-    <run id>/metadata.json           the recording's metadata records
-    <run id>/environment/...         the recording's attachments
-    <run id>/manifest.json           written last: sizes and hashes of the others
+The files of a run are in the folder of its id: the tables and other files below, the attachments of the
+recording by their names, and the manifest, which is written last.
 
 A column is for readers, or for restoring the recording; most are for both. Run and phase are columns of each
 table, so that tables of many runs can be read as one.

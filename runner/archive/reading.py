@@ -161,7 +161,11 @@ class Archive(RunDescription):
             with pq.ParquetFile(path, buffer_size=1 << 16, pre_buffer=False) as file:
                 self._check(file, path, columns, rows)
                 for batch in file.iter_batches(n):
-                    _refuse_nulls(batch, path)
+                    for column, values in zip(batch.schema.names, batch.columns, strict=True):
+                        if values.null_count and not layout.may_be_null(column):
+                            raise RecordingError(
+                                f"{path}: found {values.null_count} rows without {column}, expected none."
+                            )
                     yield batch
         except (pa.ArrowException, OSError, OverflowError, MemoryError) as error:
             raise RecordingError(f"{path}: cannot be read as a table ({error}).") from error
@@ -179,9 +183,3 @@ class Archive(RunDescription):
             raise RecordingError(f"{path}: has a group of more than {MAX_ROWS_A_GROUP:,} rows.")
         if rows * max(_ROW_BYTES, layout.row_bytes(columns)) > size * MAX_UNPACKED_RATIO + _UNPACKED_ANYWAY:
             raise RecordingError(f"{path}: {size:,} bytes declare {rows:,} rows; made to exhaust the disk.")
-
-
-def _refuse_nulls(batch: pa.RecordBatch, path: Path) -> None:
-    for name, column in zip(batch.schema.names, batch.columns, strict=True):
-        if column.null_count and not layout.may_be_null(name):
-            raise RecordingError(f"{path}: found {column.null_count} rows without {name}, expected none.")

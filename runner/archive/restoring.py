@@ -92,7 +92,12 @@ class _Restorer:
     def restore(self) -> None:
         """Restore everything, and compare its hashes with those of the manifest."""
         try:
-            self._describe()
+            if self._file is not None:
+                for name in self._archive.metadata_names:
+                    if name != "result":
+                        self._file.add_metadata(name, self._archive.metadata(name))
+                for name, media_type in self._archive.attachments:
+                    self._file.add_attachment(name, media_type, self._archive.attachment(name))
             for table in self._shape.tables:
                 self._restore_table(table)
                 self._batches.flush()
@@ -104,15 +109,6 @@ class _Restorer:
             names = self._archive.metadata_names
             result = self._archive.metadata("result") if "result" in names else None
             self._file.finish("" if result is None else "result", result)
-
-    def _describe(self) -> None:
-        if self._file is None:
-            return
-        for name in self._archive.metadata_names:
-            if name != "result":
-                self._file.add_metadata(name, self._archive.metadata(name))
-        for name, media_type in self._archive.attachments:
-            self._file.add_attachment(name, media_type, self._archive.attachment(name))
 
     def _restore_table(self, table: Table) -> None:
         if table.name in layout.LEFT_OUT_IF_EMPTY and not self._archive.count(*table.topics):

@@ -135,9 +135,6 @@ class _ArchiveWriter:
         self._copy_contents()
         topics = self._batches.entries
         self._compare(topics)
-        return self._manifest(topics)
-
-    def _manifest(self, topics: dict[str, Entry]) -> Manifest:
         facts = self._recording.run_facts() | {"name": self._recording.name}
         run = {key: facts[key] for key in ("run_id", "name", "seed", "created", "status")}
         run |= {"content_digest": self._recording.result.content_digest, "lost": self._recording.lost}

@@ -211,7 +211,10 @@ def put(document: Document, values: Sequence[tuple[tuple[str, ...], Document]]) 
     assigned: set[str] = set()
     for path, read in values:
         assigned.add(path[0])
-        for rival in _rivals(path, read.value):
+        rivals = _RIVALS.get(path[0], ())
+        if path == ("algorithm",):  # the sections of all others
+            rivals = tuple(key for key, section in SECTION_OF.items() if section.algorithm != read.value)
+        for rival in rivals:
             if rival not in assigned:
                 document.value = {key: each for key, each in document.value.items() if key != rival}
                 document.problems = _without(document.problems, (rival,))
@@ -221,13 +224,6 @@ def put(document: Document, values: Sequence[tuple[tuple[str, ...], Document]]) 
                 place = {here: place for here, place in read.places.items() if not here}
                 _assign(document, path[:length], Document(start, place))
         _assign(document, path, read)
-
-
-def _rivals(path: tuple[str, ...], value: object) -> tuple[str, ...]:
-    """Return the keys that an override removes: that of the algorithm, the sections of all others."""
-    if path == ("algorithm",):
-        return tuple(key for key, section in SECTION_OF.items() if section.algorithm != value)
-    return _RIVALS.get(path[0], ())
 
 
 def _parse(text: str) -> tuple[tuple[str, ...], Document]:

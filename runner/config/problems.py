@@ -50,7 +50,8 @@ def problems_in(error: ValidationError, value: object, schema: Schema | None = N
     for path, detail in zip(paths, details, strict=True):
         if detail["type"] == _FOLLOWS:
             continue
-        if detail["type"] == "missing" and any(_meant(path, other) for other in unknown):
+        near = [other[-1] for other in unknown if other[:-1] == path[:-1]]
+        if detail["type"] == "missing" and any(_hint(str(key), [str(path[-1])]) for key in near):
             continue
         if detail["type"] == "too_short" and any(other[:-1] == path for other in paths if other):
             continue
@@ -131,10 +132,6 @@ def _at(value: Any, path: Path) -> Any:
     for part in path:
         value = value[part]
     return value
-
-
-def _meant(missing: Path, unknown: Path) -> bool:
-    return missing[:-1] == unknown[:-1] and bool(_hint(str(unknown[-1]), [str(missing[-1])]))
 
 
 def _hint(key: str, known: Sequence[str]) -> str:

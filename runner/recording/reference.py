@@ -136,7 +136,8 @@ def _message_difference(topic: Topic, found: tuple[int, bytes], expected: tuple[
     if found[0] != expected[0]:
         return Diverged(topic.name, "log_time", found[0], expected[0], **place)
     for name in should:
-        if was[name] != should[name] and not _both_nan(was[name], should[name]):
+        are_nan = was[name] != was[name] and should[name] != should[name]
+        if was[name] != should[name] and not are_nan:
             field, left, right = (
                 _cell_difference(was, should) if name == "data" else (name, was[name], should[name])
             )
@@ -153,10 +154,6 @@ def _cell_difference(found: Message, expected: Message) -> tuple[str, object, ob
     cell = int(np.argmax(left.view("<i8") != right.view("<i8")))
     state, action = divmod(cell, int(expected["shape"][-1]))
     return f"data[{state}, {action}]", float(left[cell]), float(right[cell])
-
-
-def _both_nan(left: object, right: object) -> bool:
-    return isinstance(left, float) and left != left and right != right  # noqa: PLR0124
 
 
 def _place(record: np.void) -> dict[str, int]:

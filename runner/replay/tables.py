@@ -6,6 +6,7 @@ with runner.open_recording(path) as recording:
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Final
 
 import numpy as np
@@ -152,7 +153,9 @@ def known_steps(recording: Recording) -> list[tuple[int, int]]:
     lost = sorted((start, stop) for start, stop in recording.lost.get(schema.TRAIN_STEP.name, []))
     recorded = recording.count(schema.TRAIN_STEP)
     found: list[tuple[int, int]] = []
-    for first in _snapshot_steps(recording):
+    tables = len(recording.agents) * len(kinds_of(from_mapping(recording.config)))
+    counts = Counter(snapshot.step for snapshot in recording.snapshots(0, tables))
+    for first in sorted(step for step, count in counts.items() if count == tables):
         reach = next((start for start, stop in lost if stop > first), recorded)
         last = max(first, min(reach, recorded))
         if found and first <= found[-1][1] + 1:
@@ -184,11 +187,3 @@ def _snapshot_before(
     if not nearest:
         return None
     return nearest[0].step, held_of([table.values for table in nearest], kinds)
-
-
-def _snapshot_steps(recording: Recording) -> list[int]:
-    tables = len(recording.agents) * len(kinds_of(from_mapping(recording.config)))
-    counts: dict[int, int] = {}
-    for snapshot in recording.snapshots(0, tables):
-        counts[snapshot.step] = counts.get(snapshot.step, 0) + 1
-    return sorted(step for step, count in counts.items() if count == tables)

@@ -98,7 +98,9 @@ def read_repository(
     git.folder = root
     try:
         _read_remote_and_filters(git, repository)
-        _read_changes(git, repository)
+        status = ("--porcelain=v1", "-z", "--untracked-files=all", "--no-renames", _IGNORE_SUBMODULES)
+        for entry in filter(None, git.run("status", *status, limit=_MAX_STATUS_BYTES).split("\0")):
+            (repository.untracked if entry[:2] == "??" else repository.changed).append(entry[3:])
         if paths := used(root):
             text = git.run("ls-files", "-z", "--", *(f":(literal){path}" for path in paths))
             known = {*text.split("\0"), *repository.untracked}
@@ -132,15 +134,6 @@ def _read_remote_and_filters(git: _Git, repository: Repository) -> None:
         raise NotRecorded("a filter is configured whose name has a '='")
     for name in sorted(filters):
         git.settings += [f"filter.{name}.{key}=" for key in _EMPTY_VALUES] + [f"filter.{name}.required=false"]
-
-
-def _read_changes(git: _Git, repository: Repository) -> None:
-    """Read which files are changed and which are untracked."""
-    options = ("--porcelain=v1", "-z", "--untracked-files=all", "--no-renames", _IGNORE_SUBMODULES)
-    text = git.run("status", *options, limit=_MAX_STATUS_BYTES)
-    for entry in text.split("\0"):
-        if entry:
-            (repository.untracked if entry[:2] == "??" else repository.changed).append(entry[3:])
 
 
 def _reason(message: str) -> str:

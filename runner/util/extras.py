@@ -70,7 +70,11 @@ def install_command(extra: str) -> str:
     origin: Json = json.loads(distribution.read_text("direct_url.json") or "{}")
     url = str(origin.get("url", ""))
     if origin.get("dir_info", {}).get("editable"):
-        return _command(_installer(distribution), _clone(_path_of(url), extra))
+        from urllib.parse import urlsplit
+        from urllib.request import url2pathname
+
+        clone = Path(url2pathname(urlsplit(url).path))
+        return _command(_installer(distribution), _clone(clone, extra))
     if not url and (code / "pyproject.toml").is_file():
         return _command(_installer(distribution), _clone(code, extra))
     wanted = f"{_PROJECT}[{extra}]"
@@ -113,13 +117,6 @@ def _command(installer: str, requirement: list[str]) -> str:
 def _clone(clone: Path, extra: str) -> list[str]:
     """Return the arguments that install an extra of a clone."""
     return ["--editable", f"{_short(clone)}[{extra}]"]
-
-
-def _path_of(url: str) -> Path:
-    from urllib.parse import urlsplit
-    from urllib.request import url2pathname
-
-    return Path(url2pathname(urlsplit(url).path))
 
 
 def _short(path: Path) -> str:

@@ -169,7 +169,10 @@ class ChildProcess:
             limit = f"{self._memory_bytes / (1 << 30):g} GiB"
             raise OutOfMemory(f"this needs more than {limit} of memory, and was given up; ask for less.")
         if kind == "error":
-            raise _rebuilt(*result)
+            cls, arguments, attributes = result
+            error = cls.__new__(cls, *arguments)  # its constructor may take other arguments
+            vars(error).update(attributes)
+            raise error
         if kind == "unexpected":
             raise RuntimeError(result)
         return result
@@ -225,21 +228,8 @@ def _limit_memory(more_bytes: int) -> None:
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 
-        limit = _allocated_bytes() + more_bytes
+        limit = more_bytes
+        with contextlib.suppress(OSError):  # stacks and buffers of libraries count already, by the core
+            lines = Path("/proc/self/status").read_text().splitlines()
+            limit += sum(int(line.split()[1]) << 10 for line in lines if line.startswith("VmData:"))
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
-
-
-def _allocated_bytes() -> int:
-    """Return what counts against `RLIMIT_DATA` already: stacks and buffers of libraries, by the core."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmData:"):
-                return int(line.split()[1]) << 10
-    return 0
-
-
-def _rebuilt(kind: type[Exception], args: tuple[object, ...], attributes: dict[str, object]) -> Exception:
-    """Return an error as it was in the other process; its constructor may take other arguments."""
-    error = kind.__new__(kind, *args)
-    vars(error).update(attributes)
-    return error
