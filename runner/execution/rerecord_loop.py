@@ -167,9 +167,5 @@ def _fill_states(records: NDArray[np.void], piece: Piece, states: NDArray[np.int
 
 def _record(recorder: Recorder, topic: schema.Topic, records: NDArray[np.void]) -> None:
     """Hand whole records to the recorder."""
-    positions, done = records["log_time"] // schema.STEP_NANOSECONDS, 0
-    while done < len(records):
-        block = recorder.block(topic)[: len(records) - done]
-        block[:] = records[done : done + len(block)]
-        recorder.take(topic, positions[done : done + len(block)])
-        done += len(block)
+    for block, part in recorder.fill(topic, records["log_time"] // schema.STEP_NANOSECONDS):
+        block[:] = records[part]

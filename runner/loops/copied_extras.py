@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import ConfigError
+from runner.loops.extras import TOPICS, begin_layout
 from runner.loops.shard_sources import PHASES, Source
-from runner.recording import schema
 from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAME_LENGTH, MAX_NAMES, ExtraLayout
-from runner.recording.messages import encode
 from runner.recording.recorder import Recorder
 
 
@@ -62,18 +61,11 @@ class CopiedExtras:
         if not len(rows):
             return
         if not self._is_described:
-            payload = encode(schema.EXTRA_COLUMNS, {"json": self._layout.json})
-            self._recorder.append(schema.EXTRA_COLUMNS_TOPIC, payload, new_position + int(rows[0]) + 1)
-            self._recorder.flush_messages()
-            topics = (schema.TRAIN_EXTRA, schema.EVAL_EXTRA)
-            self._recorder.resize(dict.fromkeys(topics, self._layout.sizes))
+            begin_layout(self._recorder, self._layout, new_position + int(rows[0]) + 1)
             self._is_described = True
-        topic = schema.TRAIN_EXTRA if phase == "train" else schema.EVAL_EXTRA
-        while len(rows):
-            block = self._recorder.block(topic)[: len(rows)]
-            part, rows = rows[: len(block)], rows[len(block) :]
-            block["step"] = new_step + part
+        positions = (new_position + rows + 1).astype(np.uint64)
+        for block, part in self._recorder.fill(TOPICS[phase], positions):
+            block["step"] = new_step + rows[part]
             for name in self._layout.names:
-                block["given"][name] = given[name][part] if name in given else False
-                block["values"][name] = values[name].data[part] if name in given else 0
-            self._recorder.take(topic, (new_position + part + 1).astype(np.uint64))
+                block["given"][name] = given[name][rows[part]] if name in given else False
+                block["values"][name] = values[name].data[rows[part]] if name in given else 0

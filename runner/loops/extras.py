@@ -31,7 +31,7 @@ _MAX_DIMENSIONS: Final = 8
 _PYTHON: Final = {bool: "?", int: "<i8", float: "<f8"}
 _CODES: Final = {"b": "?", "i": "bhiq", "u": "BHIQ", "f": " efd"}
 """The codes of `struct` by the kind of a dtype, from 1 byte to 8."""
-_TOPICS: Final = {"train": schema.TRAIN_EXTRA, "eval": schema.EVAL_EXTRA}
+TOPICS: Final = {"train": schema.TRAIN_EXTRA, "eval": schema.EVAL_EXTRA}
 
 Put = Callable[[object], None]
 """Adds a value to its column, or raises `ConfigError`."""
@@ -245,26 +245,18 @@ class Extras:
         self, steps: NDArray[np.int64], columns: Mapping[str, Array], given: Mapping[str, NDArray[np.bool_]]
     ) -> None:
         """Hand the values with these steps, and whether each was given, to the recorder."""
-        topic, recorder = _TOPICS[self._phase], self._recorder
+        topic, recorder = TOPICS[self._phase], self._recorder
         # The steps of the other phase came before all of these.
         first = sum(recorder.steps.values()) - recorder.steps[self._phase] + 1
         if not self._is_described:
             layout = ExtraLayout(0, np.dtype(list(self._dtypes.items())))
-            payload = encode(schema.EXTRA_COLUMNS, {"json": layout.json})
-            recorder.append(schema.EXTRA_COLUMNS_TOPIC, payload, first + int(steps[0]))
-            recorder.flush_messages()
-            recorder.resize(dict.fromkeys(_TOPICS.values(), layout.sizes))
+            begin_layout(recorder, layout, first + int(steps[0]))
             self._is_described = True
-        done = 0
-        while done < len(steps):
-            block = recorder.block(topic)[: len(steps) - done]
-            part = slice(done, done + len(block))
+        for block, part in recorder.fill(topic, (steps + first).astype(np.uint64)):
             block["step"] = steps[part]
             for name, values in columns.items():
                 block["values"][name] = values[part]
                 block["given"][name] = given[name][part]
-            recorder.take(topic, (steps[part] + first).astype(np.uint64))
-            done += len(block)
         self._final[self._phase] = int(steps[-1])
 
     def _given(self, n: int) -> dict[str, NDArray[np.bool_]]:
@@ -274,6 +266,14 @@ class Extras:
             for name in given.keys() - names if row < n else ():
                 given[name][row] = False
         return {name: np.repeat(flags, self._n) for name, flags in given.items()}
+
+
+def begin_layout(recorder: Recorder, layout: ExtraLayout, position: int) -> None:
+    """Record the names of extras from a position on."""
+    payload = encode(schema.EXTRA_COLUMNS, {"json": layout.json})
+    recorder.append(schema.EXTRA_COLUMNS_TOPIC, payload, position)
+    recorder.flush_messages()
+    recorder.resize(dict.fromkeys(TOPICS.values(), layout.sizes))
 
 
 def _putter(name: str, base: np.dtype[np.generic], shape: tuple[int, ...], column: list[bytes]) -> Put:

@@ -369,15 +369,9 @@ class VectorRows:
     def _record(self, topic: Topic, columns: Mapping[str, Array], steps: Array) -> None:
         """Hand records, given by field, to the recorder; `steps` are the steps of the phase at each."""
         other = sum(self._recorder.steps.values()) - self._recorder.steps[self._phase]
-        positions = (steps + other).astype(np.uint64)
-        done, n = 0, len(positions)
-        while done < n:
-            block = self._recorder.block(topic)[: n - done]
-            part = slice(done, done + len(block))
+        for block, part in self._recorder.fill(topic, (steps + other).astype(np.uint64)):
             for name, values in columns.items():
                 block[name] = values[part]
-            self._recorder.take(topic, positions[part])
-            done += len(block)
 
 
 PhaseRows = Rows | VectorRows

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
@@ -183,6 +183,16 @@ class Recorder:
         free = lane.open.records[lane.open.filled :]
         already = self._reference.remaining(topic)
         return free[:already] if already else free
+
+    def fill(self, topic: Topic, positions: NDArray[np.uint64]) -> Iterator[tuple[NDArray[np.void], slice]]:
+        """Yield blocks to fill with the records of a slice; `take` follows with `positions`, one a record."""
+        done, n = 0, len(positions)
+        while done < n:
+            block = self.block(topic)[: n - done]
+            part = slice(done, done + len(block))
+            yield block, part
+            self.take(topic, positions[part])
+            done = part.stop
 
     def capacity(self, topic: Topic) -> int:
         """Return how many records a whole block of a fixed-width topic has."""
