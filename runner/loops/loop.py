@@ -51,17 +51,9 @@ class _IgnoredRows:
 class Loop(Generic[R]):
     """A loop that is being recorded; safe to use from several threads.
 
-    Args:
-        described: the environment and its spaces.
-        options: how to record it.
-        maker: how it was made.
-        make_rows: returns the rows of a phase for recorder, description, phase and what to call with the
-            first action.
-        batch: (N,) for N environments that step at once, else ().
-
-    Raises:
-        ConfigError: the steps of this environment, or of a shard, cannot be left out.
-        StorageError: the recordings folder cannot be written.
+    `make_rows`: returns the rows of a phase for recorder, description, phase and what to call with the first
+    action.
+    `batch`: (N,) for N environments that step at once, else ().
     """
 
     should_stop = False
@@ -122,11 +114,7 @@ class Loop(Generic[R]):
     # --- what is recorded -----------------------------------------------------------------------------
 
     def rows(self, phase: str) -> R:
-        """Return the rows of a phase.
-
-        Raises:
-            ConfigError: there is no such phase.
-        """
+        """Return the rows of a phase."""
         check_phase(phase)
         with self.lock:
             if phase not in self._rows:
@@ -155,12 +143,7 @@ class Loop(Generic[R]):
         self.active = rows
 
     def note(self, phase: str, rows: R, values: Mapping[str, object]) -> None:
-        """Record values with the last step of a phase.
-
-        Raises:
-            ConfigError: a name or a value cannot be recorded.
-            RunnerError: there is no such step any more, or the loop is closed.
-        """
+        """Record values with the last step of a phase."""
         with self.lock:
             if self.records() and self.position and self.active is not rows:
                 raise RunnerError(
@@ -175,21 +158,13 @@ class Loop(Generic[R]):
 
     @property
     def position(self) -> int:
-        """The number of steps executed so far.
-
-        Raises:
-            RunnerError: the loop is closed.
-        """
+        """The number of steps executed so far."""
         if self.closed:
             raise RunnerError(f"run {self.run.run_id} is closed: nothing more can be recorded in it.")
         return sum(self._recorder.steps.values()) + (self.active.filled if self.active else 0)
 
     def moment(self, rows: PhaseRows) -> tuple[int, int, int]:
-        """Return `position`, and the steps and the episode of a phase.
-
-        Raises:
-            RunnerError: the loop is closed.
-        """
+        """Return `position`, and the steps and the episode of a phase."""
         step, episode = rows.place
         if (active := self.active) is None:
             return self.position, step, episode
@@ -197,12 +172,7 @@ class Loop(Generic[R]):
         return counts["train"] + counts["eval"] + counts["elsewhere"] + active.filled, step, episode
 
     def at_step(self, steps: int) -> None:
-        """State how many training steps the whole run had when what is recorded from now on happened.
-
-        Raises:
-            ConfigError: it is no number of steps, or lower than before.
-            RunnerError: this process takes training steps itself, or the loop is closed.
-        """
+        """State how many training steps the whole run had when what is recorded from now on happened."""
         with self.lock:
             if not self.records():
                 return
@@ -279,9 +249,6 @@ class Loop(Generic[R]):
         """Write everything and the status, once; return the run.
 
         A forked process only returns the run: the recording belongs to the process it was forked from.
-
-        Raises:
-            StorageError: the disk is full or failing; what was written is kept.
         """
         if self.is_foreign:
             return self.run

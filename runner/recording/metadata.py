@@ -60,14 +60,10 @@ def run_metadata(
 ) -> dict[str, str]:
     """Return the entries of the metadata record `run` that every recording has.
 
-    Args:
-        run_id: its id.
-        name: its first name.
-        seed: its job's seed; None for a loop without one.
-        job: the identity of its job.
-        created: when it began, in ISO format.
-        agents: the learners: one reward each.
-        events: number of event counters of an episode.
+    `seed`: its job's seed; None for a loop without one.
+    `job`: the identity of its job.
+    `agents`: the learners: one reward each.
+    `events`: number of event counters of an episode.
     """
     return {
         "format_version": str(schema.FORMAT_VERSION),
@@ -84,11 +80,7 @@ def run_metadata(
 
 
 def check_file(run: Mapping[str, str], index: Index, path: str) -> None:
-    """Check the metadata record `run` of a file, and that it has the channels of its kind of recording.
-
-    Raises:
-        RecordingError: it is of another version, is damaged, or has another channel.
-    """
+    """Check the metadata record `run` of a file, and that it has the channels of its kind of recording."""
     check_run(run, path)
     topics = {topic.channel: topic.name for topic in schema.KINDS[kind_of(run)]}
     for number, channel in index.channels.items():
@@ -100,11 +92,7 @@ def check_file(run: Mapping[str, str], index: Index, path: str) -> None:
 
 
 def check_run(run: Mapping[str, str], path: str) -> None:
-    """Check that a metadata record `run` is of this version, with all entries and values that are possible.
-
-    Raises:
-        RecordingError: it is not.
-    """
+    """Refuse a metadata record `run` of another version, or without all entries with possible values."""
     version = run.get("format_version", "?")
     if version != str(schema.FORMAT_VERSION):
         raise RecordingError(
@@ -147,11 +135,7 @@ def kind_of(run: Mapping[str, str]) -> str:
 
 
 def spaces_of(run: Mapping[str, str], path: str) -> Json:
-    """Return the descriptions of the spaces, `observation` and `action`, that a loop's recording has.
-
-    Raises:
-        RecordingError: they are missing, or describe no spaces.
-    """
+    """Return the descriptions of the spaces, `observation` and `action`, that a loop's recording has."""
     spaces = json_object(run.get("spaces"), f"{path}: the spaces of its run")
     for name in ("observation", "action"):
         leaves_of(spaces.get(name), f"{path}: the {name} space")
@@ -159,22 +143,14 @@ def spaces_of(run: Mapping[str, str], path: str) -> Json:
 
 
 def sizes_of(run: Mapping[str, str], path: str) -> dict[Topic, Sizes]:
-    """Return the sizes of each fixed-width topic of a recording, as `record_dtype` takes them.
-
-    Raises:
-        RecordingError: its spaces are not described.
-    """
+    """Return the sizes of each fixed-width topic of a recording, as `record_dtype` takes them."""
     kind = kind_of(run)
     spaces = spaces_of(run, path) if kind in _FIXED_KINDS else {}
     return sizes_in(kind, int(run["learners"]), int(run["events"]), spaces, path)
 
 
 def sizes_in(kind: str, learners: int, events: int, spaces: JsonView, path: str) -> dict[Topic, Sizes]:
-    """Return what `sizes_of` returns, of a recording of this kind, whose spaces have these descriptions.
-
-    Raises:
-        RecordingError: a space is not described.
-    """
+    """Return what `sizes_of` returns, of a recording of this kind, whose spaces have these descriptions."""
     action = observation = None
     if kind in _FIXED_KINDS:
         action, observation = (
@@ -190,11 +166,7 @@ def sizes_in(kind: str, learners: int, events: int, spaces: JsonView, path: str)
 
 
 def json_object(text: str | bytes | None, what: str) -> dict[str, object]:
-    """Return the JSON object in a text.
-
-    Raises:
-        RecordingError: it holds none, is too long or nested too deeply; the message names `what`.
-    """
+    """Return the JSON object in a text."""
     try:
         if text is None or len(text) > MAX_METADATA_BYTES:
             raise ValueError("it is missing, or too long")
@@ -207,11 +179,7 @@ def json_object(text: str | bytes | None, what: str) -> dict[str, object]:
 
 
 def lost_ranges(repair: Mapping[str, object], path: str) -> dict[str, list[list[int]]]:
-    """Return the messages that a repair could not save: by topic, ranges (first, stop) of their numbers.
-
-    Raises:
-        RecordingError: the metadata record has no such ranges.
-    """
+    """Return the messages that a repair could not save: by topic, ranges (first, stop) of their numbers."""
 
     def are_ranges(value: object) -> bool:
         if not isinstance(value, list) or not all(isinstance(one, list) and len(one) == 2 for one in value):
@@ -244,11 +212,7 @@ def _indented(text: str) -> str:
 
 
 def environment_description(text: bytes, path: str) -> dict[str, object]:
-    """Return the description in `environment.json`.
-
-    Raises:
-        RecordingError: it does not name the environment's arrays and events.
-    """
+    """Return the description in `environment.json`."""
     description = json_object(text, f"{path}: environment.json")
     for key in ("arrays", "event_names", "success_events"):
         names = description.get(key)
@@ -258,17 +222,7 @@ def environment_description(text: bytes, path: str) -> dict[str, object]:
 
 
 def environment_of(description: JsonView, attachment: Callable[[str], bytes], path: str) -> Mdp:
-    """Return the environment that a recording describes.
-
-    Args:
-        description: as `environment_description` returns it.
-        attachment: returns an attachment by its name.
-        path: of the recording, for errors.
-
-    Raises:
-        RecordingError: an array is missing, damaged or too large.
-        EnvironmentNotUsable: the parts contradict each other.
-    """
+    """Return the environment that a recording describes."""
     if not description["arrays"]:
         raise RecordingError(
             f"{path}: has no transition table of {description.get('env_id')}, which is not tabular: it was "
@@ -299,11 +253,7 @@ def _packed_packages(packages: tuple[tuple[str, str], ...]) -> str:
 
 
 def unpacked_provenance(entries: Mapping[str, str], path: str) -> dict[str, str]:
-    """Return the provenance in the entries of its record, of earlier recordings too.
-
-    Raises:
-        RecordingError: the versions of packages are damaged.
-    """
+    """Return the provenance in the entries of its record, of earlier recordings too."""
     others = dict(entries)
     what = f"{path}: the packages of its provenance"
     try:
@@ -330,11 +280,7 @@ def write_description(
     environment: Attachments,
     maker: EnvironmentMaker | None = None,
 ) -> None:
-    """Write what makes a recording self-contained; `maker` is how a loop's environment was made.
-
-    Raises:
-        StorageError: the disk is full or failing.
-    """
+    """Write what makes a recording self-contained; `maker` is how a loop's environment was made."""
     try:
         file.add_metadata("run", run)
         file.add_metadata("config", _json_entry(config))
@@ -349,11 +295,7 @@ def write_description(
 
 
 def write_maker(file: RecordingFile, phase: str, maker: EnvironmentMaker) -> None:
-    """Write how the environment of a phase was made, if it has one of its own.
-
-    Raises:
-        StorageError: the disk is full or failing.
-    """
+    """Write how the environment of a phase was made, if it has one of its own."""
     try:
         file.add_metadata(f"{MAKER_RECORD}/{phase}", maker.to_metadata())
     except OSError as error:
@@ -363,11 +305,7 @@ def write_maker(file: RecordingFile, phase: str, maker: EnvironmentMaker) -> Non
 def write_result(
     file: RecordingFile, status: str, result: Mapping[str, object], *, synced: bool = True
 ) -> None:
-    """Write how the run ended, the index and the summary; `synced` is as for `RecordingFile.finish`.
-
-    Raises:
-        StorageError: the disk is full or failing; nothing of the result is written then.
-    """
+    """Write how the run ended, the index and the summary; `synced` is as for `RecordingFile.finish`."""
     try:
         file.finish("result", _json_entry({"status": status, **result}), synced=synced)
     except OSError as error:

@@ -59,14 +59,11 @@ class _Work:
 class Pipeline:
     """Takes whole message records in order; `close` waits until all is written.
 
-    Args:
-        file: the file that chunks are written to; None for the digest alone.
-        packing: how chunks are packed.
-        beat: called about once a second from the writer's thread, or when something is sent.
-        threads: False makes the sender do the work.
-        before: called once, before anything is written. With it, the pipeline holds up to `MAX_HELD` pieces
-            of work until `release`; only then are threads started, so a recording that is closed earlier
-            needs none.
+    `file`: the file that chunks are written to; None for the digest alone.
+    `beat`: called about once a second from the writer's thread, or when something is sent.
+    `threads`: False makes the sender do the work.
+    `before`: called once, before anything is written. With it, the pipeline holds up to `MAX_HELD` pieces of
+    work until `release`; only then are threads started, so a recording that is closed earlier needs none.
     """
 
     def __init__(
@@ -110,13 +107,10 @@ class Pipeline:
     ) -> None:
         """Send message records of one topic; waits while too much is pending.
 
-        Args:
-            topic: the topic of all of them.
-            records: their bytes; must not change until `done` is called.
-            log_times: nanoseconds, one a record.
-            offsets: where each begins.
-            write: False leaves them out of the file; the digest covers them all the same.
-            done: called when they were written, by the thread that writes.
+        `records`: their bytes; must not change until `done` is called.
+        `log_times`: nanoseconds, one a record.
+        `write`: False leaves them out of the file; the digest covers them all the same.
+        `done`: called when they were written, by the thread that writes.
         """
         encode = None
         if write and self._file is not None:
@@ -126,10 +120,7 @@ class Pipeline:
     def submit(self, topic: Topic, make: Callable[[], bytes], log_time: int) -> None:
         """Send one message of a topic that an encoder thread makes; waits while too much is pending.
 
-        Args:
-            topic: its topic, which the digest must not cover.
-            make: returns the message.
-            log_time: nanoseconds.
+        `topic`: its topic, which the digest must not cover.
         """
         assert not topic.digested
 
@@ -165,11 +156,7 @@ class Pipeline:
         return not self._closed and (self._writer is None or self._writer.is_alive())
 
     def raise_failure(self) -> None:
-        """Raise the error that stopped the writing, if there was one.
-
-        Raises:
-            StorageError: the disk is full or failing.
-        """
+        """Raise the error that stopped the writing, if there was one."""
         if isinstance(self.failure, OSError) and self._file is not None:
             raise storage_error(self._file, self.failure) from self.failure
         if self.failure is not None:
@@ -250,11 +237,7 @@ class _Batch:
 
 
 class MessageBatches:
-    """Messages of variable size that share chunks: some thousands of a topic, or some hundred kilobytes.
-
-    Args:
-        send: called with each batch that is full, or flushed.
-    """
+    """Messages of variable size that share chunks: some thousands of a topic, or some hundred kilobytes."""
 
     def __init__(self, send: Send) -> None:
         self._send = send

@@ -70,23 +70,19 @@ class _Lane:
 class Recorder:
     """Records one run; at its end call `drain`, or `abandon`.
 
-    Args:
-        file: the recording to write; None records nothing but the digest.
-        learners: number of reward columns.
-        events: number of event counters.
-        packing: how chunks are packed, and their most steps.
-        record_steps: False keeps the steps' digest but not the steps.
-        reference: what the recording already holds.
-        beat: called about once a second while the recorder is in use, by the thread that writes.
-        sizes: the fixed-width topics of the recording; those of a job by default.
-        threads: False packs and writes in the thread that records.
-        watch: called with the records of a block as they are committed; the block is used again.
-        before: called once, before the first message is written. With it, threads are started and messages
-            written only when some have gathered, or by `release`, so that a short recording costs little.
-        clock: whether to record the time that passes.
-        system: whether to record what the process uses of its machine; only with the clock.
-        console: returns a line of the process's output as it is to be recorded, without secrets; None
-            records no output. Only with the clock.
+    `file`: the recording to write; None records nothing but the digest.
+    `record_steps`: False keeps the steps' digest but not the steps.
+    `reference`: what the recording already holds.
+    `beat`: called about once a second while the recorder is in use, by the thread that writes.
+    `sizes`: the fixed-width topics of the recording; those of a job by default.
+    `threads`: False packs and writes in the thread that records.
+    `watch`: called with the records of a block as they are committed; the block is used again.
+    `before`: called once, before the first message is written. With it, threads are started and messages
+    written only when some have gathered, or by `release`, so that a short recording costs little.
+    `clock`: whether to record the time that passes.
+    `system`: whether to record what the process uses of its machine; only with the clock.
+    `console`: returns a line of the process's output as it is to be recorded, without secrets; None records
+    no output. Only with the clock.
     """
 
     def __init__(
@@ -156,19 +152,11 @@ class Recorder:
                 self._lanes[topic] = self._lane(topic, own, lane.write)
 
     def release(self) -> None:
-        """Write what was held back, and hold nothing back from now on.
-
-        Raises:
-            StorageError: the disk is full or failing.
-        """
+        """Write what was held back, and hold nothing back from now on."""
         self._pipeline.release()
 
     def raise_failure(self) -> None:
-        """Raise the error that stopped the writing, if there was one.
-
-        Raises:
-            StorageError: the disk is full or failing.
-        """
+        """Raise the error that stopped the writing, if there was one."""
         self._pipeline.raise_failure()
 
     def blank(self, topic: Topic, n: int) -> NDArray[np.void]:
@@ -240,13 +228,7 @@ class Recorder:
     def extend(self, topic: Topic, payloads: Sequence[bytes], positions: Sequence[int]) -> None:
         """Record messages of variable size, in a chunk with others of their topic.
 
-        Args:
-            topic: their topic.
-            payloads: the messages.
-            positions: for each message the number of steps executed so far.
-
-        Raises:
-            StorageError: the disk is full or failing; everything before is kept.
+        `positions`: for each message the number of steps executed so far.
         """
         self._pipeline.raise_failure()
         self._batches.extend(topic, [position * STEP_NANOSECONDS for position in positions], payloads)
@@ -257,9 +239,6 @@ class Recorder:
         """Record one message that is made by a thread of the recorder.
 
         Its topic must be one that the digest does not cover.
-
-        Raises:
-            StorageError: the disk is full or failing; everything before is kept.
         """
         self._pipeline.raise_failure()
         self.counts[topic.name] += 1
@@ -283,11 +262,7 @@ class Recorder:
         self._last_flush = time.monotonic()
 
     def drain(self) -> dict[str, str]:
-        """Write everything committed, stop the threads, and return the hash of each topic.
-
-        Raises:
-            StorageError: the disk is full or failing; everything before is kept.
-        """
+        """Write everything committed, stop the threads, and return the hash of each topic."""
         self._record_machine(is_last=True)
         self._send_open()
         self._pipeline.close()
@@ -331,9 +306,7 @@ class Recorder:
     def take(self, topic: Topic, positions: NDArray[np.uint64]) -> None:
         """Take the next filled records of the topic's block: set their times, compare or keep them.
 
-        Args:
-            topic: a fixed-width topic.
-            positions: for each record the number of steps executed so far, 0.1 s each.
+        `positions`: for each record the number of steps executed so far, 0.1 s each.
 
         Raises:
             Diverged: a record differs from the one that the recording already holds.

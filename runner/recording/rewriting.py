@@ -44,16 +44,11 @@ def rewrite(
     Of a recording that was cut off, everything up to its last whole chunk is written; the new file has
     an index and a summary, but no result either.
 
-    Args:
-        path: the recording.
-        fresh: the new file.
-        change: what becomes of each metadata record.
-        more: metadata records to add, by name.
-        left_out: the names of attachments and topics to leave out.
-        add: called with the new file, to add messages.
+    `change`: what becomes of each metadata record.
+    `more`: metadata records to add, by name.
+    `left_out`: the names of attachments and topics to leave out.
 
     Raises:
-        RecordingError: the recording is damaged, not merely cut off.
         OSError: the new file exists or cannot be written.
     """
     indexed, result = True, None
@@ -89,9 +84,6 @@ def content_of(path: Path) -> str:
     """Return the content digest of a recording, after checking every checksum and every message.
 
     If the recording states a digest, it must be the same; of a killed run, it is that of the whole chunks.
-
-    Raises:
-        RecordingError: it is damaged, or states another digest than its messages have.
     """
     seen = ContentHash()
     for topic, chunk in _chunks(path):
@@ -109,9 +101,6 @@ def continues(path: Path, earlier: Path) -> bool:
     """Return whether a recording begins with all messages of another one of the same job.
 
     Only topics that the digest covers are compared, byte for byte.
-
-    Raises:
-        RecordingError: one of them is damaged.
     """
     with open_recording(path) as later, open_recording(earlier) as before:
         if later.run != before.run:
@@ -145,11 +134,7 @@ def _chunks(path: Path) -> Iterator[tuple[Topic, ReadChunk]]:
 
 
 def whole_records(path: Path) -> Iterator[tuple[int, int, bytes]]:
-    """Yield (opcode, offset, body) of the data section's records, up to where the file may be cut off.
-
-    Raises:
-        RecordingError: it is damaged.
-    """
+    """Yield (opcode, offset, body) of the data section's records, up to where the file may be cut off."""
     with open_recording(path) as recording:
         finished = recording.finished
     if finished:

@@ -144,8 +144,7 @@ class RunFile:
 def parse_run_file(record: Mapping[str, Any]) -> RunFile:
     """Return the contents of a `run.json`; invalid values are named in `problems`.
 
-    Args:
-        record: the JSON object; its `run_id` must be valid.
+    `record`: the JSON object; its `run_id` must be valid.
     """
     problems: list[str] = []
     values = _valid(_without_deep_values(record, problems), _RUN, "", problems)

@@ -51,10 +51,6 @@ class RecordingFile:
     def __init__(self, path: Path, topics: Sequence[Topic] = KINDS["job"]) -> None:
         """Create the file; one that exists is never overwritten.
 
-        Args:
-            path: where to.
-            topics: those of its kind, one of `schema.KINDS`.
-
         Raises:
             OSError: it exists, or cannot be created.
         """
@@ -88,9 +84,7 @@ class RecordingFile:
     def reopen(cls, path: Path, contents: Contents) -> RecordingFile:
         """Open a recording to resume it: what follows its last whole chunk is cut off.
 
-        Args:
-            path: the recording.
-            contents: its good records, as `integrity.survey` found them.
+        `contents`: its good records, as `integrity.survey` found them.
 
         Raises:
             OSError: it cannot be written.
@@ -183,10 +177,8 @@ class RecordingFile:
     ) -> None:
         """Write a last metadata record, if one is named, summary and footer, and sync the file.
 
-        Args:
-            name: of the record; empty for none.
-            entries: of the record.
-            synced: False leaves syncing the file to the caller.
+        `name`: of the record; empty for none.
+        `synced`: False leaves syncing the file to the caller.
 
         Raises:
             OSError: it could not all be written; the file is then as it was before.
@@ -267,11 +259,7 @@ class RecordingFile:
 
 
 def create_recording(path: Path, topics: Sequence[Topic] = KINDS["job"]) -> RecordingFile:
-    """Return the file of a new recording with these topics.
-
-    Raises:
-        StorageError: it exists, or cannot be created.
-    """
+    """Return the file of a new recording with these topics."""
     try:
         return RecordingFile(path, topics)
     except OSError as error:

@@ -74,11 +74,7 @@ _COMPARED: Final = ("dualtaxi", "git", "python", "platform", "machine", "process
 
 
 def provenance(with_command: bool = True) -> dict[str, str]:
-    """Return versions, machine, settings and command line, as text by key.
-
-    Args:
-        with_command: False leaves out the command line, for runs that do not record the user's code.
-    """
+    """Return versions, machine, settings and command line, as text by key."""
     return _machine() | _packages() | _settings(with_command)
 
 

@@ -33,31 +33,19 @@ _ADVICE: Final = "free some disk"
 
 
 class Store:
-    """The store of a recordings folder; it need not exist.
-
-    Args:
-        recordings: the recordings folder.
-    """
+    """The store of a recordings folder; it need not exist."""
 
     def __init__(self, recordings: Path) -> None:
         self._folder = recordings / FOLDER
 
     def path(self, digest: str) -> Path:
-        """Return the path of a content, whether or not it is there.
-
-        Raises:
-            RecordingError: it is not a digest; anything else could lead out of the store.
-        """
+        """Return the path of a content, whether or not it is there."""
         if not DIGEST.fullmatch(digest):
             raise RecordingError(f"found the digest {digest[:80]!r}, expected 64 hexadecimal digits.")
         return self._folder / "objects" / digest[:2] / digest
 
     def has(self, digest: str, size: int) -> bool:
-        """Return whether a content of this size is there.
-
-        Raises:
-            RecordingError: it is not a digest.
-        """
+        """Return whether a content of this size is there."""
         try:
             return self.path(digest).stat().st_size == size
         except OSError:
@@ -66,14 +54,8 @@ class Store:
     def put(self, run: str, content: bytes | memoryview | Path, expected: str = "") -> tuple[str, int]:
         """Store a content that a run refers to; return its digest and its number of bytes.
 
-        Args:
-            run: the name of the run's folder.
-            content: the bytes, or a file with them.
-            expected: its digest, if it is known.
-
-        Raises:
-            RecordingError: it has another digest than expected.
-            StorageError: the file cannot be read, or the store cannot be written.
+        `content`: the bytes, or a file with them.
+        `expected`: its digest, if it is known.
         """
         if not isinstance(content, Path):
             return self._put(run, [content], expected)
@@ -104,12 +86,7 @@ class Store:
         return digest, size
 
     def refer(self, run: str, digests: Iterable[str]) -> None:
-        """Note that a run refers to contents, which then stay.
-
-        Raises:
-            RecordingError: one is not a digest.
-            StorageError: the store cannot be written.
-        """
+        """Note that a run refers to contents, which then stay."""
         if digests := [digest for digest in digests if self.path(digest)]:
             with storage_errors(self._folder, _ADVICE):
                 self._folder.mkdir(exist_ok=True)
@@ -158,11 +135,7 @@ class Store:
         return {digest: self._size(digest) for digest in sorted(own - staying)}
 
     def drop(self, run: str) -> int:
-        """Forget a run, and remove the contents that no other run refers to; return the bytes freed.
-
-        Raises:
-            StorageError: the store cannot be written.
-        """
+        """Forget a run, and remove the contents that no other run refers to; return the bytes freed."""
         if run not in self.runs():
             return 0
         with storage_errors(self._folder), self._locked():
@@ -173,11 +146,7 @@ class Store:
         return sum(unused.values())
 
     def clean(self) -> None:
-        """Forget runs that are gone, and remove what killed processes left, both after an hour.
-
-        Raises:
-            StorageError: the store cannot be written.
-        """
+        """Forget runs that are gone, and remove what killed processes left, both after an hour."""
         for run in self.runs():
             if not (self._folder.parent / run).exists() and _is_old(self._folder / "runs" / run):
                 self.drop(run)
