@@ -1,12 +1,23 @@
-"""The libraries that adapters are for: imported when an adapter is used, with versions that were tested."""
+"""What adapters have in common: the versions of libraries that were tested, arguments, settings."""
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Mapping
 from importlib import metadata
+from typing import Final
 
+import numpy as np
+
+from runner.errors import ConfigError
+from runner.loops.options import CallbackOptions, options_of
 from runner.loops.values import warn_user
 from runner.util.extras import require
+from runner.util.values import is_whole
+
+_MAX_TEXT: Final = 1_000
+_MAX_DEPTH: Final = 10
 
 
 def require_tested(module: str, extra: str, tested: tuple[str, str]) -> object:
@@ -37,3 +48,33 @@ def require_tested(module: str, extra: str, tested: tuple[str, str]) -> object:
 def _numbers(version: str) -> tuple[int, ...]:
     """Return the numbers that a version begins with."""
     return tuple(map(int, re.findall(r"\d+", re.match(r"[\d.]*", version)[0])))  # type: ignore[index]
+
+
+def check_callback(
+    recordings: str | os.PathLike[str] | None, checkpoint_every: int, options: CallbackOptions
+) -> None:
+    """Check the arguments of a callback before the library calls it.
+
+    Raises:
+        ConfigError: one cannot be used.
+        MissingExtra: frames need Pillow, which is not installed.
+    """
+    options_of(recordings, options, valid=CallbackOptions.__annotations__)
+    if not is_whole(checkpoint_every, 0, 2**62):
+        raise ConfigError(f"checkpoint_every: found {checkpoint_every!r}, expected a whole number from 0")
+
+
+def as_setting(value: object, depth: int = 0) -> object:
+    """Return a library's setting as JSON holds it; what JSON cannot hold, such as a class, by its name."""
+    if value is None or isinstance(value, bool | int | float | str | np.generic | np.ndarray):
+        return value
+    if isinstance(value, Mapping) and depth < _MAX_DEPTH:
+        return {str(key): as_setting(part, depth + 1) for key, part in value.items()}
+    if isinstance(value, set | frozenset):
+        value = sorted(value, key=repr)
+    if isinstance(value, list | tuple) and depth < _MAX_DEPTH:
+        return [as_setting(part, depth + 1) for part in value]
+    if isinstance(value, type) or callable(value):
+        return getattr(value, "__qualname__", type(value).__name__)
+    text = str(value)
+    return type(value).__name__ if " at 0x" in text else text[:_MAX_TEXT]

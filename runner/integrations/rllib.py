@@ -6,10 +6,10 @@ a shard of that run; they are put together when the algorithm is stopped.
 
 from __future__ import annotations
 
-import json
+import inspect
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
@@ -17,18 +17,18 @@ from typing import Any, Final, Unpack
 
 import numpy as np
 
-from runner.errors import ConfigError, EnvironmentNotUsable, RunnerError, truncated_message
-from runner.integrations.libraries import require_tested
+from runner.errors import EnvironmentNotUsable, RunnerError, truncated_message
+from runner.integrations.libraries import as_setting, check_callback, require_tested
 from runner.loops.description import Described
 from runner.loops.loop import Loop
-from runner.loops.makers import checked_make, vector_maker_of
-from runner.loops.options import PackingOptions, options_of
+from runner.loops.makers import checked_make, game_maker_of, vector_maker_of
+from runner.loops.options import CallbackOptions, options_of, settings_in
+from runner.loops.parallel import described_game, record_parallel
 from runner.loops.recorded import Recorded
 from runner.loops.rows import Rows
 from runner.loops.single_rows import ROWS
 from runner.loops.values import warn_user
 from runner.loops.vector import (
-    RecordedVector,
     autoreset_mode_of,
     described_vector,
     first_of,
@@ -36,17 +36,18 @@ from runner.loops.vector import (
     require_fixed,
 )
 from runner.recording.maker import EnvironmentMaker
+from runner.replay.games import MultiAgent
 from runner.runs.run import Run
-from runner.util.jsonable import as_json, as_mapping
-from runner.util.values import Json, is_whole
+from runner.util.values import Json
 
 require_tested("ray", "rllib", ("2.60", "2.60"))
 
 from ray.rllib.algorithms.algorithm import Algorithm  # noqa: E402
 from ray.rllib.callbacks.callbacks import RLlibCallback  # noqa: E402
+from ray.rllib.env.vector.vector_multi_agent_env import VectorMultiAgentEnv  # noqa: E402
 
-_RESULTS: Final = ("training_iteration", "evaluation", "env_runners", "learners")
-"""What is logged of an iteration's result."""
+_RESULTS: Final = ("training_iteration", "env_runners", "learners", "evaluation")
+"""What is logged of an iteration's result, in this order: plots and pages show the first names."""
 _CLOCK: Final = re.compile(r"(^|/)(timers|sample|[^/]*(_timer|throughput|_sec_|_between_)[^/]*)(/|$)")
 """What is not logged, because it differs between two runs that are otherwise the same."""
 _STEPS: Final = "num_env_steps_sampled_lifetime"
@@ -72,14 +73,12 @@ class Recording:
     Args:
         recordings: the recordings folder, which all nodes share; by default $DUALTAXI_RECORDINGS or
             ./recordings.
-        name: the name of the run; in Ray Tune that of the trial, else algorithm and environment.
-        seed: the seed that the run is listed with; the configuration's unless given.
-        config: your own settings, next to those of the algorithm.
-        info: names of fields of the infos to record.
-        make: a function that makes one of the environments, where it cannot be made from what is recorded.
-        checkpoint_every: keep the module's weights as the checkpoint `module` after this many iterations, and
-            at the end; 0 for none.
-        packing: as for `runner.record`.
+        checkpoint_every: keep the weights as the checkpoint `module` after this many iterations, and at the
+            end; 0 for none.
+        options: the others of `runner.record`, except `join` and `shard`; and `frames_of`, as for
+            `runner.record_vector`. The run has the name of algorithm and environment, or of the trial of Ray
+            Tune, and the configuration's seed unless given, and the configuration with the settings of
+            `config`. `make` makes one of the environments.
 
     Raises:
         ConfigError: an argument cannot be used.
@@ -89,23 +88,17 @@ class Recording:
         self,
         recordings: str | os.PathLike[str] | None = None,
         *,
-        name: str | None = None,
-        seed: int | None = None,
-        config: object = None,
-        info: Sequence[str] = (),
-        make: str | Callable[[], object] | None = None,
         checkpoint_every: int = 0,
-        **packing: Unpack[PackingOptions],
+        **options: Unpack[CallbackOptions],
     ) -> None:
-        given = {"name": name, "seed": seed, "config": config, "info": info}
-        options_of(recordings, {**given, **packing}, valid=(*PackingOptions.__annotations__, *given))
-        self.make, self.options = make, {"info": tuple(info), **packing}
-        if not is_whole(checkpoint_every, 0, 2**62):
-            raise ConfigError(f"checkpoint_every: found {checkpoint_every!r}, expected a whole number from 0")
+        check_callback(recordings, checkpoint_every, options)
+        own = ("name", "seed", "config")
+        self.name, self.seed, self.config = (options.get(name) for name in own)
+        self.options = {name: value for name, value in options.items() if name not in own}
+        self.make = checked_make(self.options.get("make"))
         folder = recordings if recordings is None else os.fspath(recordings)
         self.recordings = folder if folder is None or "://" in folder else os.path.abspath(folder)  # noqa: PTH100
         """Ray runs some of the processes in folders of its own."""
-        self.name, self.seed, self.config = name, seed, dict(as_mapping(config) or {})
         self.checkpoint_every = checkpoint_every
 
     def __call__(self) -> RLlibCallback:
@@ -159,7 +152,7 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
             EnvironmentNotUsable: they cannot be recorded.
         """
         recording, config = self._recording, algorithm.config
-        describe = partial(_described, checked_make(recording.make))
+        describe = partial(_described, recording.make)
         found = [each for each in algorithm.env_runner_group.foreach_env_runner(describe) if each]
         if not found:
             raise EnvironmentNotUsable(
@@ -169,14 +162,20 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
         name = f"{type(algorithm).__name__}-{described.env_id.rpartition('/')[2]}"
         if trial := getattr(getattr(algorithm, "_storage", None), "trial_dir_name", None):
             name = re.sub(r"_[\d-]{10}_[\d-]{8}$", "", trial)  # RLlib keeps no other name of a trial
+        settings = {key: as_setting(value) for key, value in config.to_dict().items() if key != "callbacks"}
         options = options_of(
             recording.recordings,
             {
+                **recording.options,
                 "name": recording.name or re.sub(r"[^A-Za-z0-9_.+/-]", "-", name)[:100],
                 "seed": config.seed if recording.seed is None else recording.seed,
-                "config": {**_settings(algorithm), **recording.config},
-                **recording.options,
+                "config": {
+                    "algorithm": type(algorithm).__name__,
+                    **settings,
+                    **settings_in(recording.config),
+                },
             },
+            valid=CallbackOptions.__annotations__,
         )
         return _Run(Loop(described, options, maker, ROWS[described.kind]))
 
@@ -184,9 +183,7 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
         """Return what has an env runner record its environments; it is sent to the process of each."""
         assert self._run is not None
         phase = "eval" if is_evaluation else "train"
-        return partial(
-            _join, _Join(self._run.run, phase, {"make": self._recording.make, **self._recording.options})
-        )
+        return partial(_join, _Join(self._run.run, phase, self._recording.options))
 
     def on_env_runners_recreated(
         self, *, env_runner_group: Any, env_runner_indices: list[int], is_evaluation: bool, **_: object
@@ -216,10 +213,15 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
             self._checkpoint(algorithm)
 
     def _checkpoint(self, algorithm: Algorithm) -> None:
-        """Keep the weights of the algorithm's module."""
+        """Keep the weights of the algorithm's module, or of the module of each policy."""
         assert self._run is not None
-        state = dict(_arrays(algorithm.get_module().get_state(inference_only=True)))
-        self._run.checkpoint("module", state)
+        policies = algorithm.config.policies if algorithm.config.is_multi_agent else ()
+        modules = {name: algorithm.get_module(name) for name in policies} or {
+            "module": algorithm.get_module()
+        }
+        for name, module in modules.items():
+            if state := dict(_arrays(module.get_state(inference_only=True))):
+                self._run.checkpoint(name, state)
 
     def _end(self, algorithm: Algorithm) -> None:
         """End the run; the env runners are still there."""
@@ -253,29 +255,24 @@ def _groups(algorithm: Algorithm) -> Iterator[Any]:
     yield from (group for group in groups if group is not None)
 
 
-def _inner(env_runner: object) -> tuple[Any, Any]:
-    """Return the wrapper of RLlib around the vector of an env runner, and the vector; None without one.
+def _described(make: str, env_runner: Any) -> tuple[Described, EnvironmentMaker] | None:
+    """Return the description of an env runner's environments; None without any.
 
     Raises:
-        EnvironmentNotUsable: it has environments of several agents.
+        EnvironmentNotUsable: they cannot be recorded.
     """
-    wrapper = getattr(env_runner, "env", None)
-    if wrapper is None:
-        return None, None
-    if type(env_runner).__name__ != "SingleAgentEnvRunner" or not hasattr(wrapper, "env"):
-        raise EnvironmentNotUsable(
-            f"found a {type(env_runner).__name__} with a {type(wrapper).__name__}, expected RLlib's "
-            "SingleAgentEnvRunner: environments of several agents cannot be recorded through RLlib. Record "
-            "them in a function that makes them: runner.record_parallel(env, join=run)."
-        )
-    return wrapper, wrapper.env
-
-
-def _described(make: str, env_runner: object) -> tuple[Described, EnvironmentMaker] | None:
-    """Return the description of an env runner's environments; None without any."""
-    _, envs = _inner(env_runner)
-    if envs is None:
+    if (outer := getattr(env_runner, "env", None)) is None:
         return None
+    if isinstance(outer, VectorMultiAgentEnv):
+        game = _game(env_runner, outer.envs[0])
+        return described_game(game), game_maker_of(game, make)
+    if type(env_runner).__name__ != "SingleAgentEnvRunner" or not hasattr(outer, "env"):
+        raise EnvironmentNotUsable(
+            f"found a {type(env_runner).__name__} with a {type(outer).__name__}, expected RLlib's "
+            "SingleAgentEnvRunner or MultiAgentEnvRunner. Record the environments in the function that makes "
+            "them: runner.record(env, join=run)."
+        )
+    envs = outer.env
     mode = autoreset_mode_of(envs, None)
     with first_of(envs) as first:
         described = described_vector(envs, first)
@@ -283,10 +280,19 @@ def _described(make: str, env_runner: object) -> tuple[Described, EnvironmentMak
         return replace(described, environments=1), vector_maker_of(envs, first, mode, make)
 
 
+def _game(env_runner: Any, env: object) -> MultiAgent:
+    """Return an environment of several agents as a game, with the arguments of its class if it is known."""
+    kind = env_runner.config.env
+    if not isinstance(kind, type):
+        return MultiAgent(env, kind if isinstance(kind, str) else None)
+    parameter = next(iter(inspect.signature(kind).parameters), "config")
+    return MultiAgent(env, arguments={parameter: dict(env_runner.config.env_config)})
+
+
 def _join(join: _Join, env_runner: Any) -> None:
     """Record the environments of an env runner from now on; called in its process."""
-    wrapper, envs = _inner(env_runner)
-    if envs is None or isinstance(envs, RecordedVector):
+    outer = getattr(env_runner, "env", None)
+    if outer is None or _recorded(env_runner):
         return
     kind = "evaluation" if join.phase == "eval" else "env-runner"
     shard = f"{kind}-{env_runner.worker_index or 0}"
@@ -295,24 +301,32 @@ def _join(join: _Join, env_runner: Any) -> None:
             f"found no folder {join.run.folder} on the node of an env runner, expected a recordings folder "
             "that all nodes share"
         )
-    wrapper.env = record_vector(envs, join=join.run, shard=shard, phase=join.phase, **join.options)
+    options: dict[str, Any] = {"join": join.run, "phase": join.phase, **join.options}
+    if isinstance(outer, VectorMultiAgentEnv):
+        for i, env in enumerate(outer.envs):
+            own = shard if len(outer.envs) == 1 else f"{shard}.{i}"
+            outer.envs[i] = record_parallel(_game(env_runner, env), shard=own, **options)
+    else:
+        outer.env = record_vector(outer.env, shard=shard, **options)
     env_runner._recorded_join = join
 
 
-def _recorded(env_runner: object) -> RecordedVector | None:
-    envs = getattr(getattr(env_runner, "env", None), "env", None)
-    return envs if isinstance(envs, RecordedVector) else None
+def _recorded(env_runner: object) -> list[Recorded[Any]]:
+    """Return what an env runner has recorded: its vector, or each of its environments of several agents."""
+    outer = getattr(env_runner, "env", None)
+    found = outer.envs if isinstance(outer, VectorMultiAgentEnv) else [getattr(outer, "env", None)]
+    return [each for each in found if isinstance(each, Recorded)]
 
 
 def _evaluate_at(steps: int, env_runner: object) -> None:
     """State after how many training steps an env runner evaluates; called in its process."""
-    if (recorded := _recorded(env_runner)) is not None:
+    for recorded in _recorded(env_runner):
         recorded.at_step(steps)
 
 
 def _leave(env_runner: object) -> None:
-    """End the shard of an env runner; called in its process."""
-    if (recorded := _recorded(env_runner)) is not None:
+    """End the shards of an env runner; called in its process."""
+    for recorded in _recorded(env_runner):
         recorded._loop.close()
 
 
@@ -333,17 +347,3 @@ def _arrays(state: Mapping[object, object], prefix: str = "") -> Iterator[tuple[
             yield from _arrays(value, f"{prefix}{key}/")
         elif hasattr(value, "dtype"):
             yield f"{prefix}{key}", value
-
-
-def _settings(algorithm: Algorithm) -> dict[str, object]:
-    """Return the configuration of an algorithm as JSON holds it; what JSON cannot hold, as text."""
-    found: dict[str, object] = {"algorithm": type(algorithm).__name__}
-    for key, value in algorithm.config.to_dict().items():
-        if key == "callbacks":
-            continue
-        try:
-            own = as_json(value)
-        except (ValueError, RecursionError):
-            own = type(value).__name__
-        found[str(key)] = type(value).__name__ if " at 0x" in json.dumps(own) else own
-    return found

@@ -6,23 +6,22 @@ announce itself to the callbacks of this module, when the module is imported; it
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Final, Literal, Self, Unpack
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Final, Self, Unpack
 
 import numpy as np
 
 from runner.errors import ConfigError, EnvironmentNotUsable, RunnerError
-from runner.integrations.libraries import require_tested
-from runner.loops.options import PackingOptions, RecordOptions, options_of
+from runner.integrations.libraries import as_setting, check_callback, require_tested
+from runner.loops.options import CallbackOptions, settings_in
 from runner.loops.recorded import ending_of
 from runner.loops.values import warn_user
 from runner.loops.vector import RecordedVector
 from runner.runs.run import Run
-from runner.util.jsonable import as_mapping
-from runner.util.values import is_whole
 
 require_tested("stable_baselines3", "sb3", ("2.9", "2.9"))
 
@@ -36,7 +35,6 @@ from runner.loops.recorded_vec_env import RecordedVecEnv  # noqa: E402
 _CLOCKS: Final = ("time/fps", "time/time_elapsed")
 """What is not logged, because it differs between two runs that are otherwise the same."""
 _NOT_SETTINGS: Final = ("self", "env", "verbose", "tensorboard_log", "_init_setup_model", "logger")
-_MAX_TEXT: Final = 1_000
 
 
 class Recording(BaseCallback):  # type: ignore[misc]
@@ -53,19 +51,12 @@ class Recording(BaseCallback):  # type: ignore[misc]
     in the block that take the same environments.
 
     Args:
-        recordings: as for `runner.record`, as are all others but the last one.
-        name: the name of the run; the environment's unless given.
-        seed: the seed that the run is listed with; the model's unless given.
-        config: your own settings, next to the model's.
-        info: names of fields of the infos to record.
-        frames_every: render a picture of each environment after this many steps.
-        frame_format: `png` or `jpeg`.
-        frames_of: the number of the environment to render, or several; all unless given.
-        make: a function that makes one of the environments, where it cannot be made from what is recorded.
+        recordings: as for `runner.record`.
         checkpoint_every: keep the policy's parameters as the checkpoint `policy` after this many steps of
             environments, and at the end; 0 for none.
-        on_error: as for `runner.record`.
-        packing: as for `runner.record`.
+        options: the others of `runner.record`, except `join` and `shard`; and `frames_of`, as for
+            `runner.record_vector`. The run has the environment's name and the model's seed unless given, and
+            the model's settings with those of `config`. `make` makes one of the environments.
 
     Raises:
         ConfigError: an argument cannot be used.
@@ -75,29 +66,13 @@ class Recording(BaseCallback):  # type: ignore[misc]
         self,
         recordings: str | os.PathLike[str] | None = None,
         *,
-        name: str | None = None,
-        seed: int | None = None,
-        config: object = None,
-        info: Sequence[str] = (),
-        frames_every: int = 0,
-        frame_format: str = "png",
-        frames_of: int | Sequence[int] | None = None,
-        make: str | Callable[[], object] | None = None,
         checkpoint_every: int = 0,
-        on_error: Literal["raise", "warn"] = "raise",
-        **packing: Unpack[PackingOptions],
+        **options: Unpack[CallbackOptions],
     ) -> None:
         super().__init__()
-        options: dict[str, Any] = {"name": name, "info": info, "on_error": on_error, **packing}
-        options |= {"frames_every": frames_every, "frame_format": frame_format}
-        valid = [one for one in RecordOptions.__annotations__ if one not in ("join", "shard")]
-        options_of(recordings, {**options, "seed": seed, "config": config}, valid=valid)
-        if not is_whole(checkpoint_every, 0, 2**62):
-            raise ConfigError(f"checkpoint_every: found {checkpoint_every!r}, expected a whole number from 0")
-        self._options = {"recordings": recordings, "make": make, "frames_of": frames_of, **options}
-        self._seed, self._config, self._checkpoint_every = seed, config, checkpoint_every
-        self._has_options = bool(config or frames_every or packing or info)
-        self._has_options |= any(one is not None for one in (recordings, name, seed, frames_of, make))
+        check_callback(recordings, checkpoint_every, options)
+        self._options = {name: value for name, value in options.items() if value is not None}
+        self._recordings, self._checkpoint_every = recordings, checkpoint_every
         self._envs: RecordedVecEnv | None = None
         self._is_own = False
         """Whether this callback recorded the environments, and not `runner.record` before it."""
@@ -154,7 +129,7 @@ class Recording(BaseCallback):  # type: ignore[misc]
         """
         base = model.get_env().unwrapped
         if isinstance(base, RecordedVecEnv):
-            if self._has_options:
+            if self._recordings is not None or self._options:
                 raise ConfigError(
                     "found arguments of Recording for environments that runner.record records, expected "
                     "checkpoint_every at most: give the others to runner.record"
@@ -168,9 +143,10 @@ class Recording(BaseCallback):  # type: ignore[misc]
             earlier.restore_methods()  # an error ended the `learn` before
             earlier.recorded._loop.close("interrupted")
         observations = _observations_in_progress(model, base) if is_continued else None
-        seed = model.seed if self._seed is None else self._seed
-        config = {**settings_of(model), **(as_mapping(self._config) or {})}
-        self._envs = RecordedVecEnv(base, {**self._options, "seed": seed, "config": config})
+        options: dict[str, Any] = {"recordings": self._recordings, **self._options}
+        options.setdefault("seed", model.seed)
+        options["config"] = {**settings_of(model), **settings_in(options.get("config"))}
+        self._envs = RecordedVecEnv(base, options)
         self._is_own = True
         self._envs.replace_methods()
         if is_continued:
@@ -306,21 +282,12 @@ def settings_of(model: BaseAlgorithm) -> dict[str, object]:
 
 
 def _setting(value: object) -> object:
-    """Return a hyperparameter as JSON holds it; what JSON cannot hold, such as a class, by its name."""
-    if isinstance(value, Mapping):
-        return {str(key): _setting(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_setting(part) for part in value]
-    if value is None or isinstance(value, bool | int | float | str | np.generic | np.ndarray):
-        return value
+    """Return a hyperparameter as JSON holds it."""
     if callable(value) and not isinstance(value, type):
-        try:
+        with contextlib.suppress(Exception):  # it is no schedule, but any function
             first, last = float(value(1.0)), float(value(0.0))
-        except Exception:  # it is no schedule, but any function
-            return getattr(value, "__qualname__", type(value).__name__)
-        return first if first == last else {"first": first, "last": last}
-    text = value.__name__ if isinstance(value, type) else str(value)
-    return type(value).__name__ if " object at 0x" in text else text[:_MAX_TEXT]
+            return first if first == last else {"first": first, "last": last}
+    return as_setting(value)
 
 
 def _observations_in_progress(model: BaseAlgorithm, base: object) -> object:

@@ -25,7 +25,7 @@ from runner.loops.description import Described
 from runner.loops.env import record
 from runner.loops.flushing import open_loops
 from runner.loops.loop import Loop
-from runner.loops.options import PACKING, options_of
+from runner.loops.options import PACKING, CallbackOptions, options_of
 from runner.loops.pictures import Picture
 from runner.loops.recorded import ending_of
 from runner.loops.values import arrays_of, warn_user
@@ -38,9 +38,7 @@ from runner.util.values import Json, JsonView, is_whole
 STEP_NAME: Final = "global_step"
 """The name under which the script's own step is recorded, before the values that it gave with it."""
 MAX_NAMES: Final = 10_000
-OPTIONS: Final = frozenset(
-    {*("frame_format", "frames_every", "frames_of", "info", "make", "on_error", "steps"), *PACKING}
-)
+OPTIONS: Final = CallbackOptions.__annotations__.keys() - {"config", "name", "run_id", "seed"}
 """The arguments of `runner.record` and `record_vector` that a script may add."""
 _MAX_WAITING: Final = 10_000
 """The most values that wait for an environment."""
@@ -267,7 +265,7 @@ class ScriptRun:
         """Begin a recording without an environment."""
         nothing = Discrete(1)
         described = Described("step", nothing, nothing, env_id="none")
-        packing: Any = {key: value for key, value in self._options.items() if key in PACKING}
+        packing: Any = {key: self._options[key] for key in (*PACKING, "on_error") if key in self._options}
         given = self._arguments() | {"name": self.name or script_name(), "run_id": self.run_id}
         options = options_of(self._recordings, given | packing)
         maker = EnvironmentMaker("gymnasium", reason="values were logged, and no environment was recorded")

@@ -11,7 +11,7 @@ import os
 import weakref
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any, Unpack
+from typing import Any, Final, Unpack
 
 import numpy as np
 from gymnasium import spaces
@@ -33,8 +33,13 @@ from runner.util.jsonable import as_mapping
 require_tested("torchrl", "torchrl", ("0.14", "0.14"))
 
 from torchrl.data import Categorical, OneHot  # noqa: E402
-from torchrl.envs import GymWrapper  # noqa: E402
+from torchrl.envs import GymWrapper, TransformedEnv  # noqa: E402
 from torchrl.record.loggers import Logger as _Logger  # noqa: E402
+
+_WHY_NOT_MADE: Final = (
+    "its steps were recorded as a collector of TorchRL yielded them; those of Gymnasium environments can be "
+    "reproduced if these are recorded: runner.integrations.torchrl.record(env)"
+)
 
 
 def record(env: Any, recordings: str | os.PathLike[str] | None = None, **options: Any) -> Any:
@@ -99,12 +104,14 @@ def recorded(
         for data in runner.integrations.torchrl.recorded(collector, name="ppo"):
 
     The observations are those after TorchRL's transforms; several of them are recorded as a `Dict`. One-hot
-    actions are recorded as numbers. The run ends with the iteration, also by `break`.
+    actions are recorded as numbers. The run ends with the iteration, also by `break`. It cannot be
+    reproduced: what a reset draws depends on generators of PyTorch, which are not recorded.
 
     Args:
         collector: a collector that steps its environments, also several of them, in this process.
         recordings: as for `runner.record`.
-        options: the arguments that `runner.record` has too, except those of infos and frames.
+        options: the arguments that `runner.record` has too, except those of infos and frames; `steps` may be
+            "all" or "none".
 
     Raises:
         ConfigError: the collector is of another kind, or an argument cannot be used.
@@ -117,6 +124,12 @@ def recorded(
         )
     if getattr(collector, "split_trajs", False):
         raise ConfigError("found a collector with split_trajs=True, expected split_trajs=False")
+    if options.get("steps") == "actions":
+        raise ConfigError(
+            'steps: found "actions", expected "all": what a collector yields cannot be made again from its '
+            "actions. The steps of Gymnasium environments can: record these before the collector is made, by "
+            'env = runner.integrations.torchrl.record(env, steps="actions")'
+        )
     rec = record_batches(
         _name_of(env),
         recordings,
@@ -124,6 +137,7 @@ def recorded(
         autoreset_mode="SameStep",
         **options,
     )
+    rec.why_not_made = _WHY_NOT_MADE
     return _recorded(collector, env, rec)
 
 
@@ -191,9 +205,14 @@ def _text(key: str | Sequence[str]) -> str:
 
 
 def _name_of(env: object) -> str:
-    """Return the name of an environment without its transforms."""
-    while hasattr(env, "base_env"):
-        env = env.base_env
+    """Return the name of an environment, or of the first of several, without transforms."""
+    while True:  # a `SerialEnv` looks up what it does not have in its environments, `base_env` too
+        if isinstance(env, TransformedEnv):
+            env = env.base_env
+        elif own := vars(env).get("_envs"):
+            env = own[0]
+        else:
+            break
     name = getattr(env, "env_name", None)
     return name if isinstance(name, str) and name else type(env).__name__
 

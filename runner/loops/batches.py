@@ -43,6 +43,12 @@ class NamedEnvironments(AnyVectorEnv):
 class RecordedBatches(Recorded[BatchRows]):
     """The recording of environments whose steps come in batches; made by `record_batches`."""
 
+    why_not_made = (
+        "it was recorded in batches, and is known by its name alone; name a function that makes it: "
+        'make="module:function"'
+    )
+    """Why an environment cannot be made again that is known by its name alone."""
+
     def __init__(
         self,
         envs: AnyVectorEnv | str,
@@ -72,8 +78,7 @@ class RecordedBatches(Recorded[BatchRows]):
             require_fixed(described)
             maker = vector_maker_of(envs, first, self._mode, self._make)
         if isinstance(envs, NamedEnvironments):
-            reason = "it was recorded in batches, and is known by its name alone"
-            maker = replace(maker, reason=f'{reason}; name a function that makes it: make="module:function"')
+            maker = replace(maker, reason=self.why_not_made)
         rows = partial(BatchRows, mode=self._mode)
         self.env = envs
         self._record_into(Loop(described, self._options, maker, rows, (described.environments,)))

@@ -20,6 +20,7 @@ from typing import Any, Final
 
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorActionWrapper
+from gymnasium.wrappers import OrderEnforcing
 
 from runner.environments.gym_types import AnyVectorEnv
 from runner.errors import ConfigError
@@ -41,8 +42,8 @@ from runner.loops.wrappers import (
     wrappers_as_fields,
 )
 from runner.recording.maker import FUNCTION_NAME, MAX_SPEC, EnvironmentMaker, VectorMaker
+from runner.replay.games import MultiAgent, Turns
 from runner.replay.stepping_vector import spaces_of_one
-from runner.replay.turns import Turns
 from runner.util.values import MAX_TEXT
 
 _NAME_MAKE: Final = 'name a function that makes it: make="module:function"'
@@ -179,14 +180,16 @@ def _custom_vector(base: Any) -> EnvironmentMaker:
 
 
 def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
-    """Return how a PettingZoo parallel environment was made; `make` is the function that the user named.
+    """Return how a game with PettingZoo's parallel interface was made; `make` is the user's own function.
 
     By PettingZoo's convention the module of a game has a function `parallel_env`, and `env` for the game in
     turns, which also adds the wrappers that belong to the game.
     """
-    is_in_turns = isinstance(env, Turns)
+    is_in_turns, is_of_rllib = isinstance(env, Turns), isinstance(env, MultiAgent)
     function = "env" if is_in_turns else "parallel_env"
-    layers = list(layers_of(env.env if is_in_turns else env))
+    layers = list(layers_of(env.env if is_in_turns or is_of_rllib else env))
+    if is_of_rllib:  # by `gymnasium.make`, around every environment
+        layers = [layer for layer in layers if type(layer) is not OrderEnforcing]
     base, outer = layers[-1], layers[0]
     module = type(base).__module__
     named = {str(agent): action_names(base, env.action_space(agent)) for agent in env.possible_agents}
@@ -205,10 +208,12 @@ def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
             foreign.append(outer)
         if foreign:
             raise CannotBeMade(f"the wrapper {class_name(foreign[0])} does not record its arguments")
-        arguments = getattr(base, "_ezpickle_kwargs", None)
+        arguments = env.arguments if is_of_rllib else getattr(base, "_ezpickle_kwargs", None)
+        if is_of_rllib and arguments is None:
+            raise CannotBeMade("a function that is registered with RLlib made it")
         if arguments is None:
             assumed = default_arguments(type(base), ())
-        elif base._ezpickle_args:
+        elif getattr(base, "_ezpickle_args", ()):
             arguments = inspect.signature(type(base)).bind(*base._ezpickle_args, **arguments).arguments
         entry_point = f"{module}:{function}" if has_function else entry_point_of(type(base))
         kwargs = plain_kwargs(arguments or {}, f"the game {class_name(base)}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal, TypedDict
 
@@ -44,23 +44,39 @@ class PackingOptions(TypedDict, total=False):
     run_id: str
 
 
-class RunOptions(PackingOptions, total=False):
-    """The arguments of `runner.record` that serve every way to record."""
+class OwnRunOptions(PackingOptions, total=False):
+    """Those and the ones of a process that begins a run."""
 
     name: str | None
     seed: int | None
     config: object
-    join: Run | str | os.PathLike[str] | Literal[True] | None
-    shard: str | None
     on_error: Literal["raise", "warn"]
 
 
-class RecordOptions(RunOptions, total=False):
-    """Those and the ones that an environment needs which is called."""
+class _CalledOptions(TypedDict, total=False):
+    """The arguments of `runner.record` that need an environment which is called."""
 
     info: Sequence[str]
     frames_every: int
     frame_format: str
+
+
+class RunOptions(OwnRunOptions, total=False):
+    """The arguments of `runner.record` that serve every way to record."""
+
+    join: Run | str | os.PathLike[str] | Literal[True] | None
+    shard: str | None
+
+
+class RecordOptions(RunOptions, _CalledOptions, total=False):
+    """The arguments of `runner.record` that serve every environment which is called."""
+
+
+class CallbackOptions(OwnRunOptions, _CalledOptions, total=False):
+    """The arguments of `runner.record` and `record_vector` that the adapters of libraries take too."""
+
+    frames_of: int | Sequence[int] | None
+    make: str | Callable[[], object] | None
 
 
 @dataclass(frozen=True)

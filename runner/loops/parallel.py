@@ -19,8 +19,8 @@ from runner.loops.recorded import RecordedAlone, require_pictures
 from runner.loops.single_rows import AgentRows
 from runner.loops.values import check_phase
 from runner.loops.vector import by_field, require_fixed
+from runner.replay.games import ByAgent, GameStepResult, Turns, is_in_turns
 from runner.replay.stepping import game_spaces
-from runner.replay.turns import ByAgent, GameStepResult, Turns, is_in_turns
 from runner.util.values import JsonView
 
 
@@ -153,8 +153,7 @@ def record_parallel(
             f"found {type(env).__name__}, expected a PettingZoo ParallelEnv with possible_agents"
         )
     check_phase(phase)
-    described = _game(env)
-    require_fixed(described)
+    described = described_game(env)
     if options.get("frames_every"):
         require_pictures(env)
     maker = game_maker_of(env, checked_make(make))
@@ -192,8 +191,12 @@ def record_aec(env: Any, recordings: str | os.PathLike[str] | None = None, **opt
     return recorded
 
 
-def _game(env: Any) -> Described:
-    """Return the description of a PettingZoo parallel environment."""
+def described_game(env: Any) -> Described:
+    """Return the description of an environment with PettingZoo's parallel interface.
+
+    Raises:
+        EnvironmentNotUsable: a space cannot be recorded, or there are more than 31 agents.
+    """
     agents = tuple(env.possible_agents)
     if not 1 <= len(agents) <= MAX_AGENTS:
         raise EnvironmentNotUsable(f"found {len(agents)} possible agents, expected 1 to {MAX_AGENTS}.")
@@ -202,10 +205,12 @@ def _game(env: Any) -> Described:
             raise EnvironmentNotUsable(f"found the agent {agent!r}, expected a name or a number for each.")
     observation, action = game_spaces(env)
     name = env.metadata.get("name") if isinstance(getattr(env, "metadata", None), Mapping) else None
-    return Described(
+    described = Described(
         kind=kind_of(observation, action),
         observation=observation,
         action=action,
         env_id=str(name or type(env).__name__),
         agents=agents,
     )
+    require_fixed(described)
+    return described

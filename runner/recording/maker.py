@@ -64,9 +64,9 @@ class EnvironmentMaker:
     """
 
     kind: str
-    """`gymnasium`, `vector` or `pettingzoo`."""
+    """`gymnasium`, `vector`, or `pettingzoo` for games of several agents, those of RLlib too."""
     spec: str = ""
-    """JSON: of Gymnasium's `EnvSpec`; of PettingZoo `{"entry_point": "module:function", "kwargs": {...}}`.
+    """JSON: of Gymnasium's `EnvSpec`; of a game `{"entry_point": "module:function", "kwargs": {...}}`.
 
     Empty if it is unknown.
     """

@@ -15,12 +15,12 @@ from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
 from runner.replay.comparison import Comparison, Part, parts_of
+from runner.replay.games import as_parallel
 from runner.replay.makers import is_whole_vector, make_environment, make_vector, why_not_made
 from runner.replay.recorded import Piece, RecordedReset, pieces
 from runner.replay.redone import Frame, RedoneSteps
 from runner.replay.stepping import EnvironmentStepper, GameStepper, Stepper
 from runner.replay.stepping_vector import VectorStepper
-from runner.replay.turns import Turns, is_in_turns
 
 BLOCK_SECONDS: Final = 0.2
 """Blocks of steps take about this long, so that progress and a hanging environment can be seen."""
@@ -171,8 +171,7 @@ class Replay:
                     autoreset = maker.vector.autoreset
                     stepper: Stepper = VectorStepper(env, self._recording, autoreset, self.drawn)
                 elif maker is not None and maker.kind == "pettingzoo":
-                    game = Turns(env) if is_in_turns(env) else env
-                    stepper = GameStepper(game, self._recording)
+                    stepper = GameStepper(as_parallel(env), self._recording)
                 else:
                     stepper = EnvironmentStepper(env, self._recording)
                     vector = None if maker is None else maker.vector

@@ -20,6 +20,7 @@ from runner.errors import CannotRedo
 from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
+from runner.replay.games import as_parallel
 from runner.replay.specifications import (
     ONLY_PICTURES,
     TRUST,
@@ -32,7 +33,6 @@ from runner.replay.specifications import (
     vector_wrappers,
     why_not_imported,
 )
-from runner.replay.turns import Turns, is_in_turns
 
 _OF_VECTORS: Final = frozenset({"num_envs", "vectorization_mode", "vector_kwargs", "max_episode_steps"})
 """Arguments of `make_vec` in the specification of a vector, which its environments do not take."""
@@ -74,7 +74,7 @@ def make_environment(maker: EnvironmentMaker, trust: bool, render: bool = False)
             env = _made_game(maker, trust, render)
         else:
             env = _made(maker, trust, render)
-        return Turns(env) if maker.kind == "pettingzoo" and is_in_turns(env) else env
+        return as_parallel(env) if maker.kind == "pettingzoo" else env
 
 
 @contextlib.contextmanager

@@ -20,7 +20,8 @@ _MAX_REPR: Final = 10_000
 def as_json(value: object) -> Any:
     """Return a value as JSON can hold it; what it cannot hold as its `repr`.
 
-    Arrays become lists, dataclasses and namespaces mappings, paths text; NaN and infinities become text.
+    Arrays and sets become lists, dataclasses and namespaces mappings, paths text; NaN and infinities become
+    text.
 
     Raises:
         ValueError: the value contains itself, or more than 4,000,000 values.
@@ -59,6 +60,8 @@ class _Conversion:
             value = value.tolist()
         elif isinstance(value, os.PathLike):
             value = os.fspath(value)
+        elif isinstance(value, set | frozenset):
+            value = sorted(value, key=repr)  # their own order differs between processes
         if value is None or isinstance(value, int | str):
             return value
         if isinstance(value, float):

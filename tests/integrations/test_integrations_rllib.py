@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import time
@@ -10,13 +11,12 @@ import numpy as np
 import pytest
 
 import runner
-from runner.errors import RunnerError
 from runner.execution.redo import verify_by_redoing
 from runner.recording.reader import open_recording
 from runner.runs.shards import shards_of
 
 ray = pytest.importorskip("ray")
-pytest.importorskip("ray.rllib")
+rllib_games = pytest.importorskip("tests.integrations.rllib_games")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -157,19 +157,85 @@ def test_a_trial_of_tune_is_a_run(recordings):
     assert all(run.summary.train_steps >= 400 for run in runs)
 
 
-def test_environments_of_several_agents_are_refused(recordings):
+@pytest.mark.parametrize("game", [rllib_games.at_once, rllib_games.in_turns])
+def test_agents_with_policies_of_their_own_and_a_shared_one(recordings, game):
+    from ray.tune.registry import register_env
+
+    from runner.integrations.rllib import Recording
+
+    register_env("spread", game)
+    own = {"agent_0": "first", "agent_1": "second"}
+    ended_episodes = recordings.parent / "ended"
+
+    def note_returns(*, episode, prev_episode_chunks, env_runner, **_):
+        returns = dict.fromkeys(env_runner.env.envs[0].possible_agents, 0.0)
+        for chunk in (*prev_episode_chunks, episode):
+            for agent, agent_episode in chunk.agent_episodes.items():
+                returns[agent] += agent_episode.get_return()
+        if not env_runner.config.in_evaluation:
+            with ended_episodes.open("a") as file:
+                file.write(json.dumps(list(returns.values())) + "\n")
+
+    recording = Recording(recordings, make=game, checkpoint_every=1)
+    config = (
+        configured(recording)
+        .callbacks(recording, on_episode_end=note_returns)
+        .environment("spread")
+        .multi_agent(
+            policies={"first", "second", "shared"},
+            policy_mapping_fn=lambda agent, *_, **__: own.get(agent, "shared"),
+        )
+        .evaluation(evaluation_interval=1, evaluation_num_env_runners=1, evaluation_duration=2)
+    )
+    algorithm = config.build_algo()
+    results = [algorithm.train() for _ in range(2)]
+    algorithm.stop()
+
+    (run,) = runner.list_runs(recordings)
+    assert (run.status, run.name) == ("finished", "PPO-spread")
+    assert run.summary.train_steps == results[-1]["num_env_steps_sampled_lifetime"]
+    assert sorted(run.file.config["config"]["policies"]) == ["first", "second", "shared"]
+    assert sorted({one.name for one in run.checkpoints()}) == ["first", "second", "shared"]
+    assert "env_runners/module_episode_returns_mean/shared" in run.summary.logged
+    with open_recording(run.recording) as recorded:
+        assert recorded.agents == ("agent_0", "agent_1", "agent_2", "agent_3")
+        names = ["env-runner-1.0", "env-runner-1.1", "env-runner-2.0", "env-runner-2.1", "evaluation-1.0"]
+        assert [shard.name for shard in recorded.shards][1:6] == names
+        steps = np.concatenate(list(recorded.blocks(recorded.topic("/train/step"))))
+        ended = recorded.episodes("train")
+    assert (steps["acted"] == 0b1111).all() == (game is rllib_games.at_once)
+    over = ended[ended["terminated"] | ended["truncated"]]
+    assert len(over) == results[-1]["env_runners"]["num_episodes_lifetime"]
+    expected = [json.loads(line) for line in ended_episodes.read_text().splitlines()]
+    np.testing.assert_allclose(sorted(over["returns"].tolist()), sorted(expected))
+    redone = verify_by_redoing(run.recording, trust=True)
+    assert (redone.verdict, redone.left_out) == ("reproduced", 0)
+    assert redone.steps == run.summary.train_steps + run.summary.eval_steps
+
+
+def test_an_environment_class_of_several_agents_is_made_again_from_its_configuration(recordings):
     from ray.rllib.algorithms.ppo import PPOConfig
-    from ray.rllib.examples.envs.classes.multi_agent import MultiAgentCartPole
+    from ray.rllib.connectors.env_to_module.flatten_observations import FlattenObservations
+    from ray.rllib.examples.envs.classes.multi_agent.rock_paper_scissors import RockPaperScissors
 
     from runner.integrations.rllib import Recording
 
     config = (
         PPOConfig()
-        .environment(MultiAgentCartPole, env_config={"num_agents": 2})
-        .env_runners(num_env_runners=0)
+        .environment(RockPaperScissors, env_config={"sheldon_cooper_mode": True})
+        .env_runners(
+            num_env_runners=0,
+            env_to_module_connector=lambda *_, **__: FlattenObservations(multi_agent=True),
+        )
         .multi_agent(policies={"shared"}, policy_mapping_fn=lambda *_, **__: "shared")
+        .training(train_batch_size=100, minibatch_size=50, num_epochs=1)
+        .debugging(seed=3)
         .callbacks(Recording(recordings))
     )
-    with pytest.raises(RunnerError, match="environments of several agents cannot be recorded"):
-        config.build_algo()
-    assert not runner.list_runs(recordings)
+    algorithm = config.build_algo()
+    algorithm.train()
+    algorithm.stop()
+    (run,) = runner.list_runs(recordings)
+    assert (run.name, run.summary.train_steps) == ("PPO-RockPaperScissors", 100)
+    assert "is imported only if you trust" in verify_by_redoing(run.recording).reason
+    assert verify_by_redoing(run.recording, trust=True).verdict == "reproduced"

@@ -103,6 +103,8 @@ def test_what_a_collector_yields_is_recorded(recordings, number):
     data = torch.cat(batches, -1).reshape(n, -1)
     steps = steps.reshape(-1, n)
     assert run.facts["status"] == "finished"
+    assert run.file.config["env"]["id"] == "CartPole-v1"
+    assert "torchrl.record(env)" in verified(run)
     assert spaces["action"]["type"] == "Discrete"
     assert (steps["action"] == data["action"].argmax(-1).numpy().T).all()
     assert (steps["rewards"][..., 0] == data["next", "reward"][..., 0].numpy().T).all()
@@ -168,6 +170,8 @@ def test_mistakes(recordings):
         torchrl.record(env)
     with pytest.raises(ConfigError, match="found list"):
         torchrl.recorded([])
+    with pytest.raises(ConfigError, match=r'expected "all".*torchrl\.record\(env, steps="actions"\)'):
+        torchrl.recorded(collector(GymEnv("CartPole-v1")), steps="actions")
 
 
 def test_an_environment_of_torchrl_itself(recordings):

@@ -1,4 +1,4 @@
-"""Games in turns (PettingZoo's `AECEnv`) with the interface of its parallel games: one agent acts a step."""
+"""Games with the interface of PettingZoo's parallel ones: those in turns (`AECEnv`), and those of RLlib."""
 
 from __future__ import annotations
 
@@ -8,6 +8,19 @@ from typing import Any
 ByAgent = dict[Any, Any]
 """Values of a game by agent."""
 GameStepResult = tuple[ByAgent, ByAgent, ByAgent, ByAgent, ByAgent]
+
+
+def as_parallel(env: Any) -> Any:
+    """Return a game with the interface of PettingZoo's parallel ones: itself, unless it has another."""
+    if is_in_turns(env):
+        return Turns(env)
+    return MultiAgent(env) if is_multi_agent(env) else env
+
+
+def is_multi_agent(env: Any) -> bool:
+    """Return whether an environment has the interface of RLlib's `MultiAgentEnv`."""
+    own = getattr(env, "unwrapped", env)
+    return not isinstance(env, MultiAgent) and hasattr(own, "get_observation_space")
 
 
 def is_in_turns(env: object) -> bool:
@@ -85,3 +98,64 @@ class Turns:
 
     def _is_over(self, agent: object) -> bool:
         return bool(self.env.terminations.get(agent) or self.env.truncations.get(agent))
+
+
+class MultiAgent:
+    """An environment of RLlib as a parallel game, which is over when it states so for `__all__`.
+
+    Its agents have an order of their own, because those of RLlib may come from a set, whose order differs
+    between processes.
+
+    Args:
+        env: a `MultiAgentEnv`, which may have wrappers of Gymnasium.
+        name: its name; that of its class unless given.
+        arguments: of its class, if they are known.
+    """
+
+    def __init__(
+        self, env: Any, name: str | None = None, arguments: Mapping[str, object] | None = None
+    ) -> None:
+        self.env = env
+        self.arguments = arguments
+        self.unwrapped = env.unwrapped
+        agents = self.unwrapped.possible_agents
+        self.possible_agents = sorted(agents, key=lambda agent: (isinstance(agent, str), agent))
+        self.agents: list[object] = []
+        """The agents that act next; none if the game is over."""
+        self.metadata = {"name": name or type(self.unwrapped).__name__}
+        self.render_mode = getattr(env, "render_mode", None)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name == "env":
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    def observation_space(self, agent: object) -> Any:
+        """Return the space of an agent's observations."""
+        return self.unwrapped.get_observation_space(agent)
+
+    def action_space(self, agent: object) -> Any:
+        """Return the space of an agent's actions."""
+        return self.unwrapped.get_action_space(agent)
+
+    def reset(self, **arguments: object) -> tuple[ByAgent, ByAgent]:
+        """Begin a game; return the observations and infos of the agents that act next."""
+        observations, infos = self.env.reset(**arguments)
+        self.agents = list(observations)
+        return observations, infos
+
+    def step(self, actions: Mapping[Any, object]) -> GameStepResult:
+        """Take a step; return what the environment returns, with its flags for `__all__`."""
+        result: GameStepResult = self.env.step(actions)
+        observations, _, terminated, truncated, _ = result
+        is_over = terminated.get("__all__") or truncated.get("__all__")
+        self.agents = [] if is_over else list(observations)
+        return result
+
+    def render(self) -> Any:
+        """Return a picture of the game."""
+        return self.env.render()
+
+    def close(self) -> None:
+        """Close the game."""
+        self.env.close()
