@@ -37,6 +37,7 @@ class _Copies(Rows):
     def __init__(self, recorder: Recorder, copied: Copied, phase: str) -> None:
         self._fields = _SHARED_FIELDS + (_STEP_FIELDS if copied.kind == "step" else _TRANSITION_FIELDS)
         super().__init__(recorder, copied, phase, lambda _: None)  # type: ignore[arg-type]
+        self.open()
 
     def _set_leaves(self, described: object) -> None:
         """Do nothing: values are copied."""

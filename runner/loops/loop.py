@@ -154,7 +154,10 @@ class Loop(Generic[R]):
     @property
     def active_phase(self) -> str:
         """The phase of the last step; `train` before any."""
-        return next((phase for phase, rows in self._rows.items() if rows is self.active), "train")
+        for phase, rows in self._rows.items():
+            if rows is self.active:
+                return phase
+        return "train"
 
     @property
     def position(self) -> int:

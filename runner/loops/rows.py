@@ -61,7 +61,6 @@ class Rows:
         self._ended = 0
         self._reset_count = 0
         self._last_position = 0
-        self.open()
 
     @property
     def off_table(self) -> int:
@@ -94,6 +93,8 @@ class Rows:
 
     def reset(self, observation: object, seed: int | None) -> None:
         """Put down a reset; it ends an episode in progress, neither terminated nor truncated."""
+        if not self._room:  # it is the first one
+            self.open()
         if not self._fresh:
             self._end(self.filled - 1, False, False)
         if seed is not None and not 0 <= seed <= MAX_SEED:

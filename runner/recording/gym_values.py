@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -40,9 +41,7 @@ class Leaf:
             return
         self.base = np.dtype(part.dtype.base.str)
         self.shape = part.dtype.shape
-        scalars = {kind for kind in SCALARS if np.can_cast(kind, self.base)}
-        scalars |= {bool} | ({int} if self.base.kind in "iu" else {float} if self.base.char == "d" else set())
-        self.exact_scalars = frozenset(() if self.shape else scalars)
+        self.exact_scalars = frozenset() if self.shape else _exact_scalars(self.base)
         """Classes whose values are all recorded exactly, or refused by NumPy."""
         self._is_rounded = False
 
@@ -82,6 +81,14 @@ class Leaf:
         """Return the error for a value that is not of the space."""
         what = self._what
         return RecordingError(f"found an {what} that is not of the environment's {what} space ({reason}).")
+
+
+@cache
+def _exact_scalars(base: np.dtype[Any]) -> frozenset[type]:
+    scalars = {kind for kind in SCALARS if np.can_cast(kind, base)}
+    return frozenset(
+        scalars | {bool} | ({int} if base.kind in "iu" else {float} if base.char == "d" else set())
+    )
 
 
 def leaves_of(space: Space, what: str, where: str = "", on_rounded: OnRounded = lambda _: None) -> list[Leaf]:

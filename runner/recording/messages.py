@@ -98,12 +98,15 @@ def scalar_encoder(name: str, phase: str) -> Callable[[float, int, int], bytes]:
     head = b"\n" + varint(len(named)) + named
     middle = b"\x1a" + varint(len(phased)) + phased
     before_value, before_step = head + b"\x11", middle + b"!"
-    pack = _scalar_struct(len(before_value), len(before_step)).pack
+    pack = _scalar_struct(len(before_value), len(before_step), "cq").pack
+    pack_first = _scalar_struct(len(before_value), len(before_step), "").pack
     pack_value, pack_number = _SCALAR_VALUE.pack, _SCALAR_NUMBER.pack
 
     def encode_scalar(value: float, step: int, episode: int) -> bytes:
         if value and step and episode:
             return pack(before_value, value, before_step, step, b")", episode)
+        if value and step:
+            return pack_first(before_value, value, before_step, step)
         # Protobuf leaves zeros out, but not a negative one.
         is_zero = not value and math.copysign(1.0, value) > 0
         return (
@@ -120,9 +123,9 @@ _SCALAR_NUMBER: Final = struct.Struct("<cq")
 
 
 @lru_cache(256)
-def _scalar_struct(before_value: int, before_step: int) -> struct.Struct:
-    """Return the layout of a `dualtaxi.Scalar` with this many bytes before its value and step."""
-    return struct.Struct(f"<{before_value}sd{before_step}sqcq")
+def _scalar_struct(before_value: int, before_step: int, after: str) -> struct.Struct:
+    """Return the layout of a `dualtaxi.Scalar`: bytes before its value and step, and format after these."""
+    return struct.Struct(f"<{before_value}sd{before_step}sq{after}")
 
 
 def decode(message: MessageType, payload: bytes) -> Message:

@@ -159,7 +159,8 @@ def _settings(with_command: bool) -> dict[str, str]:
     facts["random.state"] = _random_digest(random.getstate()[1])
     if "numpy.random" in sys.modules:
         state: Any = np.random.get_state(legacy=False)["state"]
-        facts["numpy.random.state"] = _digest(state["key"].tobytes() + state["pos"].to_bytes(4))
+        if "key" in state:  # otherwise the user chose another generator
+            facts["numpy.random.state"] = _digest(state["key"].tobytes() + state["pos"].to_bytes(4))
     for name, read in (("torch", _torch), ("jax", _jax)):
         if name in sys.modules:
             with contextlib.suppress(Exception):  # it may be of another version, or being imported
