@@ -139,7 +139,7 @@ class _Branches:
 
     def __init__(self, recording: Recording, at: StepRef) -> None:
         recording.require_job(
-            "what if", "`dualtaxi branch` and runner.branch() play a loop on with one action."
+            "`what_if`", "`dualtaxi branch` and runner.branch() play a loop on with one action."
         )
         require_steps(recording, "branch")
         self._recording, self._at, self._mdp = recording, at, recording.mdp

@@ -98,7 +98,7 @@ def why_in(
     """Return where a Q-value comes from, as `why` does, from an open recording."""
     at = StepRef.parse(at) if isinstance(at, str) else at
     recording.require_job(
-        "where a Q-value comes from",
+        "`why`",
         "`dualtaxi values` shows what a loop's checkpoint expects along a recorded episode.",
     )
     algorithm = recording.config["algorithm"]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
-from runner.errors import RecordingError
+from runner.errors import NotInRecording, RecordingError
 from runner.recording import schema
 from runner.recording.messages import Message, frame_place
 from runner.recording.reader import Recording
@@ -24,7 +24,7 @@ def step_of_episode(recording: Recording, episode: int) -> int:
     """Return the number of training steps taken when `episode` episodes had ended."""
     ended = recording.count(schema.TRAIN_EPISODE)
     if not 0 <= episode <= ended:
-        raise RecordingError(
+        raise NotInRecording(
             f"{recording.path}: found {ended} training episodes, expected at least {episode}."
         )
     if episode == 0:

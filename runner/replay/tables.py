@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.config import from_mapping
-from runner.errors import RecordingError
+from runner.errors import NotInRecording, RecordingError
 from runner.learning.learner import Held, held_of, kinds_of
 from runner.learning.ledger import UNKNOWN_OUTCOME, UPDATE
 from runner.recording import schema
@@ -124,7 +124,7 @@ class TableReplay(StepReplay):
         recording = self._recording
         taken = recording.result.get("train_steps", stop) if recording.leaves_out_steps else self._recorded
         if not recording.leaves_out_steps or taken < stop:
-            return RecordingError(
+            return NotInRecording(
                 f"{recording.path}: found {taken} training steps, expected at least {stop}."
             )
         later = next((snapshot.step for snapshot in recording.snapshots() if snapshot.step >= stop), None)

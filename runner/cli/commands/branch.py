@@ -108,8 +108,9 @@ def branch_command(
         raise click.UsageError("expected --at EPISODE:T, the step to branch at")
     if not run.can_train_again and "all" in actions:
         raise click.UsageError(
-            f"--action all is for runs that were trained here, and run {run.run_id} is a loop: it is played "
-            "on with one action at a time."
+            f"--action all is for runs that were trained here, and run {run.run_id} is a loop: each action "
+            "is a branch of its own, recorded as a run. Give one action, and repeat the command for others: "
+            f"`dualtaxi branch {run.run_id} --at {at} --action VALUE`."
         )
     if run.can_train_again and ("all" in actions or (not isinstance(at, int) and at.after is not None)):
         from runner.analysis.step_reference import reference_to, training_step

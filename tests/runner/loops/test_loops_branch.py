@@ -177,7 +177,7 @@ def test_the_command_and_what_show_lists(runs, tmp_path):
     words = ["branch", run.run_id, "--at", "0:3", "--action", "all", "--recordings", str(tmp_path)]
     refused = CliRunner().invoke(cli, words)
     assert refused.exit_code == 2
-    assert "one action at a time" in refused.output
+    assert "each action is a branch of its own" in refused.output
     text = command("branch", run.run_id, "--at", "0:3", "--action", "0", "--policy", "constant")
     assert re.search(r"parent +\w+ .*terminated\nbranch +\w+ .*terminated", text)
     assert f"dualtaxi diff {run.run_id}" in text

@@ -16,7 +16,7 @@ BRANCH = "/api/v1/runs/first/branch"
 
 def finished(client, number):
     """Return a job when it is over."""
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 600
     while (job := client.get(f"/api/v1/jobs/{number}").json())["state"] in ("queued", "running"):
         assert time.monotonic() < deadline
         time.sleep(0.1)
