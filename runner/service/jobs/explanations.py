@@ -10,7 +10,7 @@ from runner.client.jobs import LogEvent, SweepProgress
 from runner.config.sections import RunTable
 from runner.debugging.explain import (
     DEFAULT_SEEDS,
-    EPISODES,
+    RUNS,
     ExplanationBusy,
     Question,
     answer,
@@ -64,8 +64,9 @@ def run_explain_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
     deadline, stages = time.monotonic() + OTHER_OWNER_SECONDS, set[str]()
 
     def report(done: int, total: int, what: str) -> None:
-        channel.send(SweepProgress(done, total, 0, 0, 0, 0, None))
-        if what == EPISODES and what not in stages:
+        if what == RUNS:
+            channel.send(SweepProgress(done, total, 0, 0, 0, 0, None))
+        elif what not in stages:
             stages.add(what)
             channel.send((LogEvent("two short runs are recorded to find the first step that differs"),))
 
