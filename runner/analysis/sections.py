@@ -26,6 +26,11 @@ class Section:
     diffs: list[list[str]] = field(default_factory=list)
     """Unified diffs, each as its lines."""
 
+    @property
+    def anchor(self) -> str:
+        """The id of the section in a page: its title up to a colon, without blanks."""
+        return re.sub(r"\W+", "-", self.title.partition(":")[0].lower())
+
 
 def markdown(made: Sequence[Section]) -> Iterator[str]:
     """Yield the lines of sections in Markdown."""

@@ -8,17 +8,14 @@ import time
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final, TypeVar
 
 from runner.errors import RunnerError, RunNotFound
 from runner.runs.catalogue.database import Version, version
 from runner.runs.catalogue.folders import Depth
-from runner.runs.catalogue.index import look
+from runner.runs.catalogue.index import Index, look
 from runner.runs.resolve import choose, matching, not_found, of_name, run_of_id
 from runner.runs.run import Run
-
-if TYPE_CHECKING:
-    from runner.runs.catalogue.index import Index
 
 Result = TypeVar("Result")
 

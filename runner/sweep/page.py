@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import ClassVar
 
 from runner.analysis.groups import Group
-from runner.analysis.sections import Grid, Section
+from runner.analysis.sections import Section
 from runner.export.plots.curves import Plot, footnote, panel_plots
 from runner.export.reports.rendering import LegendEntry, View, render
 from runner.sweep.charts import learning, picture_of, picture_plots
@@ -17,21 +16,11 @@ from runner.sweep.results import Results, sections
 
 
 @dataclass(frozen=True)
-class PageSection:
-    """A section of the page."""
-
-    id: str
-    title: str
-    sentences: list[str]
-    grids: list[Grid]
-
-
-@dataclass(frozen=True)
 class _SweepView(View):
     TEMPLATE: ClassVar = "sweep.html"
     title: str
     lead: list[str]
-    sections: list[PageSection]
+    sections: list[Section]
     parameters: list[Plot]
     note: str
     best: str | None
@@ -49,7 +38,7 @@ def render_sweep(results: Results, recordings: Path) -> str:
     view = _SweepView(
         title=ranking.title,
         lead=ranking.sentences,
-        sections=[PageSection("ranking", "Ranking", [], ranking.grids), *map(_section, others)],
+        sections=[Section("Ranking", grids=ranking.grids), *others],
         parameters=picture_plots(picture),
         note=picture.footnote,
         best=results.best_yaml,
@@ -65,8 +54,3 @@ def sweep_legend(groups: list[Group]) -> list[LegendEntry]:
     """Return which trial each group of runs belongs to."""
     parts = (group.described.partition(", ") for group in groups)
     return [LegendEntry(trial, rest) for trial, _, rest in parts]
-
-
-def _section(section: Section) -> PageSection:
-    anchor = re.sub(r"\W+", "-", section.title.partition(":")[0].lower())
-    return PageSection(anchor, section.title, section.sentences, section.grids)

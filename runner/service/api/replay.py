@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Hashable
 from functools import partial
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 from fastapi import APIRouter, Path, Query, Response
 from fastapi.responses import StreamingResponse
@@ -18,13 +18,11 @@ from runner.export.encoded import encoded_pictures
 from runner.export.episodes import place_of
 from runner.export.reports.player_data import Playback
 from runner.recording.reader import open_recording
+from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.dependencies import PicturesOf, RecordedRun, RunComputationOf, recording_state
 from runner.service.pictures import Make, PictureStreams
 from runner.service.problems import error_docs, media_docs
-
-if TYPE_CHECKING:
-    from runner.runs.run import Run
 
 router = APIRouter(
     prefix="/runs/{run}/replay",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, Field
@@ -14,18 +14,15 @@ from runner.recording.labels import MAX_NOTE, MAX_TAGS
 from runner.runs.catalogue.columns import DEFAULT_JSON, columns_of
 from runner.runs.catalogue.columns import as_json as row_as_json
 from runner.runs.catalogue.filters import parse
-from runner.runs.catalogue.index import order_of
+from runner.runs.catalogue.index import Index, order_of
 from runner.runs.run import Run, label
 from runner.service.catalogue import Catalogue
 from runner.service.computed import as_json
 from runner.service.dependencies import CacheOf, CatalogueOf, FoundRun, SettingsOf
 from runner.service.errors import Refused
 from runner.service.problems import error_docs
+from runner.service.settings import Settings
 from runner.util.values import Json
-
-if TYPE_CHECKING:
-    from runner.runs.catalogue.index import Index
-    from runner.service.settings import Settings
 
 router = APIRouter(tags=["runs"])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import datetime
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final
+from typing import Annotated, ClassVar, Final
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
@@ -18,11 +18,9 @@ from runner.service.addresses import Paging
 from runner.service.api.jobs import JobResponse, Number, job_response
 from runner.service.api.uploads import OwnerOf, list_uploads
 from runner.service.dependencies import JobsOf, UploadsOf
+from runner.service.jobs.queue import JobQueue, QueueStatus
+from runner.service.jobs.store import Job
 from runner.service.pages.rendering import page
-
-if TYPE_CHECKING:
-    from runner.service.jobs.queue import JobQueue, QueueStatus
-    from runner.service.jobs.store import Job
 
 router = APIRouter(prefix="/queue", include_in_schema=False)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from http import HTTPStatus
 from itertools import islice
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
@@ -31,6 +31,7 @@ from runner.runs.shards import shards_in_words
 from runner.service import fragments
 from runner.service.api.reading import AxisName
 from runner.service.api.runs import LabelChanges, relabelled
+from runner.service.catalogue import Catalogue
 from runner.service.dependencies import (
     CatalogueOf,
     ComputationOf,
@@ -41,15 +42,12 @@ from runner.service.dependencies import (
     RunComputationOf,
     SettingsOf,
 )
+from runner.service.jobs.queue import JobQueue
 from runner.service.pages.frame import RunView, has_tables, head_of, loop_results
 from runner.service.pages.rendering import Form, message_of, page
+from runner.service.settings import Settings
 from runner.util import humanize
 from runner.util.values import Json
-
-if TYPE_CHECKING:
-    from runner.service.catalogue import Catalogue
-    from runner.service.jobs.queue import JobQueue
-    from runner.service.settings import Settings
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final, NamedTuple
+from typing import Annotated, ClassVar, Final, NamedTuple
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
@@ -23,15 +23,12 @@ from runner.runs.catalogue.columns import (
     field_of,
 )
 from runner.runs.catalogue.filters import Filter, parse
-from runner.runs.catalogue.index import order_of
+from runner.runs.catalogue.index import Index, order_of
 from runner.runs.catalogue.usage import sizes, usage_of
 from runner.service.addresses import Paging, link
+from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf
 from runner.service.pages.rendering import message_of, page, render, viewer_of
-
-if TYPE_CHECKING:
-    from runner.runs.catalogue.index import Index
-    from runner.service.catalogue import Catalogue
 
 router = APIRouter(include_in_schema=False)
 
