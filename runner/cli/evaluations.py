@@ -110,8 +110,7 @@ def _fill(records: Sequence[EvaluationRecord]) -> Columns:
 
 
 def _drawn(columns: Columns) -> Table:
-    grid = table(*(heading.replace(" ", "\n", 1) for heading in columns))
+    headings = (heading.replace(" ", "\n", 1) for heading in columns)
+    grid = table(*headings, rows=zip(*columns.values(), strict=True))
     grid.padding = (0, 1, 0, 0)
-    for row in zip(*columns.values(), strict=True):
-        grid.add_row(*row)
     return grid

@@ -118,8 +118,13 @@ def title(text: str) -> Text:
     return Text.assemble("\n", (text, "bold underline"))
 
 
-def table(*headings: str, left: tuple[str, ...] = (), shrinking: tuple[str, ...] = ()) -> Table:
-    """Return an empty table; cells of a row and headings of several lines are aligned.
+def table(
+    *headings: str,
+    rows: Iterable[Iterable[str]] = (),
+    left: tuple[str, ...] = (),
+    shrinking: tuple[str, ...] = (),
+) -> Table:
+    """Return a table of rows; cells of a row and headings of several lines are aligned.
 
     Columns whose headings are in `left` are aligned to the left, as text is, others to the right; those in
     `shrinking` are truncated where a terminal is too narrow.
@@ -136,6 +141,8 @@ def table(*headings: str, left: tuple[str, ...] = (), shrinking: tuple[str, ...]
             overflow="ellipsis",
             no_wrap=heading not in shrinking,
         )
+    for row in rows:
+        grid.add_row(*row)
     return grid
 
 
@@ -193,10 +200,7 @@ def print_sections(sections: Sequence[Section], as_markdown: bool) -> None:
         draw(title(section.title), *section.sentences)
         for part in section.grids:
             shrinking = part.headings if console().is_terminal else ()
-            grid = table(*part.headings, left=part.headings, shrinking=shrinking)
-            for row in part.rows:
-                grid.add_row(*row)
-            draw(grid)
+            draw(table(*part.headings, rows=part.rows, left=part.headings, shrinking=shrinking))
         for lines in section.diffs:
             draw(patch_text(lines))
 

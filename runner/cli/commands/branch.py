@@ -189,8 +189,8 @@ def _print_episode(parent: Run, branch: Branch, as_json: bool) -> None:
     from runner.loops.branch import Outcome
 
     if as_json:
-        outcomes = {"parent": asdict(branch.parent), "branch": asdict(branch.outcome)}
-        print_json({"run_id": branch.run.run_id, "origin": asdict(branch.origin)} | outcomes)
+        both = {"parent": asdict(branch.parent), "branch": asdict(branch.outcome)}
+        print_json({"run_id": branch.run.run_id, "origin": asdict(branch.origin)} | both)
         return
 
     def returns(outcome: Outcome) -> str:
@@ -200,12 +200,9 @@ def _print_episode(parent: Run, branch: Branch, as_json: bool) -> None:
             for agent, value in outcome.returns.items()
         )
 
-    grid = table("", "run", "return", "length", "end", left=("run", "return", "end"))
-    for title, run_id, each in (
-        ("parent", parent.run_id, branch.parent),
-        ("branch", branch.run.run_id, branch.outcome),
-    ):
-        grid.add_row(title, run_id, returns(each), f"{each.length:,}", each.end)
+    outcomes = (("parent", parent.run_id, branch.parent), ("branch", branch.run.run_id, branch.outcome))
+    played = [(name, run, returns(each), f"{each.length:,}", each.end) for name, run, each in outcomes]
+    grid = table("", "run", "return", "length", "end", rows=played, left=("run", "return", "end"))
     rows = run_facts(branch.run) | {"branched": f"run {parent.run_id} {branch.origin}"}
     draw(facts(rows), grid, facts({"next": command_for(parent, "diff", branch.run.run_id)}))
 
@@ -219,10 +216,7 @@ def _print_what_if(run: Run, at: StepRef, actions: tuple[str, ...], as_json: boo
     if as_json:
         print_json(found.as_json())
         return
-    grid = found.grid
-    drawn = table(*grid.headings, left=("action", "end"))
-    for row in grid.rows:
-        drawn.add_row(*row)
+    drawn = table(*found.grid.headings, rows=found.grid.rows, left=("action", "end"))
     draw(facts({"run": f"{run.run_id}  {run.title}"} | found.facts), "", drawn)
     for note in found.notes:
         say(f"Note: {note}.")

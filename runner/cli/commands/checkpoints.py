@@ -53,19 +53,14 @@ def checkpoints_command(run_name: str, recordings: Path | None, as_json: bool) -
     if not checkpoints:
         say("There are no checkpoints; a loop records one by rec.checkpoint(name, value).")
         return
-    grid = table(*_HEADINGS, left=_LEFT)
-    for each in checkpoints:
-        content = "here" if each.is_here else "missing"
-        grid.add_row(
-            each.reference,
-            each.phase,
-            f"{each.episode:,}",
-            each.format,
-            size(each.size),
-            each.digest[:16],
-            content,
+    rows = (
+        (
+            *(each.reference, each.phase, f"{each.episode:,}", each.format, size(each.size)),
+            *(each.digest[:16], "here" if each.is_here else "missing"),
         )
-    draw(grid)
+        for each in checkpoints
+    )
+    draw(table(*_HEADINGS, rows=rows, left=_LEFT))
 
 
 @click.group("checkpoint", cls=Group)
@@ -174,10 +169,8 @@ def values_command(
     elif output is not None:
         click.echo(f"{output}  {size(output.stat().st_size)}, {len(rows):,} steps")
     else:
-        grid = table(*columns)
-        for row in rows:
-            grid.add_row(*(f"{value:.4g}" if isinstance(value, float) else str(value) for value in row))
-        draw(grid)
+        shown = ((f"{x:.4g}" if isinstance(x, float) else str(x) for x in row) for row in rows)
+        draw(table(*columns, rows=shown))
 
 
 def _columns(name: str, values: Any) -> dict[str, list[Any]]:

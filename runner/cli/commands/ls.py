@@ -279,10 +279,7 @@ def _print_table(rows: Sequence[Row], columns: Sequence[str]) -> None:
         click.echo("\n".join(aligned([headings, *cells], left)))
         return
     left_headings = tuple(heading for heading, is_left in zip(headings, left, strict=True) if is_left)
-    grid = table(*headings, left=left_headings, shrinking=_SHRINKING)
-    for line in cells:
-        grid.add_row(*line)
-    draw(grid)
+    draw(table(*headings, rows=cells, left=left_headings, shrinking=_SHRINKING))
 
 
 def _cell(row: Row, column: str) -> str:

@@ -135,11 +135,9 @@ def push(
     if as_json:
         print_json({"runs": runs})
     elif runs:
-        grid = table("run", "name", "size", "", left=("run", "name", ""))
-        for run in runs:
-            outcome = "was there already" if run["already"] else "stored"
-            grid.add_row(run["run_id"], run["name"], size(run["bytes"]), outcome)
-        draw(grid)
+        outcomes = {True: "was there already", False: "stored"}
+        rows = [(run["run_id"], run["name"], size(run["bytes"]), outcomes[run["already"]]) for run in runs]
+        draw(table("run", "name", "size", "", rows=rows, left=("run", "name", "")))
     if codes:
         raise click.exceptions.Exit(max(codes))
 
@@ -250,12 +248,9 @@ def jobs(limit: int, server: Server, as_json: bool) -> None:
     if as_json:
         print_json({"jobs": [_job_as_json(job) for job in found]})
     elif found:
-        grid = table(
-            "job", "kind", "name", "state", "runs", left=("kind", "name", "state"), shrinking=("name",)
-        )
-        for job in found:
-            grid.add_row(str(job.number), job.kind, job.name, job.state, f"{job.runs:,}")
-        draw(grid)
+        rows = [(str(job.number), job.kind, job.name, job.state, f"{job.runs:,}") for job in found]
+        left = ("kind", "name", "state")
+        draw(table("job", *left, "runs", rows=rows, left=left, shrinking=("name",)))
     else:
         say("No jobs yet. `dualtaxi remote submit FILE` submits one.")
 

@@ -169,10 +169,8 @@ def _prune_explanations(recordings: Sequence[Path], dry_run: bool, yes: bool, as
         say("There is nothing to remove.")
         return
     if not as_json:
-        grid = table("explanation", "runs", "frees", left=("explanation",))
-        for each in found:
-            grid.add_row(each.name, f"{len(each.runs):,}", size(each.bytes))
-        draw(grid)
+        cells = [(each.name, f"{len(each.runs):,}", size(each.bytes)) for each in found]
+        draw(table("explanation", "runs", "frees", rows=cells, left=("explanation",)))
         for run in (run for each in found for run in each.runs if run.refusal):
             say(f"Run {run.run_id} stays: {run.refusal}.")
     if found and not dry_run:
@@ -249,10 +247,7 @@ def _as_json(removal: Removal) -> dict[str, object]:
 def _draw(removals: Sequence[Removal]) -> None:
     rows = [_cells(removal) for removal in removals]
     if console().is_terminal and len(removals) <= _MAX_DRAWN:
-        grid = table(*_HEADINGS, left=_LEFT, shrinking=("name",))
-        for row in rows:
-            grid.add_row(*row)
-        draw(grid)
+        draw(table(*_HEADINGS, rows=rows, left=_LEFT, shrinking=("name",)))
     else:
         lines = [_HEADINGS, *(tuple(map(printable, row)) for row in rows)]
         click.echo("\n".join(aligned(lines, [heading in _LEFT for heading in _HEADINGS])))

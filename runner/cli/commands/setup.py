@@ -70,10 +70,9 @@ def ls(as_json: bool) -> None:
         ]
         print_json({"configs": configs})
         return
-    grid = table("name", "kind", "about", left=("name", "kind", "about"), shrinking=("about",))
-    for each in shipped().values():
-        grid.add_row(each.name, each.kind, each.about)
-    draw(grid)
+    headings = ("name", "kind", "about")
+    rows = ((each.name, each.kind, each.about) for each in shipped().values())
+    draw(table(*headings, rows=rows, left=headings, shrinking=("about",)))
 
 
 @config_command.command("copy")

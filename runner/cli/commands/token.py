@@ -63,10 +63,8 @@ def ls(as_json: bool) -> None:
         print_json({"tokens": [token.as_json() for token in tokens]})
     elif tokens:
         headings = ("id", "name", "scopes", "created")
-        grid = table(*headings, left=headings, shrinking=("name",))
-        for token in tokens:
-            grid.add_row(token.id, token.name, " ".join(token.scopes), token.created)
-        draw(grid)
+        rows = [(token.id, token.name, " ".join(token.scopes), token.created) for token in tokens]
+        draw(table(*headings, rows=rows, left=headings, shrinking=("name",)))
     else:
         say("No tokens yet. `dualtaxi token create NAME` makes one.")
 
