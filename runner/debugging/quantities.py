@@ -274,17 +274,16 @@ class JobColumns:
     def _part(self, block: NDArray[np.void], needed: int) -> tuple[NDArray[np.int64], Columns]:
         changes = None if self._replay is None else self._replay.watch(block, self._watch)
         visits = {each: self._visited(each, block) for each in self._visits}
-        if self._every_step:
-            places = np.arange(len(block))
-        else:
-            found = [np.flatnonzero(mask) for mask in visits.values()]
-            if changes is not None:
-                found.append(changes.row)
-            if self._by_episode:
-                found.append(np.flatnonzero(block["t"] == 0))
-            if 0 <= needed < len(block):
-                found.append(np.array([needed]))
-            places = np.unique(np.concatenate(found)) if found else np.empty(0, np.int64)
+        may_change = np.full(len(block), self._every_step)
+        for mask in visits.values():
+            may_change |= mask
+        if changes is not None:
+            may_change[changes.row] = True
+        if self._by_episode:
+            may_change |= block["t"] == 0
+        if 0 <= needed < len(block):
+            may_change[needed] = True
+        places = np.flatnonzero(may_change)
         columns: dict[Quantity, Array] = {}
         if len(places):
             columns = self._of_steps(block[places])

@@ -22,7 +22,6 @@ from runner.export.values import Values
 from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.reader import Recording
-from runner.replay.environment import redo_in_child
 from runner.replay.steps import check_steps, recorded_frames, reset_of, transitions_of
 
 SCENE_SIZE: Final = 480
@@ -110,6 +109,8 @@ def redrawn(
         CannotRedo: the environment cannot be made again, or draws no pictures.
         EnvironmentDiffers: it differs from the recording, of which no picture comes after that step.
     """
+    from runner.replay.environment import redo_in_child  # loads Gymnasium
+
     blocks: Any = redo_in_child(
         recording.path, phase, episodes, render=True, trust=trust, draw_from=draw_from
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -24,7 +25,7 @@ from runner.cli.options import (
 from runner.cli.output import print_json, print_sections, require_one_form, require_page, say
 from runner.cli.parameter_types import INDEX, RunName
 from runner.cli.progress import stage_line
-from runner.cli.runs import find_all_recorded, find_recorded
+from runner.cli.runs import compilation_notice, find_all_recorded, find_recorded
 from runner.errors import ExitCode
 from runner.export.places import write_text_new
 from runner.util.humanize import size
@@ -246,7 +247,8 @@ def diff_command(
         require_page(html, force)
     left, right = find_recorded(a, recordings), find_recorded(b, recordings)
     with open_recording(left.recording) as recording_a, open_recording(right.recording) as recording_b:
-        with stage_line("comparing") as stage:
+        notice = compilation_notice() if left.can_train_again else contextlib.nullcontext()
+        with notice, stage_line("comparing") as stage:
             difference = differences.diff(recording_a, recording_b, dict(targets), first)
             difference = difference if first else differences.with_seconds(difference, left, right)
             difference = differences.without_ignored(difference, ignore, everything)

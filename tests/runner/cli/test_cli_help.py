@@ -114,6 +114,10 @@ def _imported(*words):
     return set(done.stderr.splitlines()[-1].split())
 
 
+def test_playing_a_job_imports_no_gymnasium(recorded):
+    assert "gymnasium" not in _imported("play", "tiny", "--recordings", recorded.recordings)
+
+
 @pytest.mark.parametrize("word", ["--help", "--version"])
 def test_help_imports_nothing_heavy(word):
     assert not _imported(word) & HEAVY
