@@ -11,12 +11,12 @@ from typing import Annotated, Any, Final, Literal, Self, get_args
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
-from runner.config.branches import Branch
 from runner.config.document import write_yaml
 from runner.config.schedules import Probability, StepSize
 from runner.config.sections import (
     Algorithm,
     AlgorithmSection,
+    Branch,
     Environment,
     Evaluation,
     Exploration,

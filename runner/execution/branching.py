@@ -18,8 +18,8 @@ from typing import Final
 from runner.analysis.diff.divergence import first_difference, unbroken
 from runner.analysis.step_reference import StepRef, parse_step, reference_to, training_step, training_steps
 from runner.config import ExperimentConfig, from_mapping
-from runner.config.branches import Branch, Changes
 from runner.config.job import Job
+from runner.config.sections import Branch, Changes
 from runner.environments.mdp import Mdp
 from runner.environments.naming import agent_actions, agent_of, joint_action, numbered_actions, own_action
 from runner.errors import ConfigError, RunnerError

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from runner.config.loading import packing_from
 from runner.errors import truncated_message
-from runner.loops.copied_extras import CopiedExtras
-from runner.loops.copied_rows import Copied, CopiedMessages, CopiedRows
+from runner.loops.copied_rows import Copied, CopiedExtras, CopiedMessages, CopiedRows
 from runner.loops.options import PACKING
 from runner.loops.outcomes import Outcomes
 from runner.loops.shard_sources import PHASES, Source

@@ -22,7 +22,7 @@ from runner.loops.fold import Fold, Report, ending_of_run
 from runner.loops.shard_sources import Source
 from runner.recording.metadata import json_object
 from runner.recording.reader import open_recording
-from runner.recording.salvage import DamagedFile
+from runner.recording.repair import DamagedFile
 from runner.runs.listing import run_at
 from runner.runs.run import RECORDING_FILE, SHARDS_FOLDER, Run
 from runner.runs.shards import ENDS_AS, are_over, handed_over, shards_locked, shards_of

@@ -286,8 +286,8 @@ def test_a_changed_action_is_found(tmp_path, monkeypatch):
                 piece.rows["action"][40] ^= 1
             yield piece
 
-    monkeypatch.setattr("runner.execution.rerecord_loop.pieces", changed)
-    from runner.execution.rerecord_loop import _write
+    monkeypatch.setattr("runner.execution.rerecord.pieces", changed)
+    from runner.execution.rerecord import _write
 
     with pytest.raises((CannotRedo, Diverged)):
         _write(run.recording, tmp_path / "fresh.mcap", trust=False)
