@@ -147,8 +147,7 @@ class WhatIf:
     def picture(self, style: str = svg.STYLE) -> str:
         """Return the grid in the state of the step, as SVG; empty without a scene.
 
-        Args:
-            style: CSS of the picture; empty if the page has it.
+        The style is CSS of the picture; empty if the page has it.
         """
         drawing = svg.drawing_of(self.mdp)
         if drawing is None:
@@ -160,10 +159,8 @@ class WhatIf:
         """Return the actions of two agents as a matrix, as SVG; empty for other environments.
 
         The first agent's actions are the rows. A cell has the exact values of its joint action, or its
-        returns where there are none, and the colour of their sum.
-
-        Args:
-            address: called with a joint action, returns the address that its cell links to.
+        returns where there are none, and the colour of their sum; `address` returns what the cell of a joint
+        action links to.
         """
         mdp = self.mdp
         if len(mdp.agents) != 2 or len(self.actions) < mdp.joint_actions:

@@ -31,11 +31,9 @@ class Moment(NamedTuple):
 
 
 class Continuation:
-    """An episode played on, by the kernels that record episodes.
+    """An episode played on from a moment, by the kernels that record episodes.
 
-    Args:
-        learner: its tables are those of the moment; they do not change.
-        moment: the step.
+    The tables of the learner are those of the moment; they do not change.
     """
 
     def __init__(self, learner: Learner, moment: Moment) -> None:
@@ -90,10 +88,8 @@ class Continuation:
     def play(self, action: int, steps: NDArray[np.void], episodes: NDArray[np.void]) -> int:
         """Take a joint action, play on until the episode ends or `steps` is full, and return the steps taken.
 
-        Args:
-            action: the first one, whatever the policy would choose.
-            steps: step records of the phase, filled.
-            episodes: one episode record of the phase, overwritten.
+        The action is taken whatever the policy would choose. `steps` are step records of the phase, filled;
+        `episodes` is one episode record of the phase, overwritten.
         """
         moment, learner = self._moment, self._learner
         cursor = np.zeros(1, kernel.CURSOR)

@@ -249,11 +249,7 @@ def answer(
 
 
 def _resolved(source: Source, recordings: Path) -> tuple[Side, ExperimentConfig, int]:
-    """Return a name, the configuration and the seed of a run or a configuration.
-
-    Raises:
-        RunnerError: there is none, or it is a loop, whose learning is the user's own.
-    """
+    """Return a name, the configuration and the seed of a run or a configuration."""
     if isinstance(source, Mapping):
         source = from_mapping(source)
     if isinstance(source, str | os.PathLike):
@@ -282,9 +278,6 @@ def check_metric(question: Question) -> None:
     """Check that evaluations of A and of B have the metric, by an episode of each.
 
     Rewards are not checked: `training.reward.VALUE` depends on what was received.
-
-    Raises:
-        RunnerError: there is no such metric.
     """
     mixing, metric = question.mixing, question.metric
     if metric is None or metric.startswith("training.reward"):
@@ -300,12 +293,7 @@ def check_metric(question: Question) -> None:
 def _metric_of(sides: Sequence[Readings], metric: str | None) -> str:
     """Return the metric: the one that was chosen, the success rate, or the mean return.
 
-    Args:
-        sides: the readings of A and of B.
-        metric: the chosen one.
-
-    Raises:
-        RunnerError: there is no such metric in evaluations of A and of B.
+    The sides are the readings of A and of B.
     """
     shared = {name for name in sides[0] if all(side.get(name) is not None for side in sides)}
     candidates = [metric] if metric is not None else ["success_percent", "mean_return"]

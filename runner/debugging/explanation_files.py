@@ -33,11 +33,7 @@ MAX_VALUE: Final = 1e15
 
 
 def write_explanation(explanation: Explanation, recordings: Path) -> None:
-    """Write a result next to what it was computed from.
-
-    Raises:
-        StorageError: the folder cannot be written.
-    """
+    """Write a result next to what it was computed from."""
     path = recordings / FOLDER / f"{explanation.name}.json"
     with storage_errors(path), replacing(path) as fresh:
         fresh.write_text(json.dumps(explanation.as_json()), encoding="utf-8")
@@ -82,12 +78,7 @@ def trained_in(recordings: Path) -> list[Trained]:
 
 
 def remove_trained(trained: Trained) -> None:
-    """Remove what an explanation trained, but runs that are kept or in use.
-
-    Raises:
-        RunnerError: it is being computed.
-        StorageError: a file cannot be removed.
-    """
+    """Remove what an explanation trained, but runs that are kept or in use."""
     lock = acquired(trained.folder / LOCK, RunnerError(f"{trained.name} is being computed; it stays."))
     try:
         for run in trained.runs:
@@ -104,11 +95,7 @@ def remove_trained(trained: Trained) -> None:
 
 
 def read_explanation(name: str, recordings: Path) -> Explanation:
-    """Return a result from its file.
-
-    Raises:
-        RunnerError: there is none of this name, or its file is damaged.
-    """
+    """Return a result from its file."""
     from pydantic import TypeAdapter, ValidationError
 
     known = explanations_in(recordings)

@@ -92,12 +92,7 @@ Resolve = Callable[["Parser", ast.expr], Term]
 
 
 class Parser:
-    """Parses one expression.
-
-    Args:
-        text: the expression.
-        resolve: finds quantities.
-    """
+    """Parses one expression."""
 
     def __init__(self, text: str, resolve: Resolve) -> None:
         self.text = " ".join(text.split("\n")).strip()
@@ -106,11 +101,7 @@ class Parser:
         self._conditions: dict[str, Term] = {}
 
     def parse(self) -> Expression:
-        """Return the parsed expression.
-
-        Raises:
-            RunnerError: it is no condition over quantities, or too large; a line marks the place.
-        """
+        """Return the parsed expression."""
         condition = self._condition(self._tree())
         if not self._quantities:
             raise RunnerError(f"expression: found {self.text}, expected a quantity in it that changes.")
@@ -300,15 +291,9 @@ class Parser:
     # --- names ------------------------------------------------------------------------------------------
 
     def number_of(self, node: ast.expr, names: Sequence[str], what: str) -> int:
-        """Return the state or action that a number or a name stands for.
+        """Return the state or action that a number or a name stands for, among all names by number.
 
-        Args:
-            node: the number or the name.
-            names: all names, by number.
-            what: `state` or `action`, for errors.
-
-        Raises:
-            RunnerError: there is none, or several have this name.
+        `what` is `state` or `action`, for errors.
         """
         constant = node.operand if isinstance(node, ast.UnaryOp) else node
         value = constant.value if isinstance(constant, ast.Constant) else None

@@ -73,11 +73,7 @@ class Mixing:
         return (1 << len(self.factors)) - 1
 
     def config(self, mixture: int) -> ExperimentConfig:
-        """Return the configuration of a mixture: the values of B where its bits are 1, else those of A.
-
-        Raises:
-            ConfigError: the values contradict each other.
-        """
+        """Return the configuration of a mixture: the values of B where its bits are 1, else those of A."""
         paths = [change.path for factor in self.chosen(mixture) for change in factor.changes]
         return from_mapping(_mixed(self.a.to_mapping(), self.b.to_mapping(), paths))
 
@@ -89,15 +85,8 @@ class Mixing:
 def mix(a: ExperimentConfig, b: ExperimentConfig, at: int | None = None, exact: bool = False) -> Mixing:
     """Return the settings in which two experiments differ, grouped so that they can be mixed.
 
-    Args:
-        a: one experiment.
-        b: another.
-        at: the number of training episodes after which they are compared; by default each at its own end.
-        exact: whether evaluations need exact measures.
-
-    Raises:
-        RunnerError: they differ in no setting, in too many, or in settings that cannot be mixed; or one of
-            them trains fewer episodes than `at`.
+    They are compared after `at` training episodes, by default each at its own end; `exact` is whether
+    evaluations need exact measures.
     """
     for name, config in (("A", a), ("B", b)):
         if at is not None and at > config.episodes:
@@ -168,11 +157,7 @@ def _mixed(a: Json, b: JsonView, paths: Sequence[str]) -> Json:
 
 
 def _grouped(mixing: Mixing) -> Mixing:
-    """Return the mixing with settings merged until each of its mixtures is valid.
-
-    Raises:
-        RunnerError: A or B itself cannot be used.
-    """
+    """Return the mixing with settings merged until each of its mixtures is valid."""
     notes = list(mixing.notes)
     for mixture in (0, mixing.everything):
         if problem := _problem(mixing, mixture):

@@ -45,20 +45,12 @@ def first_step(
     """Record A with and without one setting of B, until they differ; return where they do.
 
     If they do not, all settings of B with and without this one are recorded. The runs are not listed among
-    those of the recordings folder: they are found by their ids.
-
-    Args:
-        mixing: the two configurations.
-        number: of the setting.
-        seed: the seed of the runs.
-        recordings: the recordings folder.
-        name: the name of the explanation, which the runs have as a tag.
-        report: called a few times a second with the episodes recorded, and of how many.
-        stop: called every few milliseconds; return True to stop.
+    those of the recordings folder: they are found by their ids, and have the name of the explanation as a
+    tag. `report` is called a few times a second with the episodes recorded, and of how many; `stop` is called
+    every few milliseconds, and returns True to stop.
 
     Raises:
         KeyboardInterrupt: `stop` returned True.
-        StorageError: the recordings folder cannot be written.
     """
     bit, setting, folder = 1 << number, mixing.factors[number].name, recordings / UNLISTED
     tag = TAG.format(name)

@@ -99,14 +99,7 @@ def measure(
 ) -> Readings | None:
     """Train an experiment with a seed to its end, in memory, and return the readings there; None if stopped.
 
-    Args:
-        config: the experiment, with an evaluation.
-        seed: the seed.
-        recordings: the folder of the run that it takes its initial tables from.
-        stop: returns whether to stop.
-
-    Raises:
-        RunnerError: the environment cannot be used, or there is no run with the initial tables.
+    The experiment has an evaluation; the run with its initial tables is looked for in the recordings folder.
     """
     plan = config.evaluation
     assert plan is not None
@@ -156,14 +149,9 @@ def _environment_digest(env_id: str, kwargs: str, rewards: str) -> str:
 
 
 class Mixtures:
-    """The readings of mixtures, measured when they are needed.
+    """The readings of mixtures, measured when they are needed, and kept in a folder.
 
-    Args:
-        mixing: the two configurations.
-        seeds: the seeds of each mixture.
-        recordings: the recordings folder.
-        folder: where the readings are kept.
-        report: called several times a second with the number of runs done, and of those known to be needed.
+    `report` is called several times a second with the number of runs done, and of those known to be needed.
     """
 
     def __init__(
@@ -210,11 +198,7 @@ class Mixtures:
         return [self._found[mixture, seed] for seed in self._seeds if (mixture, seed) in self._found]
 
     def values(self, mixtures: Sequence[int], metric: str) -> NDArray[np.float64]:
-        """Return the values of a metric in mixtures, [mixtures, seeds].
-
-        Raises:
-            RunnerError: a mixture does not have it, or not as a finite number.
-        """
+        """Return the values of a metric in mixtures, [mixtures, seeds]."""
         rows = []
         for mixture in mixtures:
             row = [read.get(metric) for read in self.readings(mixture)]
@@ -230,12 +214,7 @@ class Mixtures:
     def measure(
         self, mixtures: Sequence[int], workers: Workers[Measurement, Measured], seeds: int | None = None
     ) -> None:
-        """Measure mixtures with all seeds, or the first `seeds`, if they are not known yet.
-
-        Raises:
-            RunnerError: a mixture cannot be run, or a worker died twice at it.
-            StorageError: the readings cannot be written.
-        """
+        """Measure mixtures with all seeds, or the first `seeds`, if they are not known yet."""
         waiting = deque(self._tasks(mixtures, self._seeds[:seeds]))
         left = sum(len(task.seeds) for task in waiting)
         busy, died = 0, list[Measurement]()

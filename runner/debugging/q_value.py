@@ -202,15 +202,7 @@ def _step(part: StepPart, cells: tuple[str, str, str]) -> tuple[str, ...]:
 
 
 def why_body(found: Why, linked: bool) -> str:
-    """Return the part of a page that shows a Q-value as a sum.
-
-    Args:
-        found: the sum.
-        linked: link each step to its replay on a server.
-
-    Raises:
-        MissingExtra: Jinja2 is not installed.
-    """
+    """Return the part of a page that shows a Q-value as a sum; linked, each step links to its replay."""
     parts = partials()
     whole, steps, *rest = sections_of(found)
     steps_at = [StepRef.parse(step.at) for step in found.steps]

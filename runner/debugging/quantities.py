@@ -57,11 +57,7 @@ class Quantity:
 
 
 class JobVocabulary:
-    """Finds the quantities that an expression names; `quantities` lists them.
-
-    Args:
-        recording: of a job.
-    """
+    """Finds the quantities that an expression names; `quantities` lists them."""
 
     def __init__(self, recording: Recording) -> None:
         self._mdp = recording.mdp
@@ -84,11 +80,7 @@ class JobVocabulary:
         return tuple((number, self._state_names[number]) for number in numbers)
 
     def resolve(self, parser: Parser, node: ast.expr) -> Term:
-        """Return the quantity that a node names.
-
-        Raises:
-            RunnerError: there is none.
-        """
+        """Return the quantity that a node names."""
         head = node.value if isinstance(node, ast.Subscript) else node
         base = head.value if isinstance(head, ast.Attribute) else head
         if not isinstance(base, ast.Name) or base.id not in NAMES:
@@ -175,14 +167,7 @@ class JobVocabulary:
 class JobColumns:
     """The values of quantities after training steps, in blocks of which only the changes are taken.
 
-    Args:
-        recording: of a job.
-        quantities: what to read.
-        start: the first training step; the tables are those before it.
-
-    Raises:
-        RunnerError: the quantities are too many.
-        RecordingError: the tables or the visits before `start` are not known.
+    `start` is the first training step; the tables are those before it.
     """
 
     def __init__(self, recording: Recording, quantities: list[Quantity], start: int) -> None:
@@ -255,11 +240,8 @@ class JobColumns:
     def take(self, block: NDArray[np.void], needed: int) -> Iterator[tuple[NDArray[np.int64], Columns]]:
         """Yield the steps after which quantities may have changed, as places in a block, and their values.
 
-        The values have a row more, before the others: those before the first of the steps.
-
-        Args:
-            block: the training steps that follow.
-            needed: a place in the block that is included in any case; -1 for none.
+        The block has the training steps that follow. The values have a row more, before the others: those
+        before the first of the steps. The place `needed` is included in any case; -1 for none.
         """
         width = max(len(self._watch.cells), 1)
         size = max(_VALUES_AT_ONCE // width, 1)
@@ -357,11 +339,7 @@ class JobColumns:
 
 
 def check_lost(recording: Recording, expected: int, found: int) -> None:
-    """Refuse training steps of which some were lost before the step that was found.
-
-    Raises:
-        RecordingError: another step was expected.
-    """
+    """Refuse training steps of which some were lost before the step that was found."""
     if found != expected:
         raise RecordingError(
             f"{recording.path}: training steps {expected:,} to {found - 1:,} were lost, so what holds after "

@@ -21,14 +21,8 @@ T = TypeVar("T")
 def shapley_values(values: Values) -> Values:
     """Return the share of each setting: its effect, averaged over all orders in which settings change.
 
-    L. S. Shapley, "A value for n-person games", 1953. The shares of all settings add up to the difference
-    between the last mixture and the first.
-
-    Args:
-        values: of every mixture, [2^k, columns].
-
-    Returns:
-        [k, columns].
+    L. S. Shapley, "A value for n-person games", 1953. The shares of all settings, [k, columns], add up to the
+    difference between the last mixture and the first, of values [2^k, columns].
     """
     count = len(values).bit_length() - 1
     masks = np.arange(len(values))
@@ -42,16 +36,11 @@ def shapley_values(values: Values) -> Values:
 
 
 def shapley_interactions(values: Values) -> dict[tuple[int, int], Values]:
-    """Return for each pair of settings what both do beyond what each does, averaged over the others.
+    """Return for each pair of settings (i, j), i < j, what both do beyond each, averaged over the others.
 
     The Shapley interaction index of M. Grabisch and M. Roubens, "An axiomatic approach to the concept of
-    interaction among players in cooperative games", 1999. It is 0 for settings whose effects add up.
-
-    Args:
-        values: of every mixture, [2^k, columns].
-
-    Returns:
-        [columns] by pair (i, j), i < j.
+    interaction among players in cooperative games", 1999, [columns] of values [2^k, columns]. It is 0 for
+    settings whose effects add up.
     """
     count = len(values).bit_length() - 1
     masks = np.arange(len(values))
@@ -75,10 +64,7 @@ def minimal_set(items: Sequence[T], holds: Callable[[Sequence[T]], bool]) -> lis
     """Return items for which a property holds, and of which none can be left out.
 
     Delta debugging (A. Zeller and R. Hildebrandt, "Simplifying and isolating failure-inducing input", 2002).
-
-    Args:
-        items: for which it holds; it does not hold for no items at all.
-        holds: returns whether it holds for some of the items, in their order.
+    `holds` takes some of the items, in their order; it is so of all of them, and not of none.
     """
     left, parts = list(items), 2
     while len(left) > 1:

@@ -64,18 +64,9 @@ class Weights:
 def weights_of(
     recording: Recording, cell: Cell, stop: int, limit: int, report: Callable[[int], None]
 ) -> Weights:
-    """Return the weights of a Q-value after a number of training steps.
+    """Return the weights of a Q-value after a number of training steps of a job that learns.
 
-    Args:
-        recording: of a job that learns.
-        cell: the Q-value.
-        stop: the number of training steps.
-        limit: the most steps in `Weights.largest`.
-        report: called with the number of steps read so far.
-
-    Raises:
-        RecordingError: the steps are not recorded, or the environment cannot have them.
-        StorageError: the temporary file cannot be written.
+    `limit` is the most steps in `Weights.largest`; `report` is called with the number of steps read so far.
     """
     replay = TableReplay(recording)
     learner, model = replay.learner, replay.learner.model
@@ -134,11 +125,7 @@ def weights_of(
 def _updates(
     recording: Recording, replay: TableReplay, learner: int, stop: int
 ) -> Iterator[NDArray[np.void]]:
-    """Yield what decides the weights of a learner's updates up to a step, in parts of `STEPS_AT_ONCE`.
-
-    Raises:
-        RecordingError: the numbers of the steps' episodes decrease; compiled code uses them as indices.
-    """
+    """Yield what decides the weights of a learner's updates up to a step, in parts of `STEPS_AT_ONCE`."""
     episode = 0
     while replay.step < stop:
         first = replay.step

@@ -107,14 +107,9 @@ def branched(recording: Recording, at: StepRef, action: str | int) -> Branched:
 def branch_playback(
     recording: Recording, at: StepRef, action: str | int, limit: int, first: int = 0
 ) -> Playback:
-    """Return what a page plays of the episode to which an action leads; errors as for `what_if`.
+    """Return what a page plays of the episode to which a joint action leads: at most `limit` steps.
 
-    Args:
-        recording: the run.
-        at: the step of the branch.
-        action: the joint action there.
-        limit: the largest number of steps.
-        first: the first step.
+    They begin with step `first`; errors as for `what_if`.
     """
     found = branched(recording, at, action)
     shown = found.steps[first : first + limit]
@@ -126,16 +121,7 @@ def branch_playback(
 
 
 class _Branches:
-    """The branches of one step of a recorded episode.
-
-    Args:
-        recording: of a job.
-        at: the step.
-
-    Raises:
-        RecordingError: there is no such step, its tables are unknown, or it is damaged.
-        RunnerError: it is the recording of a loop.
-    """
+    """The branches of one step of a recorded episode of a job."""
 
     def __init__(self, recording: Recording, at: StepRef) -> None:
         recording.require_job(

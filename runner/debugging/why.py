@@ -174,12 +174,7 @@ def _learner(recording: Recording, agent: str | None) -> int:
 
 
 def _step_at(recording: Recording, at: StepRef | None) -> NDArray[np.void]:
-    """Return the record of a step.
-
-    Raises:
-        ConfigError: none is given.
-        RecordingError: there is no such step.
-    """
+    """Return the record of a step."""
     if at is None:
         raise ConfigError(
             "found no state or no action, expected both, or a step (`at`) whose state and action are meant."
@@ -195,11 +190,7 @@ def _step_at(recording: Recording, at: StepRef | None) -> NDArray[np.void]:
 
 
 def _steps_before(recording: Recording, at: StepRef) -> int:
-    """Return the training steps that the tables at a step have learned from.
-
-    Raises:
-        RecordingError: there is no such step.
-    """
+    """Return the training steps that the tables at a step have learned from."""
     place = place_of(recording, at.which)
     if at.after is not None:
         return place.table_step

@@ -187,11 +187,7 @@ def _prune_explanations(recordings: Sequence[Path], dry_run: bool, yes: bool, as
 
 
 def _confirm(question: str, yes: bool) -> None:
-    """Ask before something is removed.
-
-    Raises:
-        RunnerError: there is no terminal to ask on.
-    """
+    """Ask before something is removed."""
     if not yes and not sys.stdin.isatty():
         raise RunnerError("there is no terminal to ask on; --yes removes without asking, --dry-run shows.")
     if not yes:
