@@ -11,11 +11,8 @@ import inspect
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from gymnasium.envs.registration import EnvSpec
-
-from runner.environments.gym_types import Env
 from runner.errors import CannotRedo
 from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
@@ -33,6 +30,11 @@ from runner.replay.specifications import (
     vector_wrappers,
     why_not_imported,
 )
+
+if TYPE_CHECKING:
+    from gymnasium.envs.registration import EnvSpec
+
+    from runner.environments.gym_types import Env
 
 _OF_VECTORS: Final = frozenset({"num_envs", "vectorization_mode", "vector_kwargs", "max_episode_steps"})
 """Arguments of `make_vec` in the specification of a vector, which its environments do not take."""
