@@ -27,6 +27,7 @@ from runner.execution.initial_tables import recorded_tables
 from runner.execution.session import Report, Stop, run_job
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
+from runner.recording.reuse import PackedChunks
 from runner.runs.branches import TrainingOrigin, origin_in
 from runner.runs.run import Run, create_run, recordings_folder, unless_empty
 from runner.util.values import checked_run_name
@@ -102,9 +103,12 @@ def train_branch(parent: Recording, job: Job, run: Run, report: Report, stop: St
     Raises:
         RunnerError: the episodes before the branch are not those of the parent.
     """
+    step, packing = job.config.branches[-1].step, from_mapping(parent.config).recording.packing
     with unless_empty(run):
-        own = run_job(job, run, report, stop, mdp=parent.mdp, initial=recorded_tables(parent))
-    _check_beginning(parent, own, reference_to(parent, job.config.branches[-1].step).episode)
+        packed = PackedChunks.before(parent, step) if job.config.recording.packing == packing else None
+        initial = recorded_tables(parent)
+        own = run_job(job, run, report, stop, mdp=parent.mdp, initial=initial, packed=packed)
+    _check_beginning(parent, own, reference_to(parent, step).episode)
     return own
 
 

@@ -32,6 +32,7 @@ from runner.recording.metadata import (
 from runner.recording.metrics import METRICS, defined_metrics
 from runner.recording.recorder import Recorder
 from runner.recording.reference import Reference
+from runner.recording.reuse import PackedChunks
 from runner.recording.writer import RecordingFile, create_recording
 from runner.runs import run as runs
 from runner.runs.code import CodeCollector
@@ -85,6 +86,7 @@ def run_job(
     mdp: Mdp | None = None,
     threads: bool = True,
     initial: Sequence[Held] | None = None,
+    packed: PackedChunks | None = None,
 ) -> Run:
     """Train, evaluate and record a job; return its run, finished or interrupted.
 
@@ -107,7 +109,8 @@ def run_job(
             made_by = provenance_entries(with_command=job.config.recording.code)
             describe(file, job, run, learner, made_by)
             run = run.update(provenance={key: made_by[key] for key in runs.MADE_BY if key in made_by})
-        recorder = recorder_for(job, learner, file, beat=code.beat(run, file), threads=threads)
+        beat = code.beat(run, file)
+        recorder = recorder_for(job, learner, file, beat=beat, threads=threads, packed=packed)
         return execute(Session(job, learner, recorder, report, stop, observer), file, run, started, code)
 
 
@@ -347,6 +350,7 @@ def recorder_for(
     beat: Callable[[], None] = lambda: None,
     threads: bool = True,
     clock: bool = True,
+    packed: PackedChunks | None = None,
 ) -> Recorder:
     """Return a recorder for a learner's steps into a file, packed as in the job's configuration."""
     options = job.config.recording
@@ -362,6 +366,7 @@ def recorder_for(
         clock=clock,
         system=options.system,
         console=LineRedactor() if options.console else None,
+        packed=packed,
     )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 import threading
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from typing import Final
@@ -40,6 +41,9 @@ _DATA_LENGTH: Final = struct.Struct("<Q")
 _MAX_NAME_BYTES: Final = 4
 """The length of the longest name of a compression, `zstd`."""
 
+Packed = Callable[[str, int, int], bytes | memoryview | None]
+"""Returns records packed, by compression, size and checksum, if they were packed before."""
+
 
 @dataclass(frozen=True)
 class Chunk:
@@ -61,19 +65,21 @@ def encode_chunk(
     log_times: NDArray[np.uint64],
     offsets: NDArray[np.uint64],
     packing: Packing,
+    packed: Packed | None = None,
 ) -> Chunk:
     """Return the chunk that holds these whole message records of one topic.
 
     `log_times`: nanoseconds of each, ascending.
     `offsets`: where each begins in `records`.
+    `packed`: may return the records packed; by default, and if it does not, they are packed here.
     """
     name = "" if packing.compression == "none" else packing.compression
     width = len(records) // len(log_times) if topic.message is TRANSITION else 0
-    data = _compress(records, packing, width)
+    start, end, size, crc = int(log_times[0]), int(log_times[-1]), len(records), zlib.crc32(records)
+    data = (packed and packed(name, size, crc)) or _compress(records, packing, width)
     if topic.message is ACTIONS and len(data) * _MOSTLY_ZEROS < len(records):  # quick at any level
         data = _compress(records, replace(packing, level=MAX_LEVEL), width)
-    start, end, size = int(log_times[0]), int(log_times[-1]), len(records)
-    head = CHUNK_HEAD.pack(start, end, size, zlib.crc32(records), len(name)) + name.encode()
+    head = CHUNK_HEAD.pack(start, end, size, crc, len(name)) + name.encode()
     head += _DATA_LENGTH.pack(len(data))
     record = b"".join((RECORD_HEAD.pack(Opcode.CHUNK, len(head) + len(data)), head, data))
     indexed = has_message_index(topic, packing.index == "message")
@@ -94,10 +100,8 @@ def message_index(channel: int, log_times: NDArray[np.uint64], offsets: NDArray[
     entries = np.empty((len(log_times), 2), dtype="<u8")
     entries[:, 0] = log_times
     entries[:, 1] = offsets
-    return (
-        struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + entries.nbytes, channel, entries.nbytes)
-        + entries.tobytes()
-    )
+    head = struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + entries.nbytes, channel, entries.nbytes)
+    return b"".join((head, entries.data))
 
 
 def _compress(records: bytes | memoryview, packing: Packing, width: int) -> bytes:

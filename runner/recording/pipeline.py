@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.recording.blocks import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, message_record
-from runner.recording.chunks import Chunk, encode_chunk
+from runner.recording.chunks import Chunk, Packed, encode_chunk
 from runner.recording.digest import ContentHash
 from runner.recording.schema import Topic
 from runner.recording.writer import RecordingFile, storage_error
@@ -104,6 +104,7 @@ class Pipeline:
         offsets: NDArray[np.uint64],
         write: bool = True,
         done: Callable[[], None] = lambda: None,
+        packed: Packed | None = None,
     ) -> None:
         """Send message records of one topic; waits while too much is pending.
 
@@ -111,10 +112,11 @@ class Pipeline:
         `log_times`: nanoseconds, one a record.
         `write`: False leaves them out of the file; the digest covers them all the same.
         `done`: called when they were written, by the thread that writes.
+        `packed`: as for `encode_chunk`.
         """
         encode = None
         if write and self._file is not None:
-            encode = partial(encode_chunk, topic, records, log_times, offsets, self._packing)
+            encode = partial(encode_chunk, topic, records, log_times, offsets, self._packing, packed)
         self._enqueue(_Work(topic, records, encode, done))
 
     def submit(self, topic: Topic, make: Callable[[], bytes], log_time: int) -> None:

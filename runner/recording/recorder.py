@@ -23,7 +23,9 @@ from runner.recording.digest import combined_digest
 from runner.recording.observer import Observer
 from runner.recording.pipeline import MessageBatches, Pipeline
 from runner.recording.reference import Reference
+from runner.recording.reuse import PackedChunks
 from runner.recording.schema import STEP_NANOSECONDS, Topic
+from runner.recording.topic_chunks import ChunkSpan
 from runner.recording.writer import RecordingFile
 from runner.util.arrays import Records
 from runner.util.packing import Packing
@@ -65,6 +67,8 @@ class _Lane:
     """Number of whole blocks, at most `MAX_BLOCKS`."""
     has_started: bool = False
     """Whether it had its first block, which may be smaller."""
+    span: ChunkSpan | None = None
+    """The packed chunk that may be used for the open block."""
 
 
 class Recorder:
@@ -83,6 +87,7 @@ class Recorder:
     `system`: whether to record what the process uses of its machine; only with the clock.
     `console`: returns a line of the process's output as it is to be recorded, without secrets; None records
     no output. Only with the clock.
+    `packed`: the chunks of another recording, used again for the same messages.
     """
 
     def __init__(
@@ -101,10 +106,12 @@ class Recorder:
         clock: bool = True,
         system: bool = False,
         console: Callable[[str], str] | None = None,
+        packed: PackedChunks | None = None,
     ) -> None:
         packing = packing or Packing()
         self._file = file
         self._watch = watch
+        self._packed = packed
         self._chunk_steps = packing.chunk_steps
         self._first_records = _FIRST_RECORDS if before is not None else None
         self._reference = reference or Reference()
@@ -169,8 +176,11 @@ class Recorder:
         if lane.open is None:
             lane.open = self._take_block(lane)
         free = lane.open.records[lane.open.filled :]
-        already = self._reference.remaining(topic)
-        return free[:already] if already else free
+        limit = self._reference.remaining(topic)
+        if self._packed is not None:  # end where a packed chunk does
+            lane.span = self._packed.span(topic, self.counts[topic.name])
+            limit = lane.span.stop - self.counts[topic.name] if lane.span is not None else 0
+        return free[:limit] if limit else free
 
     def fill(self, topic: Topic, positions: NDArray[np.uint64]) -> Iterator[tuple[NDArray[np.void], slice]]:
         """Yield blocks to fill with the records of a slice; `take` follows with `positions`, one a record."""
@@ -328,6 +338,8 @@ class Recorder:
             self._send_block(lane, write=False)
         elif block.filled == len(block.records):
             self._send_block(lane)
+        elif lane.span is not None and self.counts[topic.name] == lane.span.stop:
+            self._send_block(lane)
 
     def _open(self, topic: Topic) -> _Block:
         block = self._lanes[topic].open
@@ -353,6 +365,10 @@ class Recorder:
             return
         filled = block.records[: block.filled]
         offsets = np.arange(block.filled, dtype=np.uint64) * np.uint64(filled.itemsize)
+        packed, span, count = None, lane.span, self.counts[lane.topic.name]
+        numbers = (count - block.filled, count)
+        if self._packed is not None and span is not None and numbers == (span.first, span.stop):
+            packed = partial(self._packed.data, span.entry)
         is_whole = len(block.records) == lane.capacity  # the first, smaller one is not used again
         self._pipeline.send(
             lane.topic,
@@ -361,6 +377,7 @@ class Recorder:
             offsets,
             write=write and lane.write,
             done=partial(lane.free.put, block) if is_whole else lambda: None,
+            packed=packed,
         )
 
 

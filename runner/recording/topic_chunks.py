@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,6 +108,15 @@ def _infer_phases(
                 channels[chain] = channels[chain[0]]
 
 
+class ChunkSpan(NamedTuple):
+    """A chunk, and the messages of its topic that it holds, by number."""
+
+    first: int
+    stop: int
+    """The number after that of its last message."""
+    entry: ChunkEntry
+
+
 class TopicChunks:
     """The chunks of a topic, in order.
 
@@ -151,6 +160,13 @@ class TopicChunks:
             return sum(1 for _ in self.messages())
         _, ends = self._numbers
         return int(ends[-1]) if len(ends) else 0
+
+    def holding(self, number: int) -> ChunkSpan | None:
+        """Return the chunk that holds a message of fixed width; None if there is none."""
+        firsts, ends = self._numbers
+        k = int(np.searchsorted(ends, number, side="right"))
+        is_held = k < len(ends) and firsts[k] <= number
+        return ChunkSpan(int(firsts[k]), int(ends[k]), self.entry(k)) if is_held else None
 
     def blocks(self, start: int, stop: int | None) -> Iterator[NDArray[np.void]]:
         """Yield the messages number `start` up to `stop`, a chunk at a time; they must have one size."""
