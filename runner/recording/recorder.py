@@ -179,7 +179,7 @@ class Recorder:
         limit = self._reference.remaining(topic)
         if self._packed is not None:  # end where a packed chunk does
             lane.span = self._packed.span(topic, self.counts[topic.name])
-            limit = lane.span.stop - self.counts[topic.name] if lane.span is not None else 0
+            limit = lane.span.stop - self.counts[topic.name] if lane.span else 0
         return free[:limit] if limit else free
 
     def fill(self, topic: Topic, positions: NDArray[np.uint64]) -> Iterator[tuple[NDArray[np.void], slice]]:
@@ -336,9 +336,7 @@ class Recorder:
         self._watch(topic, fresh)
         if known:
             self._send_block(lane, write=False)
-        elif block.filled == len(block.records):
-            self._send_block(lane)
-        elif lane.span is not None and self.counts[topic.name] == lane.span.stop:
+        elif block.filled == len(block.records) or (lane.span and lane.span.stop == self.counts[topic.name]):
             self._send_block(lane)
 
     def _open(self, topic: Topic) -> _Block:
@@ -366,8 +364,7 @@ class Recorder:
         filled = block.records[: block.filled]
         offsets = np.arange(block.filled, dtype=np.uint64) * np.uint64(filled.itemsize)
         packed, span, count = None, lane.span, self.counts[lane.topic.name]
-        numbers = (count - block.filled, count)
-        if self._packed is not None and span is not None and numbers == (span.first, span.stop):
+        if self._packed and span and span[:2] == (count - block.filled, count):
             packed = partial(self._packed.data, span.entry)
         is_whole = len(block.records) == lane.capacity  # the first, smaller one is not used again
         self._pipeline.send(

@@ -1,4 +1,4 @@
-"""Packed chunks that are used again in another recording of the same messages: packing takes most of the time.
+"""Packed chunks that are used again where another recording has the same messages: packing takes long.
 
 The other recording is made by its own job alone. Where its messages are, to the byte, those of a chunk that
 was packed before, the packed data are taken over instead of packing them again.
