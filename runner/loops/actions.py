@@ -16,6 +16,7 @@ from runner.environments.naming import spoken
 from runner.errors import ConfigError, nearest, shortened
 from runner.recording.gym_json import registered, value_of
 from runner.recording.maker import MAX_NAMES
+from runner.recording.spaces import Value
 from runner.util.values import is_text
 
 _MAX_TEXT: Final = 200
@@ -59,7 +60,7 @@ def action_names(env: object, space: Space) -> tuple[str, ...]:
     return names if is_complete and all(map(is_text, names)) else ()
 
 
-def action_in_words(space: Space, action: Any, names: Names) -> str:
+def action_in_words(space: Space, action: Value, names: Names) -> str:
     """Return the name of an action, or the names of those of several agents; empty if there is none."""
     if isinstance(names, Mapping):
         assert isinstance(space, spaces.Dict)
@@ -72,7 +73,7 @@ def action_in_words(space: Space, action: Any, names: Names) -> str:
     )
 
 
-def parsed_action(space: Space, given: object, recorded: Any, names: Names) -> Any:
+def parsed_action(space: Space, given: object, recorded: Value, names: Names) -> Value:
     """Return an action in the dtypes of the recorded one.
 
     `given`: text, or a value; of a game `AGENT=VALUE`, or a mapping by agent: the others act as recorded.
@@ -100,7 +101,7 @@ def parsed_action(space: Space, given: object, recorded: Any, names: Names) -> A
     }
 
 
-def _parsed(space: Space, given: object, recorded: Any, names: Sequence[str], where: str) -> object:
+def _parsed(space: Space, given: object, recorded: Value, names: Sequence[str], where: str) -> object:
     if isinstance(space, spaces.Dict | spaces.Tuple):
         return _parsed_parts(space, given, recorded, where)
     if isinstance(space, spaces.Discrete):
@@ -141,7 +142,9 @@ def _parsed_json(space: Space, given: object, where: str) -> object:
     raise ConfigError(f"{where}: found {_short(given)}, expected an element of {space}")
 
 
-def _parsed_parts(space: spaces.Dict | spaces.Tuple[Any], given: object, recorded: Any, where: str) -> object:
+def _parsed_parts(
+    space: spaces.Dict | spaces.Tuple[Any], given: object, recorded: Value, where: str
+) -> object:
     """Return an action of a `Dict` or `Tuple`, whose text is JSON."""
     try:
         values = json.loads(given) if isinstance(given, str) else given
@@ -163,7 +166,7 @@ def _parsed_parts(space: spaces.Dict | spaces.Tuple[Any], given: object, recorde
     )
 
 
-def _discrete(space: spaces.Discrete, given: Any, names: Sequence[str], where: str) -> int:
+def _discrete(space: spaces.Discrete, given: Value, names: Sequence[str], where: str) -> int:
     """Return a discrete action, given by its number or its name."""
     start = int(space.start)
     by_name = {spoken(name).casefold(): start + i for i, name in enumerate(names[: int(space.n)])}

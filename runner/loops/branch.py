@@ -259,7 +259,7 @@ class _Player:
                 report_progress(task.at.t + count)
         return f"stopped after {task.max_steps:,} steps"
 
-    def _next(self, observation: object) -> Any:
+    def _next(self, observation: object) -> Value:
         """Return the policy's action; None where the recorded ones run out."""
         if self._function is not None:
             with from_policy(self._task.policy):

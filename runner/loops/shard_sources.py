@@ -180,12 +180,13 @@ class Source:
         units = self.units[phase]
         return list(units[units["first"] - units["environment"] == step])
 
-    def unit_begun(self, phase: str, environment: int, step: int) -> Any:
+    def unit_begun(self, phase: str, environment: int, step: int) -> np.void:
         """Return the last unit of an environment that had begun by a step."""
         return self._unit(phase, environment, step + environment)
 
-    def _unit(self, phase: str, environment: int, step: int) -> Any:
+    def _unit(self, phase: str, environment: int, step: int) -> np.void:
         units = self.units[phase]
         low, high = np.searchsorted(units["environment"], [environment, environment + 1])
         at = int(np.searchsorted(units["first"][low:high], step, side="right"))
-        return units[low + max(at - 1, 0)]
+        unit: np.void = units[low + max(at - 1, 0)]
+        return unit

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
-from runner.environments.gym_types import AnyVectorEnv
+from runner.environments.gym_types import AnyVectorEnv, ResetResult, VectorStepResult
 
 LIBRARY: Final = "stable-baselines3"
 _MODES: Final = {"DummyVecEnv": "sync", "SubprocVecEnv": "async"}
@@ -42,7 +42,7 @@ class VecEnvVector(AnyVectorEnv):
         self.native: Any = None
         """What the `VecEnv` returned last, for those who use it as such."""
 
-    def step(self, actions: object) -> tuple[Any, Any, Any, Any, Any]:  # noqa: ARG002
+    def step(self, actions: object) -> VectorStepResult:  # noqa: ARG002
         """Wait for the steps that `step_async` has begun."""
         observations, rewards, dones, infos = self._step_wait()
         rounded = rewards if self._rewards_dtype is None else rewards.astype(self._rewards_dtype)
@@ -52,7 +52,7 @@ class VecEnvVector(AnyVectorEnv):
             truncated[i] = infos[i].get("TimeLimit.truncated", False)
         return observations, rewards, dones & ~truncated, truncated, infos
 
-    def reset(self, *, seed: object = None, options: object = None) -> tuple[Any, Any]:  # noqa: ARG002
+    def reset(self, *, seed: object = None, options: object = None) -> ResetResult:  # noqa: ARG002
         """Reset all environments, with the seeds and options that the `VecEnv` has for them."""
         self.native = self._reset()
         return self.native, self.base.reset_infos

@@ -18,7 +18,7 @@ from gymnasium import spaces
 from runner.environments.gym_types import Space
 from runner.errors import EnvironmentNotUsable
 from runner.recording.gym_json import numbers_in, registered, structure_of, text_of
-from runner.recording.spaces import MAX_VALUE_BYTES, Description
+from runner.recording.spaces import MAX_VALUE_BYTES, Description, Value
 from runner.util.jsonable import as_json
 from runner.util.values import is_text
 
@@ -46,7 +46,7 @@ class Part:
         """The keys as names of NumPy's fields."""
         return tuple(map(str, self.keys))
 
-    def of(self, value: Any) -> Any:
+    def of(self, value: Value) -> Value:
         """Return the value of this part in a value of the whole space."""
         for key in self.keys:
             value = value[key]

@@ -175,7 +175,7 @@ def leaves_by_agent(space: Any, what: str, on_rounded: OnRounded = lambda _: Non
 
 def filler_by_agent(
     leaves: Mapping[str, Sequence[Leaf]], column: Array
-) -> Callable[[int, Mapping[str, Any]], None]:
+) -> Callable[[int, Mapping[str, Value]], None]:
     """Return a function that puts the values of some agents into a row, and zeros for the others."""
     fillers = {agent: filler(own, column) for agent, own in leaves.items()}
     zeros = np.zeros((), column.dtype)
@@ -215,7 +215,7 @@ def put_chosen(leaves: Sequence[Leaf], values: object, into: Array, which: NDArr
         put(i, element_of(values, i))
 
 
-def element_of(values: Any, i: int | slice) -> Any:
+def element_of(values: Value, i: int | slice) -> Value:
     """Return one of many values, or some, that are nested as their space."""
     if isinstance(values, Mapping):
         return {key: element_of(part, i) for key, part in values.items()}

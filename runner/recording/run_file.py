@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple, TypeGuard
 
 from runner.errors import shortened
 from runner.recording.metrics import METRICS
-from runner.util.values import MAX_JSON_DEPTH, JsonView, is_too_deep
+from runner.util.values import MAX_JSON_DEPTH, Json, JsonView, is_too_deep
 
 STATED_STATUSES: Final = ("running", "finished", "interrupted", "failed")
 """The statuses that a run's owner writes."""
@@ -65,7 +65,7 @@ class RecentTraining:
 
 
 @dataclass(frozen=True, eq=False)
-class Summary(Mapping[str, Any]):
+class Summary(JsonView):
     """How a run ended, as its owner wrote it; also a mapping of the valid JSON values."""
 
     status: str | None = None
@@ -141,7 +141,7 @@ class RunFile:
     """The invalid values, a sentence each without its full stop."""
 
 
-def parse_run_file(record: Mapping[str, Any]) -> RunFile:
+def parse_run_file(record: JsonView) -> RunFile:
     """Return the contents of a `run.json`; invalid values are named in `problems`.
 
     `record`: the JSON object; its `run_id` must be valid.
@@ -151,7 +151,7 @@ def parse_run_file(record: Mapping[str, Any]) -> RunFile:
     problems += [f"{key} is missing" for key in _REQUIRED if key not in record]
     return RunFile(
         run_id=record["run_id"],
-        name=values.get("name", record["run_id"]),
+        name=values["name"] if "name" in values else record["run_id"],
         seed=values.get("seed"),
         status=values.get("status", "interrupted"),
         created=_in_utc(values["created"]) if "created" in values else None,
@@ -197,7 +197,7 @@ def run_title(name: str, seed: int | None) -> str:
     return name if seed is None else f"{name}, seed {seed}"
 
 
-def _valid(record: JsonView, checks: Mapping[str, Check], prefix: str, problems: list[str]) -> dict[str, Any]:
+def _valid(record: JsonView, checks: Mapping[str, Check], prefix: str, problems: list[str]) -> Json:
     """Return the valid values, and those without a check; name the others in `problems`."""
     values = {}
     for key, value in record.items():

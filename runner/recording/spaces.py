@@ -71,7 +71,7 @@ def dtype_of(description: Any, where: str) -> np.dtype[np.generic] | None:
     return _dtype(description)
 
 
-def decode(description: Description, data: bytes, where: str) -> Any:
+def decode(description: Description, data: bytes, where: str) -> Value:
     """Return the value that stands in these bytes: dictionaries, tuples, texts and arrays."""
     try:
         value, end = _value(description, data, 0)
@@ -134,7 +134,7 @@ def _dtype(description: Description) -> np.dtype[np.generic]:
     return np.dtype([(name, _dtype(part)) for name, part in parts])
 
 
-def _value(description: Description, data: bytes, at: int) -> tuple[Any, int]:
+def _value(description: Description, data: bytes, at: int) -> tuple[Value, int]:
     """Return the value at an offset, and the offset behind it."""
     parts = _parts(description)
     if parts is not None:

@@ -11,11 +11,11 @@ import os
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from peewee import SchemaManager, SqliteDatabase
 
-from runner.runs.catalogue.rows import Expression, Row
+from runner.runs.catalogue.rows import Expression, Row, SqlRow
 from runner.util.files import cache_folder, replacing
 
 Report = Callable[[str], None]
@@ -104,9 +104,9 @@ def create(path: str) -> SqliteDatabase:
     return database
 
 
-def tuples_of(database: SqliteDatabase, query: Expression) -> Iterator[tuple[Any, ...]]:
+def tuples_of(database: SqliteDatabase, query: Expression) -> Iterator[SqlRow]:
     """Return the rows of a query as tuples of SQLite's values, without peewee's conversions."""
-    found: Iterator[tuple[Any, ...]] = database.execute(query)  # type: ignore[no-untyped-call]
+    found: Iterator[SqlRow] = database.execute(query)  # type: ignore[no-untyped-call]
     return found
 
 

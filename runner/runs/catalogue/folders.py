@@ -100,7 +100,8 @@ class Folders:
     def _difference(self, root: str) -> Difference:
         """Return the difference of one folder; entries without files of a run are left out, or gone."""
         stored = Row.mark if self._depth is Depth.FOLDERS else Row.fingerprint
-        known = dict(tuples_of(self._database, Row.select(Row.entry, stored).where(Row.root == root)))
+        own = Row.select(Row.entry, stored).where(Row.root == root)
+        known: dict[str, str] = dict(tuples_of(self._database, own))
         tokens = self._tokens_of(root)
         died: list[str] = []
         if self._depth is Depth.NAMES and not self._rebuild:

@@ -11,7 +11,7 @@ import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 from peewee import DatabaseError, OperationalError, SqliteDatabase, Tuple, Value, chunked, fn
 
@@ -21,7 +21,7 @@ from runner.runs.catalogue.columns import SETTING, IndexRow, Kind, field_of, wit
 from runner.runs.catalogue.database import Report, create, index_path, open_index, renew, tuples_of, version
 from runner.runs.catalogue.filters import ANY_RUN, Filter, matches, setting_path
 from runner.runs.catalogue.folders import Depth, Folders
-from runner.runs.catalogue.rows import Expression, Row, text
+from runner.runs.catalogue.rows import Expression, Row, SqlRow, text
 from runner.runs.run import check_folder_name
 
 Result = TypeVar("Result")
@@ -109,7 +109,7 @@ class Index:
         places = self._of(chosen, Row.root, Row.entry).order_by(size.desc(), Row.id).limit(limit)
         return self._at(list(self._tuples(places)), columns)
 
-    def _at(self, places: Sequence[tuple[Any, ...]], columns: Sequence[str] | None) -> list[IndexRow]:
+    def _at(self, places: Sequence[SqlRow], columns: Sequence[str] | None) -> list[IndexRow]:
         """Return the rows of folders, given by root and entry, in their order."""
         found: dict[tuple[str, str], IndexRow] = {}
         for root in {root for root, _ in places}:
@@ -203,14 +203,14 @@ class Index:
 
         return node(top)
 
-    def named(self, name: str) -> list[tuple[Any, ...]]:
+    def named(self, name: str) -> list[SqlRow]:
         """Return the runs of a name, or whose ids begin with it, the newest first.
 
         Each is root, entry, id, name, seed and creation (ms).
         """
         return self._names(_begins(Row.id, name) | (Row.name == text(name)))
 
-    def with_id_prefix(self, beginning: str) -> list[tuple[Any, ...]]:
+    def with_id_prefix(self, beginning: str) -> list[SqlRow]:
         """Return runs whose ids begin with a text, at most the 1,000 newest, as `named` does."""
         return self._names(_begins(Row.id, beginning), _MAX_VALUES)
 
@@ -219,11 +219,11 @@ class Index:
         query = self._of(Filter(_begins(Row.name, beginning)), Row.name, fn.COUNT(Row.entry))
         return [(name, count) for name, count in self._tuples(query.group_by(Row.name).limit(_MAX_VALUES))]
 
-    def newest(self, name: str = "", limit: int = 1) -> list[tuple[Any, ...]]:
+    def newest(self, name: str = "", limit: int = 1) -> list[SqlRow]:
         """Return the newest runs, of a name if one is given, as `named` does."""
         return self._names(Row.name == text(name) if name else None, limit)
 
-    def _names(self, condition: Expression, limit: int | None = None) -> list[tuple[Any, ...]]:
+    def _names(self, condition: Expression, limit: int | None = None) -> list[SqlRow]:
         columns = (Row.root, Row.entry, Row.id, Row.name, Row.seed, Row.created)
         query = self._of(Filter(condition), *columns).order_by(Row.created.desc(), Row.id.desc())
         return list(query.limit(limit).tuples().bind(self._database))
@@ -232,7 +232,7 @@ class Index:
         known = Row.root.in_(self.roots) & Row.id.is_null(False)
         return Row.select(*columns).where(known if chosen.condition is None else known & chosen.condition)
 
-    def _tuples(self, query: Expression) -> Iterator[tuple[Any, ...]]:
+    def _tuples(self, query: Expression) -> Iterator[SqlRow]:
         return tuples_of(self._database, query)
 
     def _check_settings(self, chosen: Filter) -> None:

@@ -34,6 +34,8 @@ _SUMMED: Final = (
 )
 """The columns for sums of disk usage: an SQLite index over them saves reading all rows."""
 
+SqlRow = tuple[Any, ...]
+"""The values of a row that SQLite returns."""
 Expression = Any
 """A column, a condition or a query of peewee, which has no types."""
 
