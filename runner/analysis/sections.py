@@ -6,6 +6,12 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from html import escape
+from typing import Final
+
+_NUMBERS: Final = re.compile(
+    r"(?<![\w.])[-+]?[\d,]*\.?\d+(e[-+]?\d+)?(?![\w.])|\b(to|never|inf|nan)\b|[][() %,/:;–]"
+)
+"""What cells of numbers consist of, such as `1,500`, `12 %`, `[0.5, 1]` and `2 to 3`."""
 
 
 @dataclass(frozen=True)
@@ -14,6 +20,15 @@ class Grid:
 
     headings: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
+
+    @property
+    def numeric(self) -> tuple[bool, ...]:
+        """Whether each column has numbers, which are aligned to the right, and no other text."""
+        columns: list[list[str]] = [[str(cell) for cell in column] for column in zip(*self.rows, strict=True)]
+        return tuple(
+            any(column) and not any(_NUMBERS.sub("", cell) for cell in column)
+            for column in columns or [[] for _ in self.headings]
+        )
 
 
 @dataclass(frozen=True)
@@ -40,7 +55,7 @@ def markdown(made: Sequence[Section]) -> Iterator[str]:
             yield from (sentence, "")
         for grid in section.grids:
             yield _row(grid.headings)
-            yield _row(("---",) * len(grid.headings))
+            yield _row(tuple("---:" if is_number else "---" for is_number in grid.numeric))
             yield from (_row(row) for row in grid.rows)
             yield ""
         for lines in section.diffs:
@@ -55,8 +70,15 @@ def html(made: Sequence[Section]) -> str:
         parts += [f"<h3>{escape(section.title)}</h3>"]
         parts += [f"<p>{escape(sentence)}</p>" for sentence in section.sentences]
         for grid in section.grids:
-            head = "".join(f'<th scope="col">{escape(heading)}</th>' for heading in grid.headings)
-            rows = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in grid.rows]
+            sides = [f' style="text-align:{"right" if is_number else "left"}"' for is_number in grid.numeric]
+            head = "".join(
+                f'<th scope="col"{side}>{escape(heading)}</th>'
+                for heading, side in zip(grid.headings, sides, strict=True)
+            )
+            rows = [
+                "".join(f"<td{side}>{escape(cell)}</td>" for cell, side in zip(row, sides, strict=True))
+                for row in grid.rows
+            ]
             body = "".join(f"<tr>{row}</tr>" for row in rows)
             parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
         parts += [f"<pre>{escape(chr(10).join(lines))}</pre>" for lines in section.diffs]

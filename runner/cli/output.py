@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # imported when something is drawn
     from rich.table import Table
     from rich.text import Text
 
-    from runner.analysis.sections import Section
+    from runner.analysis.sections import Grid, Section
 
 SHRUNK: Final = 10
 """Minimum characters of a shrinking column."""
@@ -129,21 +129,28 @@ def table(
     Columns whose headings are in `left` are aligned to the left, as text is, others to the right; those in
     `shrinking` are truncated where a terminal is too narrow.
     """
+    return _table([(heading, heading in left, heading in shrinking) for heading in headings], rows)
+
+
+def grid_table(grid: Grid, shrinking: bool = False) -> Table:
+    """Return a grid as a table, numbers aligned to the right; its columns may shrink on a narrow terminal."""
+    columns = zip(grid.headings, grid.numeric, strict=True)
+    return _table([(heading, not is_number, shrinking) for heading, is_number in columns], grid.rows)
+
+
+def _table(columns: Sequence[tuple[str, bool, bool]], rows: Iterable[Iterable[str]]) -> Table:
+    """Return a table of columns: heading, whether it is aligned to the left, whether it may shrink."""
     from rich.align import Align
     from rich.table import Table
 
-    grid = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
-    for heading in headings:
-        side: Literal["left", "right"] = "left" if heading in left else "right"
-        grid.add_column(
-            Align(heading, side, vertical="bottom"),
-            justify=side,
-            overflow="ellipsis",
-            no_wrap=heading not in shrinking,
-        )
+    drawn = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
+    for heading, is_left, shrinks in columns:
+        side: Literal["left", "right"] = "left" if is_left else "right"
+        header = Align(heading, side, vertical="bottom")
+        drawn.add_column(header, justify=side, overflow="ellipsis", no_wrap=not shrinks)
     for row in rows:
-        grid.add_row(*row)
-    return grid
+        drawn.add_row(*row)
+    return drawn
 
 
 def facts(pairs: Mapping[str, str]) -> Table:
@@ -199,8 +206,7 @@ def print_sections(sections: Sequence[Section], as_markdown: bool) -> None:
     for section in sections:
         draw(title(section.title), *section.sentences)
         for part in section.grids:
-            shrinking = part.headings if console().is_terminal else ()
-            draw(table(*part.headings, rows=part.rows, left=part.headings, shrinking=shrinking))
+            draw(grid_table(part, shrinking=console().is_terminal))
         for lines in section.diffs:
             draw(patch_text(lines))
 

@@ -184,7 +184,7 @@ class WhatIf:
             i, j = divmod(row.action, len(columns))
             x, y, colour = _HEAD[0] + j * _CELL[0], _HEAD[1] + i * _CELL[1], ramp_colour(levels[row.action])
             edge = ' stroke="currentColor" stroke-width="4"' if row.is_recorded else ""
-            values = " / ".join(number(value, 1) for value in shown[row.action]).replace("-", "−")
+            values = " / ".join(number(value, 1) for value in shown[row.action])
             cell = (
                 f'<rect x="{x + 2}" y="{y + 2}" width="{_CELL[0] - 4}" height="{_CELL[1] - 4}" '
                 f'fill="{colour}"{edge}/>' + _text(x + _CELL[0] / 2, y + 27, values, ink_on(colour))

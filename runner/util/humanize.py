@@ -1,4 +1,7 @@
-"""Sizes, times, numbers and long lists formatted for people, as in tables and pages."""
+"""Sizes, times, numbers and long lists formatted for people, as in tables and pages.
+
+A minus is a hyphen everywhere, in text, tables and pictures, so that numbers can be copied and searched.
+"""
 
 from __future__ import annotations
 
@@ -64,6 +67,12 @@ def age(seconds: float) -> str:
 def number(value: float | None, digits: int = 1) -> str:
     """Return a number with `digits` decimals; an unknown one (None, NaN) as a dash."""
     return UNKNOWN if value is None or math.isnan(value) else f"{value:,.{digits}f}"
+
+
+def number_column(values: Sequence[float]) -> list[str]:
+    """Return numbers with the same decimals: none if all are whole, else three."""
+    digits = 0 if all(float(value).is_integer() for value in values) else 3
+    return [number(value, digits) for value in values]
 
 
 def listed(names: Sequence[str]) -> str:

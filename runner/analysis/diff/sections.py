@@ -13,7 +13,7 @@ from runner.analysis.sections import Grid, Section
 from runner.environments.naming import spoken
 from runner.recording.reader import Recording
 from runner.runs.branches import PATHS
-from runner.util.humanize import UNKNOWN
+from runner.util.humanize import UNKNOWN, counted
 
 _MAX_SETTINGS: Final = 4
 """Settings that are named in the first sentences."""
@@ -144,8 +144,8 @@ def _environment(difference: RunDiff) -> Section:
     if environment.transitions:
         share = environment.transitions / environment.of
         sentences.append(
-            f"{environment.transitions:,} of {environment.of:,} (state, action) pairs ({share:.1%}) have "
-            f"other outcomes; {len(environment.examples)} of them:"
+            f"{environment.transitions:,} of {environment.of:,} (state, action) pairs ({100 * share:.1f} %) "
+            f"have other outcomes; {len(environment.examples)} of them:"
         )
     if environment.other_starts:
         sentences.append("Episodes start in other states, or with other probabilities.")
@@ -181,13 +181,13 @@ def overlap_in_words(difference: RunDiff) -> list[str]:
         share = overlap.equal_steps / overlap.compared_steps if overlap.compared_steps else math.nan
         sentences.append(
             f"Of the {overlap.episodes:,} episodes of both, {overlap.equal_episodes:,} are the same; of "
-            f"their steps {share:.1%} agree at the same time of the same episode. Mean length "
+            f"their steps {100 * share:.1f} % agree at the same time of the same episode. Mean length "
             f"{overlap.mean_length_a:.1f} in A, {overlap.mean_length_b:.1f} in B."
         )
     if visits is not None:
         sentences.append(
             f"A acted in {visits.states_a:,} states, B in {visits.states_b:,}; their distributions over the "
-            f"states overlap by {visits.alike:.1%}."
+            f"states overlap by {100 * visits.alike:.1f} %."
         )
     return sentences
 
@@ -284,18 +284,23 @@ def _tables(difference: RunDiff) -> Section:
     rows = [
         (
             f"{table.episode:,}",
-            table.agent,
+            spoken(table.agent),
             f"{table.largest:.4g}",
             f"{table.mean:.4g}",
-            f"{table.greedy_share:.1%}",
-            UNKNOWN if math.isnan(table.greedy_share_visited) else f"{table.greedy_share_visited:.1%}",
+            f"{100 * table.greedy_share:.1f} %",
+            UNKNOWN
+            if math.isnan(table.greedy_share_visited)
+            else f"{100 * table.greedy_share_visited:.1f} %",
         )
         for table in differing
     ]
     headings = ("episode", "agent", "largest", "mean", "other greedy action", "weighted by visits")
     last = differing[-1]
     cells = [(f"{cell.state}: {cell.action}", f"{cell.a:.6g}", f"{cell.b:.6g}") for cell in last.cells]
-    where = Grid((f"largest, {last.agent}, episode {last.episode:,}", "A", "B"), cells)
+    where = Grid(
+        (f"largest differences of {spoken(last.agent)} after {counted(last.episode, 'episode')}", "A", "B"),
+        cells,
+    )
     return Section("Q-tables", grids=[Grid(headings, rows), where])
 
 

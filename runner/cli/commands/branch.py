@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
+from runner.analysis.sections import Grid
 from runner.cli import Command
 from runner.cli.options import json_option, recordings_option, run_argument, set_option, trust_option
-from runner.cli.output import draw, facts, print_json, say, table
+from runner.cli.output import draw, facts, grid_table, print_json, say
 from runner.cli.parameter_types import COUNT, INDEX, PLACE
 from runner.cli.progress import steps_line
 from runner.cli.runs import command_for, compilation_notice, find_recorded, run_as_json, run_facts
@@ -202,7 +203,7 @@ def _print_episode(parent: Run, branch: Branch, as_json: bool) -> None:
 
     outcomes = (("parent", parent.run_id, branch.parent), ("branch", branch.run.run_id, branch.outcome))
     played = [(name, run, returns(each), f"{each.length:,}", each.end) for name, run, each in outcomes]
-    grid = table("", "run", "return", "length", "end", rows=played, left=("run", "return", "end"))
+    grid = grid_table(Grid(("", "run", "return", "length", "end"), played))
     rows = run_facts(branch.run) | {"branched": f"run {parent.run_id} {branch.origin}"}
     draw(facts(rows), grid, facts({"next": command_for(parent, "diff", branch.run.run_id)}))
 
@@ -216,7 +217,6 @@ def _print_what_if(run: Run, at: StepRef, actions: tuple[str, ...], as_json: boo
     if as_json:
         print_json(found.as_json())
         return
-    drawn = table(*found.grid.headings, rows=found.grid.rows, left=("action", "end"))
-    draw(facts({"run": f"{run.run_id}  {run.title}"} | found.facts), "", drawn)
+    draw(facts({"run": f"{run.run_id}  {run.title}"} | found.facts), "", grid_table(found.grid))
     for note in found.notes:
         say(f"Note: {note}.")

@@ -262,9 +262,7 @@ def series_marker(number: int) -> int:
 def number_on_axis(value: float) -> str:
     """Return a number as an axis shows it: `20,000`, `0.5`, `2.5M`."""
     text = f"{value:,.0f}" if abs(value) >= 1000 else f"{value:g}"
-    if abs(value) >= 1e6:
-        text = f"{value / 1e6:g}M"
-    return text.replace("-", "\N{MINUS SIGN}")
+    return f"{value / 1e6:g}M" if abs(value) >= 1e6 else text
 
 
 def labelled(ticks: Sequence[float], short: bool = False) -> list[tuple[float, str]]:

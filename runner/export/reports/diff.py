@@ -37,7 +37,6 @@ from runner.recording.run_file import run_title
 
 _MAX_VALUES: Final = 6
 """Q-values shown of each run: the highest."""
-_GREEDY: Final = "\N{NO-BREAK SPACE}◀\N{NO-BREAK SPACE}greedy"
 
 
 class StepPicture(NamedTuple):
@@ -198,10 +197,11 @@ def _values(row: Row) -> Grid:
     shown = dict.fromkeys(
         int(j) for values in (a, b) for j in np.argsort(-values, kind="stable")[:_MAX_VALUES]
     )
-    rows = [
-        (row.actions[j], *(f"{v[j]:.6g}{_GREEDY if j == int(v.argmax()) else ''}" for v in (a, b)))
-        for j in shown
-    ]
+    rows = []
+    for j in shown:
+        greedy = " and ".join(name for name, own in (("A", a), ("B", b)) if j == int(own.argmax()))
+        name = f"{row.actions[j]} (greedy in {greedy})" if greedy else row.actions[j]
+        rows.append((name, f"{a[j]:.6g}", f"{b[j]:.6g}"))
     of = f", the highest of {len(row.actions)}" if len(row.actions) > len(shown) else ""
     return Grid((f"Q-values of {spoken(row.agent)} there{of}", "A", "B"), rows)
 

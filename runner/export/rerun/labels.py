@@ -184,5 +184,4 @@ def _event_labels(mdp: Mdp, mask: int, agent: str) -> list[str]:
 
 
 def _signed(value: float, digits: int | None = None) -> str:
-    text = f"{value:g}" if digits is None else f"{value:.{digits}f}"
-    return text.replace("-", "−")
+    return f"{value:g}" if digits is None else f"{value:.{digits}f}"

@@ -203,7 +203,7 @@ class Replay {
       for (const { line, cursor, value } of rows) {
         cursor.setAttribute("x1", i);
         cursor.setAttribute("x2", i);
-        value.textContent = Replay.number(line.values[i] ?? "unknown");
+        value.textContent = line.values[i] ?? "unknown";
       }
     }
   }
@@ -215,7 +215,7 @@ class Replay {
       const after = at.findIndex((step) => step > now), j = after < 0 ? at.length - 1 : Math.max(0, after - 1);
       const far = Math.abs(at[j] - now), steps = `${far.toLocaleString("en")} ${far === 1 ? "step" : "steps"}`;
       const row = Replay.make("tr");
-      row.append(Replay.make("th", name), Replay.make("td", Replay.number(values[j])), Replay.make("td", far ? `${steps} ${at[j] > now ? "later" : "before"}` : "now"));
+      row.append(Replay.make("th", name), Replay.make("td", values[j]), Replay.make("td", far ? `${steps} ${at[j] > now ? "later" : "before"}` : "now"));
       row.firstChild.scope = "row";
       return row;
     });
@@ -279,7 +279,7 @@ class Replay {
 
   // A Q-value before the step at the slider; on a server's page a link to where it comes from.
   explained(value, action, learner) {
-    const number = Replay.make("b", Replay.number(value)), { why } = this.root.dataset;
+    const number = Replay.make("b", value), { why } = this.root.dataset;
     if (!why) return number;
     const { agents, choices } = this.episode, link = Replay.make("a");
     const query = new URLSearchParams({ action, ...(choices.length > 1 ? { agent: agents[learner] } : {}) });
@@ -323,9 +323,8 @@ class Replay {
     return element;
   }
 
-  static number(value) { return String(value).replace("-", "\u2212"); }
 
-  static signed(value) { return (value > 0 ? "+" : "") + Replay.number(value); }
+  static signed(value) { return (value > 0 ? "+" : "") + value; }
 }
 
 // A report contains its episodes, with their pictures.

@@ -18,6 +18,7 @@ from runner.service.addresses import Paging, link
 from runner.service.dependencies import OpenRecording, RecordedRun
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import page
+from runner.util.humanize import number_column
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 
@@ -54,12 +55,9 @@ def episodes(
     names = [name for name in columns if name not in _HIDDEN]
     values: Mapping[str, list[Any]] = {name: column.tolist() for name, column in columns.items()}
     paths = _paths(recording, phase, values["episode"])
+    cells = [number_column(values[name]) for name in names]
     rows = [
-        (
-            path.partition("/")[2].replace("/", ", trial "),
-            _end(values, i),
-            *(f"{values[name][i]:,g}" for name in names),
-        )
+        (path.partition("/")[2].replace("/", ", trial "), _end(values, i), *(column[i] for column in cells))
         for i, path in enumerate(paths)
     ]
     headings = [_heading(name, len(recording.agents)) for name in names]
