@@ -40,6 +40,8 @@ STEP_NAME: Final = "global_step"
 MAX_NAMES: Final = 10_000
 OPTIONS: Final = CallbackOptions.__annotations__.keys() - {"config", "name", "run_id", "seed"}
 """The arguments of `runner.record` and `record_vector` that a script may add."""
+_NO_ENVIRONMENT: Final = Described("step", Discrete(1), Discrete(1), env_id="none")
+_NOT_MADE: Final = EnvironmentMaker("gymnasium", reason="values were logged, and no environment was recorded")
 _MAX_WAITING: Final = 10_000
 """The most values that wait for an environment."""
 _MAX_WAITING_BYTES: Final = 1 << 28
@@ -263,14 +265,11 @@ class ScriptRun:
 
     def _begin_values(self) -> None:
         """Begin a recording without an environment."""
-        nothing = Discrete(1)
-        described = Described("step", nothing, nothing, env_id="none")
         packing: Any = {key: self._options[key] for key in (*PACKING, "on_error") if key in self._options}
         given = self._arguments() | {"name": self.name or script_name(), "run_id": self.run_id}
         options = options_of(self._recordings, given | packing)
-        maker = EnvironmentMaker("gymnasium", reason="values were logged, and no environment was recorded")
         self._values = rows = ValueRows()
-        loop: Loop[Any] = Loop(described, options, maker, lambda *_: rows)
+        loop: Loop[Any] = Loop(_NO_ENVIRONMENT, options, _NOT_MADE, lambda *_: rows)
         loop.activate(loop.rows("train"))
         self._begin_own(loop)
 

@@ -14,8 +14,10 @@ from runner.environments.gym_types import Space
 from runner.environments.loading import mdp_of
 from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
+from runner.recording.blocks import Sizes
 from runner.recording.gym_spaces import describe_space, parts_of
-from runner.recording.metadata import Attachments, environment_attachments
+from runner.recording.metadata import Attachments, environment_attachments, sizes_in
+from runner.recording.schema import Topic
 from runner.util.jsonable import as_json
 
 _MAX_STATES: Final = 2**32
@@ -60,7 +62,13 @@ class Described:
         wide = {} if self.wide_action is None else {"action": describe_space(self.wide_action)}
         return self._spaces | wide
 
-    @property
+    @cached_property
+    def sizes(self) -> dict[Topic, Sizes]:
+        """The sizes of the topics of fixed width in its recordings."""
+        events = len(self.mdp.event_names) if self.mdp else 0
+        return sizes_in(self.kind, len(self.agents), events, self.recorded_spaces, self.env_id)
+
+    @cached_property
     def common(self) -> str:
         """What all processes that record one run have in common, as JSON: kind, spaces, agents of a game."""
         agents = list(map(str, self.agents)) if len(self.agents) > 1 else 1

@@ -26,11 +26,11 @@ from runner.loops.outcomes import Outcomes
 from runner.recording import schema
 from runner.recording.action_recorder import ActionRecorder
 from runner.recording.actions import ACTION_TOPICS
-from runner.recording.blocks import Sizes, record_dtype
+from runner.recording.blocks import record_dtype
 from runner.recording.compaction import compacted
 from runner.recording.gym_spaces import can_widen, widened
 from runner.recording.maker import EnvironmentMaker
-from runner.recording.metadata import run_metadata, sizes_in, write_description, write_maker, write_result
+from runner.recording.metadata import run_metadata, write_description, write_maker, write_result
 from runner.recording.recorder import Recorder
 from runner.recording.schema import Topic
 from runner.recording.syncing import SYNCER
@@ -78,7 +78,7 @@ class LoopRun:
             packing=options.packing.packing,
             record_steps=options.steps == "all",
             beat=self._beat,
-            sizes=self._sizes(),
+            sizes=self.described.sizes,
             watch=self._watch,
             before=self.describe,
             system=options.packing.system and not is_shard,
@@ -149,11 +149,6 @@ class LoopRun:
             "environments": str(described.environments),
         }
 
-    def _sizes(self) -> dict[Topic, Sizes]:
-        described, events = self.described, int(self._facts["events"])
-        learners, spaces = len(described.agents), described.recorded_spaces
-        return sizes_in(described.kind, learners, events, spaces, str(self._file.path))
-
     def describe(self) -> None:
         """Write what makes the recording self-contained, once; from then on dtypes are fixed."""
         if not self._is_described:
@@ -171,7 +166,7 @@ class LoopRun:
             return False
         self.described = replace(self.described, wide_action=wide)
         self._facts = self._run_facts()
-        self.recorder.resize(self._sizes())
+        self.recorder.resize(self.described.sizes)
         return True
 
     def commit(self) -> None:
@@ -204,7 +199,7 @@ class LoopRun:
         counts = self.recorder.counts
         steps = {
             ACTION_TOPICS[topic.name]: record_dtype(topic.message, sizes)
-            for topic, sizes in self._sizes().items()
+            for topic, sizes in self.described.sizes.items()
             if topic.name in ACTION_TOPICS
         }
         if sum(counts[topic.name] for topic in steps) > len(steps):

@@ -27,6 +27,7 @@ PACKING: Final = ("compression", "level", "index", "chunk_steps", "code", "syste
 _ARGUMENTS: Final = ("recordings", "make", "frames_of", "phase", "autoreset_mode")
 """The other arguments of functions that record, of which a misspelt one may be meant."""
 _AS_GIVEN: Final = ("name", "frames_every", "frame_format", "shard", "steps", "on_error", "run_id")
+_DEFAULT_PACKING: Final = Recording()
 _STEPS: Final = ("all", "actions", "none")
 
 
@@ -186,7 +187,7 @@ def options_of(
         settings=settings,
         info=tuple(info),
         frames_of=frames_of,
-        packing=packing_from(packing),
+        packing=packing_from(packing) if packing else _DEFAULT_PACKING,
         join=None if join is None else find_joined(join, recordings),
         **given_as_is,
     )

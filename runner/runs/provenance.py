@@ -150,7 +150,9 @@ def _normalised(name: str) -> str:
 
 def _settings(with_command: bool) -> dict[str, str]:
     """Return what may change during a process: environment variables, flags, states of random generators."""
-    variables, command = _redacted(frozenset(os.environ.items()), tuple(sys.argv))
+    names = _used_names(tuple(os.environ))
+    present = frozenset((name, os.environ[name]) for name in names if name in os.environ)
+    variables, command = _redacted(present, tuple(sys.argv))
     facts = {"host": socket.gethostname(), "directory": _directory(), "user": _user()}
     if with_command and is_code_wanted():
         facts["command"] = command
@@ -166,6 +168,12 @@ def _settings(with_command: bool) -> dict[str, str]:
             with contextlib.suppress(Exception):  # it may be of another version, or being imported
                 facts |= dict(read(sys.modules[name]))
     return variables | {key: as_utf8(text) for key, text in facts.items()}
+
+
+@lru_cache(1)
+def _used_names(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return which environment variables are recorded, or hold a secret that is not."""
+    return tuple(name for name in names if _VARIABLE.fullmatch(name) or is_secret_name(name))
 
 
 @lru_cache(1)
