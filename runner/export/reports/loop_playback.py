@@ -87,7 +87,7 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
     span = recording.episode_span(place.phase, place.number)
     if not 0 <= first < len(span):
         raise no_step(recording, place.title, len(span), first)
-    observed, notes = _shown_parts(recording, "observation", MAX_SERIES)
+    observed, notes = _shown_parts(recording)
     reader = _Reader(recording, place.phase, observed)
     before, steps = reader.part(place.number, span, first, limit)
     time = frame_times(steps.log_time // schema.STEP_NANOSECONDS)
@@ -239,12 +239,12 @@ def _extras(recording: Recording, phase: str, part: range, notes: list[str]) -> 
     return series
 
 
-def _shown_parts(recording: Recording, space: str, limit: int) -> tuple[list[_ShownPart], list[str]]:
-    """Return what is shown of a space of the recording, and a sentence on each thing that is not."""
+def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
+    """Return what is shown of the observations, and a sentence on each thing that is not."""
     agents = recording.agents if len(recording.agents) > 1 else ()
-    leaves = leaves_of(recording.spaces[space], f"{recording.path}: the {space} space")
+    leaves = leaves_of(recording.spaces["observation"], f"{recording.path}: the observation space")
     shown, notes, unseen = [], [], 0
-    left = max(limit // len(agents), _LEAST_SERIES) if agents else limit
+    left = max(MAX_SERIES // len(agents), _LEAST_SERIES) if agents else MAX_SERIES
     budget = dict.fromkeys(agents or ("",), left)
     for leaf in leaves:
         agent = leaf.path[0] if leaf.path and leaf.path[0] in agents else ""
@@ -256,7 +256,7 @@ def _shown_parts(recording: Recording, space: str, limit: int) -> tuple[list[_Sh
         shape, count = leaf.dtype.shape, math.prod(leaf.dtype.shape)
         if len(shape) > 1 and count > left:
             what = "an image" if is_image(leaf) else "an array"
-            notes.append(f"{' '.join(filter(None, (agent, name))) or space}: {what}, {_sizes(shape)}")
+            notes.append(f"{' '.join(filter(None, (agent, name))) or 'observation'}: {what}, {_sizes(shape)}")
             continue
         taken = min(count, budget.get(agent, left))
         budget[agent] = budget.get(agent, left) - taken
@@ -265,7 +265,7 @@ def _shown_parts(recording: Recording, space: str, limit: int) -> tuple[list[_Sh
         if names:
             shown.append(_ShownPart(agent, names, leaf.path, is_text=False))
     if unseen:
-        notes.append(f"{unseen:,} more numbers of each {space} are in the recording")
+        notes.append(f"{unseen:,} more numbers of each observation are in the recording")
     return shown, notes
 
 
