@@ -14,6 +14,8 @@ from runner.learning.learner import NEVER, Learner
 from runner.learning.schedules import compile_schedule, schedule_value
 from runner.planning.evaluation import joint_probabilities
 
+Records = NDArray[np.void]
+
 
 class Moment(NamedTuple):
     """The step of an episode from which it is played on."""
@@ -102,21 +104,13 @@ class Continuation:
             np.zeros(1, np.int64),
         )
         play = self._train if moment.phase == "train" else self._evaluate
-        filled, ended = play(cursor, tally, steps[:1], episodes, action)
+        filled, ended = play(action, cursor, tally, steps[:1], episodes)
         if not ended and len(steps) > 1:
-            filled += play(cursor, tally, steps[1:], episodes, None)[0]
-        return filled
+            filled += play(None, cursor, tally, steps[1:], episodes)[0]
+        return int(filled)
 
-    def _train(
-        self,
-        cursor: NDArray[np.void],
-        tally: Tally,
-        steps: NDArray[np.void],
-        episodes: NDArray[np.void],
-        action: int | None,
-    ) -> tuple[int, int]:
-        learner, rules = self._learner, self._rules
-        tables = learner.tables
+    def _train(self, action: int | None, cursor: Records, tally: Tally, *blocks: Records) -> tuple[int, int]:
+        learner, rules, tables = self._learner, self._rules, self._learner.tables
         if action is not None:  # greedy agents that prefer it take it
             state, own = self._moment.state, learner.model.own_action[action]
             rules = rules._replace(epsilon=compile_schedule(0.0), epsilon_exploits=False)
@@ -126,47 +120,20 @@ class Continuation:
                 for offset, width, choice in zip(tables.offset, learner.model.width, own, strict=True):
                     row = tables.extra[algorithms.POLICY, offset + state * width :][:width]
                     row[:] = np.arange(width) == choice
-        filled, ended = kernel.train(
-            cursor,
-            learner.seed,
-            learner.model,
-            tables,
-            rules,
-            tally,
-            steps,
-            episodes,
-            self._moment.episode + 1,
-            NEVER,
-            None,
-        )
-        return int(filled), int(ended)
+        fixed = (learner.seed, learner.model, tables, rules)
+        filled, ended = kernel.train(cursor, *fixed, tally, *blocks, self._moment.episode + 1, NEVER, None)
+        return filled, ended
 
     def _evaluate(
-        self,
-        cursor: NDArray[np.void],
-        tally: Tally,
-        steps: NDArray[np.void],
-        episodes: NDArray[np.void],
-        action: int | None,
+        self, action: int | None, cursor: Records, tally: Tally, *blocks: Records
     ) -> tuple[int, int]:
-        learner, state = self._learner, self._moment.state
-        policy = learner.trial_actions
+        learner, moment, policy = self._learner, self._moment, self._learner.trial_actions
         if action is not None:
             policy = policy.copy()
-            policy[state] = action
-        filled, ended = kernel.evaluate(
-            cursor,
-            learner.seed,
-            learner.model,
-            learner.tables,
-            policy,
-            tally,
-            steps,
-            episodes,
-            self._moment.episode + 1,
-            state,
-        )
-        return int(filled), int(ended)
+            policy[moment.state] = action
+        fixed = (learner.seed, learner.model, learner.tables, policy)
+        filled, ended = kernel.evaluate(cursor, *fixed, tally, *blocks, moment.episode + 1, moment.state)
+        return filled, ended
 
     def _scheduled(self, schedule: NDArray[np.float64]) -> float:
         return float(schedule_value(schedule, self._moment.trained_episode, self._moment.trained_step))

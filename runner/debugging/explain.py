@@ -170,6 +170,8 @@ def ask(
     """Return what is to be explained; arguments and errors as for `explain`."""
     if not 1 <= seeds <= MAX_SEEDS:
         raise RunnerError(f"--seeds: found {seeds}, expected 1 to {MAX_SEEDS:,}.")
+    if at is not None and at < 1:
+        raise RunnerError(f"--at: found {at}, expected a number of training episodes from 1 on.")
     (side_a, config_a, first), (side_b, config_b, other) = (
         _resolved(source, recordings) for source in (a, b)
     )

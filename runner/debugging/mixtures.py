@@ -303,13 +303,7 @@ def _kept(path: Path) -> Iterator[tuple[str, _Known]]:
 
 
 def _checked(values: object) -> Readings:
-    """Return readings from a file.
-
-    Raises:
-        TypeError: they are none.
-        ValueError: one is not finite.
-        OverflowError: one is too large.
-    """
+    """Return readings from a file."""
     if not isinstance(values, dict):
         raise TypeError(values)
     return {str(name): None if value is None else _finite(value) for name, value in values.items()}

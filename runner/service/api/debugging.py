@@ -9,6 +9,7 @@ from fastapi import APIRouter, Path, Query, Response
 from pydantic import BaseModel
 
 from runner.analysis.step_reference import EXPECTED, StepRef
+from runner.debugging.action_outcomes import ActionOutcome, Outcome
 from runner.service import computed, fragments
 from runner.service.api.replay import STEPS, Part, Start, Steps
 from runner.service.dependencies import RunComputationOf
@@ -24,33 +25,6 @@ router = APIRouter(
 MAX_ACTIONS = 1000
 At = Annotated[str, Path(max_length=60, description=EXPECTED, examples=["eval:3000:17:5"])]
 ActionPath = Annotated[str, Path(max_length=200, description="A joint action: its number or its name.")]
-
-
-class Outcome(BaseModel):
-    """Where an episode led."""
-
-    returns: list[float]
-    """Of each learner."""
-    length: int
-    end: str
-
-
-class ActionOutcome(Outcome):
-    """Where an action leads, and what it is worth."""
-
-    action: int
-    name: str
-    is_recorded: bool
-    probability: float
-    """With which the policy takes it."""
-    learned: list[float]
-    """Its Q-value in each learner's table."""
-    values: list[float | None]
-    """Its exact value for each learner under the policy; null with a discount of 1."""
-    optimal_value: float | None
-    """Its exact value for all together if they act optimally from there on."""
-    regret: float | None
-    """By how much that is below the best action's."""
 
 
 class WhatIf(BaseModel):

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from http import HTTPStatus
 from pathlib import Path
-from typing import Annotated
 
 from fastapi import APIRouter, Request, Response
-from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
 from runner.config.document import write_yaml
-from runner.debugging.explain import DEFAULT_SEEDS, MAX_SEEDS
 from runner.runs.run import Run
 from runner.service.api.jobs import JobResponse, job_response
 from runner.service.dependencies import JobsOf, RecordedRun
@@ -26,19 +23,6 @@ from runner.service.problems import error_docs
 router = APIRouter(
     tags=["jobs"], responses=error_docs(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT, HTTPStatus.BAD_REQUEST)
 )
-Text = Annotated[str, Field(max_length=1000)]
-
-
-class BranchRequest(BaseModel, extra="forbid"):
-    """A change of a training step; as the options of `dualtaxi branch`."""
-
-    at: Text | int = Field(description="The first step that may differ: `EPISODE:T`, or its number.")
-    action: Text | int | dict[Text, Text | int] | None = Field(
-        default=None, description="A joint action, or one by agent; names or numbers. Null: as recorded."
-    )
-    overrides: list[Text] = Field(default=[], max_length=100, description="`KEY=VALUE` each, as for `--set`.")
-    episodes: int | None = Field(default=None, ge=1, description="Training episodes in all.")
-    name: Text | None = Field(default=None, description="Name of the new run; `NAME.branch` by default.")
 
 
 @router.post(
@@ -48,22 +32,12 @@ class BranchRequest(BaseModel, extra="forbid"):
     summary="Branch the training of a run: another action at a step, or other settings from it on.",
 )
 async def branch(
-    run: RecordedRun, jobs: JobsOf, sent: BranchRequest, request: Request, response: Response
+    run: RecordedRun, jobs: JobsOf, sent: BranchQuestion, request: Request, response: Response
 ) -> JobResponse:
     """Queue a branch of training, as `dualtaxi branch` records it; of a run that was trained here."""
-    job = await queue_branch(run, jobs, BranchQuestion(**dict(sent)))
+    job = await queue_branch(run, jobs, sent)
     response.headers["location"] = f"{request.app.url_path_for('list_jobs')}/{job.number}"
     return await run_in_threadpool(job_response, job, jobs)
-
-
-class ExplainRequest(BaseModel, extra="forbid"):
-    """Two runs or configurations; as the options of `dualtaxi explain`."""
-
-    a: Text = Field(description="A run here, or the name of a shipped configuration.")
-    b: Text = Field(description="Another.")
-    metric: Text | None = Field(default=None, description="A metric of evaluations.")
-    at: int | None = Field(default=None, ge=1, description="Training episodes; the end of each by default.")
-    seeds: int = Field(default=DEFAULT_SEEDS, ge=1, le=MAX_SEEDS)
 
 
 @router.post(
@@ -72,9 +46,9 @@ class ExplainRequest(BaseModel, extra="forbid"):
     response_model=JobResponse,
     summary="Find which settings make the difference between two runs or configurations.",
 )
-async def explain(jobs: JobsOf, sent: ExplainRequest, request: Request, response: Response) -> JobResponse:
+async def explain(jobs: JobsOf, sent: ExplainQuestion, request: Request, response: Response) -> JobResponse:
     """Queue an explanation, as `dualtaxi explain` computes it."""
-    job = await queue_explanation(jobs, ExplainQuestion(**dict(sent)))
+    job = await queue_explanation(jobs, sent)
     response.headers["location"] = f"{request.app.url_path_for('list_jobs')}/{job.number}"
     return await run_in_threadpool(job_response, job, jobs)
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from pydantic import BaseModel, Field
 
 from runner.archive.places import at_hand
 from runner.config.job import Job
 from runner.errors import RunnerError
-from runner.execution.branching import Action, branch_job, branch_name, train_branch
+from runner.execution.branching import branch_job, branch_name, train_branch
 from runner.execution.estimate import estimate
 from runner.execution.session import Report, Stop
 from runner.recording.reader import open_recording
@@ -18,15 +17,16 @@ from runner.service.jobs.channel import JobSpec
 from runner.service.jobs.checking import CheckedJob
 
 
-@dataclass(frozen=True)
-class BranchQuestion:
-    """A branch of training; the fields are the arguments of `runner.branch`."""
+class BranchQuestion(BaseModel, extra="forbid", frozen=True):
+    """A change of a training step; the fields are the arguments of `runner.branch`."""
 
-    at: str | int
-    action: Action | None = None
-    overrides: Sequence[str] = ()
-    episodes: int | None = None
-    name: str | None = None
+    at: str | int = Field(description="The first step that may differ: `EPISODE:T`, or its number.")
+    action: str | int | dict[str, str | int] | None = Field(
+        default=None, description="A joint action, or one by agent; names or numbers. Null: as recorded."
+    )
+    overrides: tuple[str, ...] = Field(default=(), description="`KEY=VALUE` each, as for `--set`.")
+    episodes: int | None = Field(default=None, description="Training episodes in all.")
+    name: str | None = Field(default=None, description="Name of the new run; `NAME.branch` by default.")
 
 
 def check_branch(run: Run, question: BranchQuestion) -> CheckedJob:

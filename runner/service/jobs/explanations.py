@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
 from pathlib import Path
+
+from pydantic import BaseModel, Field
 
 from runner.client.jobs import LogEvent, SweepProgress
 from runner.config.sections import RunTable
@@ -26,14 +27,13 @@ from runner.service.jobs.sweeps import slotted_workers
 from runner.sweep.local import Workers
 
 
-@dataclass(frozen=True)
-class ExplainQuestion:
+class ExplainQuestion(BaseModel, extra="forbid", frozen=True):
     """What is to be explained; the fields are the arguments of `runner.explain`."""
 
-    a: str
-    b: str
-    metric: str | None = None
-    at: int | None = None
+    a: str = Field(description="A run here, or the name of a shipped configuration.")
+    b: str = Field(description="Another.")
+    metric: str | None = Field(default=None, description="A metric of evaluations.")
+    at: int | None = Field(default=None, description="Training episodes; the end of each by default.")
     seeds: int = DEFAULT_SEEDS
 
 
@@ -55,12 +55,12 @@ def check_explanation(given: ExplainQuestion, recordings: Path) -> CheckedJob:
     if runs > MAX_RUNS:
         raise ConfigError(f"seeds: makes {runs:,} runs, expected at most {MAX_RUNS:,} in a job.")
     sides = {"a": question.a.run_id or question.a.name, "b": question.b.run_id or question.b.name}
-    return CheckedJob("explain", question.name, runs, 0, asdict(given) | sides)
+    return CheckedJob("explain", question.name, runs, 0, given.model_dump() | sides)
 
 
 def run_explain_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
     """Train what is left of an explanation, and store it."""
-    question = _question(ExplainQuestion(**spec.values), spec.recordings)  # type: ignore[arg-type]
+    question = _question(ExplainQuestion.model_validate(spec.values), spec.recordings)
     deadline, stages = time.monotonic() + OTHER_OWNER_SECONDS, set[str]()
 
     def report(done: int, total: int, what: str) -> None:

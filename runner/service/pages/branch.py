@@ -55,7 +55,7 @@ async def branch(request: Request, run: RecordedRun, sent: Form, jobs: JobsOf) -
 def _question(given: Mapping[str, str]) -> BranchQuestion:
     """Return the branch that the fields of the form describe."""
     prefix = "action."
-    own = {
+    own: dict[str, str | int] = {
         name.removeprefix(prefix): text for name, text in given.items() if name.startswith(prefix) and text
     }
     return BranchQuestion(
