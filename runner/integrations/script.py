@@ -183,9 +183,12 @@ class ScriptRun:
             if not self._join_loop() and not (is_early and self._has_environment):
                 self._begin_values()
             return
-        self._move(self._loop, step)
-        phase = () if method == "picture" else (self._loop.active_phase,)
-        getattr(self._loop.messages, method)(*phase, *arguments)
+        try:
+            self._move(self._loop, step)
+            phase = () if method == "picture" else (self._loop.active_phase,)
+            getattr(self._loop.messages, method)(*phase, *arguments)
+        except Exception as error:
+            self._loop.leave_out(error)
 
     def _move(self, loop: Loop[Any], step: int | None) -> None:
         """Record the script's own step, if it is another than before."""

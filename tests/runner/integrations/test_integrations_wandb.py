@@ -83,6 +83,17 @@ def test_settings_that_json_cannot_hold_become_text_with_one_warning():
     assert found["model"]["activation"] == "<built-in function len>"
 
 
+@pytest.mark.parametrize("has_environment", [True, False])
+def test_a_value_that_cannot_be_recorded_does_not_end_a_training_that_prefers_a_warning(has_environment):
+    wandb.init(on_error="warn", monitor_gym=has_environment)
+    if has_environment:
+        make().reset(seed=0)
+    with pytest.warns(RuntimeWarning, match="a value was left out"):
+        wandb.log({"\ud800": 1.0})
+    wandb.finish()
+    assert the_run().status == "finished"
+
+
 def test_settings_after_the_recording_began_are_logged_as_text():
     wandb.init()
     env = make()

@@ -220,6 +220,12 @@ def test_settings_that_json_cannot_hold_leave_no_run(tmp_path, kind):
     assert not list(tmp_path.iterdir())
 
 
+def test_settings_in_a_set_have_one_order_in_all_processes(tmp_path):
+    with runner.record(pole(), tmp_path, config={"policies": {"shared", "first", "second"}}) as rec:
+        rec.reset(seed=0)
+    assert rec.run.file.config["config"] == {"policies": ["first", "second", "shared"]}
+
+
 @pytest.mark.parametrize(
     "packing",
     [
