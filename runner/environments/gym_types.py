@@ -9,7 +9,9 @@ from gymnasium.vector import VectorEnv
 Space = spaces.Space[Any]
 Env = gymnasium.Env[Any, Any]
 AnyVectorEnv = VectorEnv[Any, Any, Any]
-StepResult = tuple[Any, Any, bool, bool, dict[str, Any]]
-VectorStepResult = tuple[Any, Any, Any, Any, dict[str, Any]]
-ResetResult = tuple[Any, dict[str, Any]]
+Info = dict[str, Any]
+"""What an environment tells besides, by field."""
+StepResult = tuple[Any, Any, bool, bool, Info]
+VectorStepResult = tuple[Any, Any, Any, Any, Info]
+ResetResult = tuple[Any, Info]
 ResetOptions = dict[str, Any]

@@ -28,6 +28,8 @@ _ARGUMENTS: Final = ("recordings", "make", "frames_of", "phase", "autoreset_mode
 """The other arguments of functions that record, of which a misspelt one may be meant."""
 _AS_GIVEN: Final = ("name", "frames_every", "frame_format", "shard", "steps", "on_error", "run_id")
 _DEFAULT_PACKING: Final = Recording()
+Arguments = dict[str, Any]
+"""Arguments of a function that records, by name."""
 _STEPS: Final = ("all", "actions", "none")
 
 
@@ -152,12 +154,12 @@ def options_of(
     `frames_of`: the environments of a vector of which frames are recorded.
     `valid`: the names of the arguments that the function has.
     """
-    options: Json = dict(given)
+    options: Arguments = dict(given)
     if unknown := sorted(set(options) - {*valid}):
         names = [name for name in valid if name != "run_id"]
         hint = nearest(unknown[0], (*names, *_ARGUMENTS))
         raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {', '.join(names)}.{hint}")
-    packing: Json = {name: options[name] for name in PACKING if name in options}
+    packing: Arguments = {name: options[name] for name in PACKING if name in options}
     if options.get("steps") == "actions":  # an index of messages would take more than they do
         packing = {"index": "chunk"} | packing
     info, config, seed = options.get("info", ()), options.get("config"), options.get("seed")

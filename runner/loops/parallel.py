@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from numbers import Integral
 from typing import Any, Unpack
 
-from runner.environments.gym_types import ResetOptions
+from runner.environments.gym_types import Info, ResetOptions
 from runner.environments.mdp import MAX_AGENTS
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, kind_of
@@ -19,9 +19,9 @@ from runner.loops.recorded import RecordedAlone, require_pictures
 from runner.loops.single_rows import AgentRows
 from runner.loops.values import check_phase
 from runner.loops.vector import by_field, require_fixed
+from runner.recording.spaces import Value
 from runner.replay.games import ByAgent, GameStepResult, Turns, is_in_turns
 from runner.replay.stepping import game_spaces
-from runner.util.values import JsonView
 
 
 class RecordedParallel(RecordedAlone[AgentRows]):
@@ -70,7 +70,7 @@ class RecordedParallel(RecordedAlone[AgentRows]):
             self._loop.fail(error)
         return result  # type: ignore[no-any-return]
 
-    def _extras_by_name(self, values: JsonView) -> JsonView:
+    def _extras_by_name(self, values: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return the values of agents as `agent/name`."""
         agents = self._loop.described.agents
         for agent, own in values.items():
@@ -85,7 +85,7 @@ class RecordedParallel(RecordedAlone[AgentRows]):
         """Reset the environment, and record it."""
         return self._recorded_reset(seed, options)
 
-    def _info_by_field(self, info: Mapping[str, object]) -> Mapping[str, object]:
+    def _info_by_field(self, info: Info) -> Info:
         return by_field(info)
 
 

@@ -8,12 +8,12 @@ import weakref
 from collections.abc import Iterator, Mapping
 from typing import Any, Generic, Literal, Self, TypeVar
 
-from runner.environments.gym_types import ResetOptions, ResetResult
+from runner.environments.gym_types import Info, ResetOptions, ResetResult
 from runner.errors import ConfigError
 from runner.loops.generators import GeneratorWatch
 from runner.loops.loop import Loop, R
 from runner.loops.messages import Messages
-from runner.loops.options import Options
+from runner.loops.options import Arguments, Options
 from runner.loops.rows import Rows
 from runner.loops.values import frozen_options
 from runner.runs.run import Run
@@ -215,7 +215,7 @@ def _close_abandoned(loop: Loop[Any]) -> None:
     loop.close(*(("interrupted", "") if error is None or is_interactive else ending_of(error)))
 
 
-def given(**arguments: object) -> dict[str, Any]:
+def given(**arguments: object) -> Arguments:
     """Return the arguments that are not None: an environment's `reset` may not have the others."""
     return {name: value for name, value in arguments.items() if value is not None}
 
@@ -258,7 +258,7 @@ class RecordedAlone(Recorded[S]):
             self._loop.fail(error)
         return result
 
-    def _info_by_field(self, info: Mapping[str, object]) -> Mapping[str, object]:
+    def _info_by_field(self, info: Info) -> Info:
         return info
 
 

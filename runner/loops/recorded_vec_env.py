@@ -8,11 +8,11 @@ from typing import Any
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from runner.errors import ConfigError
+from runner.loops.options import Arguments
 from runner.loops.recorded import Recorded
 from runner.loops.values import warn_user
 from runner.loops.vec_env import VecEnvVector
 from runner.loops.vector import record_vector
-from runner.util.values import Json
 
 _METHODS = ("reset", "step_async", "step_wait")
 
@@ -38,7 +38,7 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         options: the arguments of `record_vector`.
     """
 
-    def __init__(self, base: VecEnv, options: Json) -> None:
+    def __init__(self, base: VecEnv, options: Arguments) -> None:
         self.base = base
         self._vector = VecEnvVector(base)
         try:
@@ -109,7 +109,7 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
     env_method, env_is_wrapped = _passed_on("env_method"), _passed_on("env_is_wrapped")
 
 
-def record_vec_env(env: VecEnv, options: Json) -> VecEnv:
+def record_vec_env(env: VecEnv, options: Arguments) -> VecEnv:
     """Return a `VecEnv` whose environments are recorded, as they are inside of all wrappers.
 
     `env`: the `VecEnv`; of one with wrappers, the innermost wrapper gets the recorded environments.

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
-from runner.environments.gym_types import AnyVectorEnv, ResetOptions, ResetResult, VectorStepResult
+from runner.environments.gym_types import AnyVectorEnv, Info, ResetOptions, ResetResult, VectorStepResult
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, describe
 from runner.loops.generators import States, VectorWatch
@@ -25,8 +25,8 @@ from runner.loops.recorded import Recorded, given, require_pictures
 from runner.loops.values import check_phase, frozen_options
 from runner.loops.vector_counts import Flags
 from runner.loops.vector_rows import VectorRows
+from runner.recording.spaces import Value
 from runner.replay.stepping_vector import final_observations, spaces_of_one
-from runner.util.values import Json, JsonView
 
 if TYPE_CHECKING:
     _Wrapper = VectorWrapper[Any, Any, Any, Any, Any]
@@ -277,7 +277,7 @@ def first_of(envs: AnyVectorEnv) -> Iterator[object]:
         yield envs
 
 
-def _by_environment(infos: Any) -> JsonView:
+def _by_environment(infos: Any) -> Mapping[str, Value]:
     """Return infos by field; SuperSuit returns a list of them, one for each environment."""
     if isinstance(infos, Mapping):
         return infos
@@ -293,9 +293,9 @@ def require_fixed(described: Described) -> None:
         )
 
 
-def by_field(infos: JsonView) -> dict[str, Json]:
+def by_field(infos: Mapping[str, Info]) -> dict[str, Info]:
     """Return the infos of agents by field, then by agent."""
-    fields: dict[str, Json] = {}
+    fields: dict[str, Info] = {}
     for agent, info in infos.items():
         for key, value in info.items():
             fields.setdefault(key, {})[agent] = value
