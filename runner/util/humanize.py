@@ -69,6 +69,13 @@ def number(value: float | None, digits: int = 1) -> str:
     return UNKNOWN if value is None or math.isnan(value) else f"{value:,.{digits}f}"
 
 
+def measure(value: float | None) -> str:
+    """Return a logged value with four significant digits, large ones whole: `0.000202`, `19,950`."""
+    if value is None or not math.isfinite(value):
+        return "not finite"
+    return f"{value:,.0f}" if 1e4 <= abs(value) < 1e15 else f"{value:,.4g}"
+
+
 def number_column(values: Sequence[float]) -> list[str]:
     """Return numbers with the same decimals: none if all are whole, else three."""
     digits = 0 if all(float(value).is_integer() for value in values) else 3

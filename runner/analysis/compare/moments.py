@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -91,6 +92,27 @@ def last_episodes(metric: str, groups: Sequence[Group]) -> str:
     if counts == [1]:
         return "last episode"
     return f"last {f'{counts[0]} to ' if len(counts) > 1 else ''}{counts[-1]} episodes"
+
+
+def averaged(groups: Sequence[Group], metrics: Sequence[str], moment: Moment) -> list[str]:
+    """Return a note on the window that a value of training averages, unless only last values are compared."""
+    if moment.kind == "last" or not any(name.startswith("training.") for name in metrics):
+        return []
+    windows: dict[str, list[str]] = {}
+    for group in groups:
+        run, window = group.runs[0], ""
+        if run.can_train_again:
+            log = run.config["log"]
+            window = f"the last {log['episodes']:,} episodes (lengths) or {log['window']:,} steps (rewards)"
+        elif run.training:
+            ends = [0.0, *sorted(place for place, _ in run.training)]
+            width = min(after - before for before, after in itertools.pairwise(ends))
+            if width > 1 or not run.axis.whole:
+                window = f"stretches of {run.axis.moment(width)}"
+        if window:
+            windows.setdefault(window, []).append(group.label)
+    found = "; ".join(f"{window} in {listed(labels)}" for window, labels in windows.items())
+    return [f"a value of training is the mean over a window: {found}"] if found else []
 
 
 def few_seeds(groups: Sequence[Group], seeds: Mapping[str, int]) -> list[str]:

@@ -28,7 +28,11 @@ EXPLANATION: Final = (
 def sections(comparison: Comparison) -> list[Section]:
     """Return the text of a comparison."""
     rows = [(label, str(len(ids)), listed(ids)) for label, ids in comparison.groups.items()]
-    sentences = [*summary(comparison), *(f"Note: {note}." for note in comparison.notes)]
+    sentences = [
+        *summary(comparison),
+        f"Values are read: {comparison.moment}.",
+        *(f"Note: {note}." for note in comparison.notes),
+    ]
     first = Section("Groups", sentences, [Grid(("group", "runs", ""), rows)])
     return [
         first,

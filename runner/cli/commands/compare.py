@@ -56,7 +56,8 @@ if TYPE_CHECKING:
     default="last",
     show_default=True,
     metavar="last|best|area|N",
-    help="Compare at the last evaluation, at each run's best, the mean over all, or after N on the axis.",
+    help="Compare at the last evaluation, at each run's best, the mean over all, or after N on the axis. "
+    "Values of training are means over a window, which a note states.",
 )
 @axis_option
 @click.option(

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.export.plots.chart import Chart, Scale, labelled, series_colour
+from runner.export.plots.chart import Chart, Scale, labelled, series_colour, series_marker
 from runner.export.plots.curves import HEIGHT, WIDTH, Plot, draw_legend
 from runner.recording.clock import SAMPLE_SECONDS, Clock
 from runner.recording.host import HostMetrics
@@ -102,7 +102,10 @@ def _plot(panel: _Panel, seconds: Values, duration: float) -> Plot:
     chart.frame(panel.title, 25.0 if len(usable) == 1 else 14.0, unit, [panel.unit])
     for number, values in enumerate(usable.values()):
         known = ~np.isnan(values)
-        chart.line(seconds[known] / divisor, values[known], series_colour(number), number)
+        places, shown = seconds[known] / divisor, values[known]
+        chart.line(places, shown, series_colour(number), number)
+        if len(places) < 3:  # a line through one point is invisible
+            chart.markers(places, shown, series_colour(number), series_marker(number), 1.7)
     if len(usable) > 1:
         draw_legend(chart, list(usable), [series_colour(i) for i in range(len(usable))])
     return Plot(panel.title, chart.svg(), wide=False)

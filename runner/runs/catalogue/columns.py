@@ -13,7 +13,7 @@ from typing import Any, Final
 from runner.errors import RunnerError, nearest
 from runner.recording.metrics import METRICS
 from runner.runs.run import RECORDING_FILE
-from runner.util.humanize import UNKNOWN, age, duration, number, size
+from runner.util.humanize import UNKNOWN, age, duration, measure, number, size
 
 IndexRow = dict[str, Any]
 """A run as the index has it, by the names of the stored columns."""
@@ -77,7 +77,7 @@ def moment(row: IndexRow) -> datetime:
 
 def _logged_text(values: Mapping[str, float | None]) -> str:
     """Return logged values on one line: `loss 0.0123, entropy 1.5, 3 more`."""
-    texts = [f"{name} {'not finite' if value is None else f'{value:,.4g}'}" for name, value in values.items()]
+    texts = [f"{name} {measure(value)}" for name, value in values.items()]
     more = len(texts) - _MAX_LOGGED
     return ", ".join(texts if more <= 0 else [*texts[:_MAX_LOGGED], f"{more} more"])
 

@@ -221,10 +221,11 @@ def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:
     number, live = _job_of(run, jobs)
     summary = live or (_done_by(run) if not run.can_train_again and run.status == "running" else run.summary)
     episodes = summary.get("episode", summary.get("episodes"))
+    trial_steps = summary.get("eval_steps")
     facts = _results(run, EvaluationMetrics.of(summary.get("last_evaluation") or {})) | {
         "Training episodes": humanize.number(episodes, 0),
         "Training steps": humanize.number(summary.get("train_steps"), 0),
-        "Evaluation steps": humanize.number(summary.get("eval_steps"), 0),
+        **({"Evaluation steps": humanize.number(trial_steps, 0)} if trial_steps or live else {}),
         "Time": _duration(run),
         **({"Other processes": f"{others}, added at the end"} if (others := shards_in_words(run)) else {}),
         "Recording": humanize.size(summary["bytes"]) if summary.get("bytes") else humanize.UNKNOWN,
@@ -276,7 +277,7 @@ def _results(run: Run, last: EvaluationMetrics) -> dict[str, str]:
         f"Mean length of {episodes}": humanize.number(recent.mean_length),
     }
     logged = {
-        f"Logged last: {name}": "not finite" if value is None else f"{value:,.4g}"
+        f"Logged last: {name}": humanize.measure(value)
         for name, value in islice(results.logged.items(), MAX_LOGGED)
     }
     return {name: text for name, text in measures.items() if humanize.UNKNOWN not in text} | logged
