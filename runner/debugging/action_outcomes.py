@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from runner.analysis.sections import Grid
+from runner.analysis.sections import Grid, Section, html
 from runner.drawing import svg, svg_maps
 from runner.drawing.palette import ink_on, ramp_colour
 from runner.environments.mdp import Mdp
@@ -199,21 +199,13 @@ class WhatIf:
 
     def _repr_html_(self) -> str:
         """Return the result as a notebook shows it."""
-        left = ' style="text-align:left"'
-        facts = "".join(
-            f"<tr><th{left}>{escape(name)}</th><td{left}>{escape(text)}</td></tr>"
-            for name, text in self.facts.items()
-        )
-        grid = self.grid
-        head = "".join(f"<th>{escape(heading)}</th>" for heading in grid.headings)
-        rows = "".join(
-            "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in grid.rows
-        )
-        notes = "".join(f"<p>{escape(note[0].upper() + note[1:])}.</p>" for note in self.notes)
+        facts = [f"{name}: {text}" for name, text in self.facts.items()]
+        notes = [f"{note[0].upper()}{note[1:]}." for note in self.notes]
         return (
-            f'<table>{facts}</table><div style="display:flex;gap:1rem;max-width:60rem">'
-            f'<div style="flex:1">{self.picture()}</div><div style="flex:2">{self.matrix()}</div></div>'
-            f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>{notes}"
+            f"{html([Section('What if?', facts)])}"
+            f'<div style="display:flex;gap:1rem;max-width:60rem"><div style="flex:1">{self.picture()}</div>'
+            f'<div style="flex:2">{self.matrix()}</div></div>'
+            f"{html([Section('Where each action leads', notes, [self.grid])])}"
         )
 
 
