@@ -268,7 +268,7 @@ def number_on_axis(value: float) -> str:
 def labelled(ticks: Sequence[float], short: bool = False) -> list[tuple[float, str]]:
     """Return ticks with their labels; short ones are `20k` for 20,000."""
     return [
-        (tick, f"{number_on_axis(tick / 1e3)}k" if short and 0 < abs(tick) < 1e6 else number_on_axis(tick))
+        (tick, f"{number_on_axis(tick / 1e3)}k" if short and 1e3 <= abs(tick) < 1e6 else number_on_axis(tick))
         for tick in ticks
     ]
 
