@@ -21,7 +21,8 @@ rllib_games = pytest.importorskip("tests.integrations.rllib_games")
 
 @pytest.fixture(scope="module", autouse=True)
 def cluster():
-    ray.init(num_cpus=4, include_dashboard=False, log_to_driver=False, ignore_reinit_error=True)
+    ray.shutdown()  # a cluster of another test may have fewer processors, and these would be waited for
+    ray.init(num_cpus=4, include_dashboard=False, log_to_driver=False)
     yield
     ray.shutdown()
 
