@@ -73,7 +73,7 @@ def _speed(source: Run, folder: Path, url: str, repetitions: int) -> list[Figure
             while sent.offset < size:
                 sent = client.append_upload(sent, source.recording, size)
             last = number == repetitions - 1
-            sent = client.complete_upload(sent, source, size, digest if last else "0" * 64)
+            sent = client.complete_upload(sent, size, digest if last else "0" * 64)
             uploaded.append(size / (time.perf_counter() - begin) / 1e6)
             begin = time.perf_counter()
             while sent.state == "verifying":
