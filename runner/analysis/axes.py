@@ -53,7 +53,11 @@ AXES: Final = {axis.name: axis for axis in (EPISODES, STEPS, UPDATES, TIME)}
 
 
 def axis_of(name: str) -> Axis:
-    """Return the axis of a name."""
+    """Return the axis of a name.
+
+    Raises:
+        RunnerError: there is none.
+    """
     if name not in AXES:
         raise RunnerError(f"axis: found {name!r}, expected one of {', '.join(AXES)}.{nearest(name, AXES)}")
     return AXES[name]
@@ -157,6 +161,9 @@ def _updates(recording: Recording) -> tuple[Values, Values]:
     """Return training steps, and the number of updates that the loop logged there.
 
     Of more than 262,144 values every second, fourth, ... is used.
+
+    Raises:
+        RecordingError: the numbers of the steps' episodes decrease; compiled code uses them as indices.
     """
     steps: list[int] = []
     values: list[float] = []

@@ -167,7 +167,11 @@ def step_columns(
     start: int = 0,
     stop: int | None = None,
 ) -> dict[str, Array]:
-    """Return the columns of `steps`, an array each."""
+    """Return the columns of `steps`, an array each.
+
+    Raises:
+        RecordingError: the recording cannot be read, or has no such episode.
+    """
     topic = recording.topic(f"/{phase}/step")
     if topic not in recording.dtypes:
         raise RecordingError(

@@ -98,7 +98,11 @@ def grouped(
 
 
 def require_two(groups: Sequence[Group], by: str | None = None) -> None:
-    """Refuse a single group."""
+    """Refuse a single group.
+
+    Raises:
+        RunnerError: there are not two groups.
+    """
     if len(groups) > 1:
         return
     (group,) = groups

@@ -161,7 +161,11 @@ def mean_height(places: Sequence[float], values: Sequence[float]) -> float:
 
 
 def parse_target(text: str) -> tuple[str, float]:
-    """Return metric and level of a target such as `success_percent=80`."""
+    """Return metric and level of a target such as `success_percent=80`.
+
+    Raises:
+        RunnerError: the text is no target.
+    """
     metric, _, level = text.partition("=")
     try:
         return metric, float(level)

@@ -39,7 +39,11 @@ class StepRef:
 
     @classmethod
     def parse(cls, text: str, expected: str = EXPECTED) -> Self:
-        """Return the step that a text refers to; `expected` is as for `parse_step`."""
+        """Return the step that a text refers to; `expected` is as for `parse_step`.
+
+        Raises:
+            RunnerError: the text is no step reference.
+        """
         if match := _TRAINING.fullmatch(text):
             return cls(*(int(part or 0) for part in match.groups()))
         if match := _EVALUATION.fullmatch(text):
@@ -99,7 +103,11 @@ def training_steps(recording: Recording) -> int:
 
 
 def training_step(recording: Recording, at: int | StepRef) -> int:
-    """Return the number of a training step of a job, also of one that recorded no steps."""
+    """Return the number of a training step of a job, also of one that recorded no steps.
+
+    Raises:
+        RunnerError: the reference is to a step of an evaluation.
+    """
     taken = training_steps(recording)
     if isinstance(at, int):
         if not 0 <= at < taken:

@@ -260,7 +260,11 @@ def shape_of(
 ) -> Shape:
     """Return the shape of a run.
 
-    `extras`: the names of its extras, from when on.
+    Args:
+        extras: the names of its extras, from when on.
+
+    Raises:
+        RecordingError: they contradict each other.
     """
     try:
         learners = json.loads(run["agents"])
@@ -322,7 +326,11 @@ def records_of(topic: Topic, batch: pa.RecordBatch, shape: Shape) -> Records:
 
 
 def checked_batch(topic: Topic, records: Records, shape: Shape, where: str) -> pa.RecordBatch:
-    """Return the columns of message records, which turn back into exactly these records."""
+    """Return the columns of message records, which turn back into exactly these records.
+
+    Raises:
+        RecordingError: they do not: the records have what no recorder writes.
+    """
     batch = batch_of(topic, records, shape)
     restored = records_of(topic, batch, shape)
     if topic.message is schema.EXTRA:
@@ -363,7 +371,11 @@ def record_bytes(records: Records) -> memoryview:
 
 
 def of_phase(batch: pa.RecordBatch, phase: str, where: str) -> pa.RecordBatch:
-    """Return the rows of one phase."""
+    """Return the rows of one phase.
+
+    Raises:
+        RecordingError: there is a phase other than training and evaluation.
+    """
     column = batch.column("phase")
     names = column.dictionary.to_pylist()
     codes = numbers(column.indices)

@@ -69,7 +69,11 @@ def _json(values: Mapping[str, object]) -> bytes:
 
 
 def read_manifest(data: bytes, where: str) -> Manifest:
-    """Return the manifest in a file's bytes."""
+    """Return the manifest in a file's bytes.
+
+    Raises:
+        RecordingError: they are not a manifest of a dualtaxi archive.
+    """
     try:
         values = json.loads(data[:MAX_MANIFEST_BYTES])
         if values["format"] != FORMAT:

@@ -38,7 +38,12 @@ def default_target(recordings: Path) -> str:
 def at_hand(run: Run, log: Callable[[str], None] = lambda _: None, report: Report = lambda _: None) -> Run:
     """Return the run with a recording that can be read: an archived one is restored into the user's cache.
 
-    `log`: called with a line if it must be restored, which takes seconds.
+    Args:
+        log: called with a line if it must be restored, which takes seconds.
+
+    Raises:
+        RecordingError: the archive is damaged, missing, or of another run.
+        StorageError: the cache cannot be written, or another process has been restoring it for too long.
     """
     if run.status != "archived" or run.restored:
         return run
@@ -73,7 +78,11 @@ def at_hand(run: Run, log: Callable[[str], None] = lambda _: None, report: Repor
 
 @contextlib.contextmanager
 def archive_of(run: Run) -> Iterator[Path]:
-    """Yield a local folder with the archive of a run."""
+    """Yield a local folder with the archive of a run.
+
+    Raises:
+        RecordingError: it is at none of its places.
+    """
     from runner.archive.store import Store, split_place
 
     place = archive_place(run)
@@ -104,7 +113,11 @@ def _places(run: Run) -> list[str]:
 
 
 def restore_to(folder: Path, path: Path, digest: str, report: Report) -> None:
-    """Restore an archive with a digest into a file; it is checked completely."""
+    """Restore an archive with a digest into a file; it is checked completely.
+
+    Raises:
+        RecordingError: the archive is damaged, or has another digest; there is no file then.
+    """
     path.unlink(missing_ok=True)
     try:
         found = _in_child_process(folder, path, report)

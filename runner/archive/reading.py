@@ -51,7 +51,11 @@ class Archive(RunDescription):
         self.manifest: Manifest = read_manifest(data, str(path))
 
     def check_files(self) -> None:
-        """Compare size and hash of every file with what the manifest says."""
+        """Compare size and hash of every file with what the manifest says.
+
+        Raises:
+            RecordingError: one is missing or changed; it is named.
+        """
         for name, expected in self.manifest.files.items():
             path = self.folder / name
             try:
@@ -97,7 +101,11 @@ class Archive(RunDescription):
         return RecordingError(f"{self.folder / layout.METADATA}: is invalid ({error!r}).")
 
     def metadata(self, name: str) -> dict[str, str]:
-        """Return a metadata record's entries."""
+        """Return a metadata record's entries.
+
+        Raises:
+            RecordingError: there is none of that name.
+        """
         if name not in self._metadata:
             raise RecordingError(f"{self.folder}: has no metadata {name!r}.")
         return self._metadata[name]
@@ -132,7 +140,11 @@ class Archive(RunDescription):
         return read_layouts(columns, str(self.folder / name))
 
     def attachment(self, name: str) -> bytes:
-        """Return the data of an attachment."""
+        """Return the data of an attachment.
+
+        Raises:
+            RecordingError: there is no such attachment.
+        """
         if name not in dict(self.attachments):
             raise RecordingError(f"{self.folder}: has no attachment {name!r}.")
         return self._bytes(name)
@@ -153,7 +165,11 @@ class Archive(RunDescription):
         return sum(self.manifest.topics.get(topic.name, Entry(0, "")).size for topic in topics)
 
     def batches(self, name: str, columns: pa.Schema, rows: int, n: int) -> Iterator[pa.RecordBatch]:
-        """Yield the rows of a table in batches."""
+        """Yield the rows of a table in batches.
+
+        Raises:
+            RecordingError: it is not such a table.
+        """
         path = self.folder / name
         try:
             # pre_buffer would keep everything that was read until the file is closed

@@ -48,7 +48,8 @@ _MAX_PENDING: Final = 8
 def restore(folder: Path, path: Path, report: Callable[[int], None] = lambda _: None) -> Manifest:
     """Write the recording of an archive to a new file; return the archive's manifest.
 
-    `path`: the file, which does not exist yet; nor does it after an error.
+    Args:
+        path: the file, which does not exist yet; nor does it after an error.
     """
     archive = Archive(folder)
     archive.check_files()

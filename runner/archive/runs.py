@@ -48,8 +48,9 @@ def archive_run(
 ) -> Archived:
     """Archive a run.
 
-    `remove`: remove the recording after the archive was restored in memory and compared with it.
-    `dry_run`: write the archive to a temporary folder, and change nothing.
+    Args:
+        remove: remove the recording after the archive was restored in memory and compared with it.
+        dry_run: write the archive to a temporary folder, and change nothing.
 
     Raises:
         RunnerError: the run stands alone, or is running; the target has another archive of its id.
@@ -156,7 +157,13 @@ def _restore_contents(archive: Path, folder: Path) -> None:
 
 
 def restore_place(place: str, recordings: Path, report: Report = lambda _: None) -> Run:
-    """Restore a run from its archive alone, with the same id, into a recordings folder."""
+    """Restore a run from its archive alone, with the same id, into a recordings folder.
+
+    Raises:
+        RunnerError: there is a run of that id.
+        RecordingError: there is no archive, or it is damaged.
+        StorageError: the run cannot be written.
+    """
     location, run_id = split_place(place)
     store = Store(location)
     manifest = store.manifest(run_id)

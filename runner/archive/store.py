@@ -56,7 +56,11 @@ class Store:
         return str(self._folder / run_id) if self._folder else f"{self._url}/{run_id}"
 
     def manifest(self, run_id: str) -> Manifest | None:
-        """Return the manifest of a run's archive; None if there is no archive."""
+        """Return the manifest of a run's archive; None if there is no archive.
+
+        Raises:
+            StorageError: it cannot be read.
+        """
         where = f"{self.place(run_id)}/{layout.MANIFEST}"
         with self._reaching(where):
             path = self._path(run_id, layout.MANIFEST)
@@ -166,7 +170,11 @@ class Store:
                     left -= target.write(data)
 
     def _path(self, *parts: str) -> str:
-        """Return the path of a file in the store's file system."""
+        """Return the path of a file in the store's file system.
+
+        Raises:
+            RecordingError: it would lead out of the store.
+        """
         if not is_inside(path := "/".join(parts)):
             raise RecordingError(f"{self._url}: {path!r} is not the name of an archive's file.")
         return f"{self._root}/{path}"

@@ -43,7 +43,8 @@ def write_archive(
 ) -> Manifest:
     """Write a recording into a folder as an archive, the manifest last; return the manifest.
 
-    `folder`: an empty folder.
+    Args:
+        folder: an empty folder.
 
     Raises:
         OSError: the folder cannot be written.

@@ -69,7 +69,11 @@ def folded(run: Run) -> Run:
 
 
 def recorded(run: Run) -> Run:
-    """Return a run with its recording, restored into the cache if it is archived."""
+    """Return a run with its recording, restored into the cache if it is archived.
+
+    Raises:
+        RunnerError: the recording is missing.
+    """
     run = restored(run)
     if run.recording.exists():
         return run
@@ -108,7 +112,11 @@ def find_recording(name: str, recordings: Path | None) -> tuple[Path, Run | None
 
 
 def require_over(run: Run | None) -> None:
-    """Refuse a run that is still running."""
+    """Refuse a run that is still running.
+
+    Raises:
+        RunnerError: it is.
+    """
     if run is not None and run.status == "running":
         raise RunnerError(f"run {run.run_id} is running; wait until it has finished, or interrupt it.")
 

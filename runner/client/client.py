@@ -225,7 +225,11 @@ def _about(run: Run) -> dict[str, object]:
 
 
 def _read_pieces(path: Path, offset: int, size: int) -> Iterator[bytes]:
-    """Yield `size` bytes of a file."""
+    """Yield `size` bytes of a file.
+
+    Raises:
+        RunnerError: there are fewer.
+    """
     with path.open("rb") as stream:
         stream.seek(offset)
         while size:

@@ -168,7 +168,11 @@ class Connection:
             yield response
 
     def download(self, path: str, tag: str, offset: int, size: int) -> Iterator[bytes]:
-        """Yield the bytes of a file of `size` bytes, whose ETag is `tag`, from an offset on."""
+        """Yield the bytes of a file of `size` bytes, whose ETag is `tag`, from an offset on.
+
+        Raises:
+            ServerError: it has changed, or the server is unavailable.
+        """
         headers = {"Range": f"bytes={offset}-", "If-Range": tag, "Accept-Encoding": "identity"}
         with self.stream(path, headers) as response:
             if response.headers.get("content-range") != f"bytes {offset}-{size - 1}/{size}":
@@ -203,7 +207,11 @@ class Connection:
 
 
 def checked_url(url: str) -> str:
-    """Return the address of a server, without a slash at its end."""
+    """Return the address of a server, without a slash at its end.
+
+    Raises:
+        RunnerError: it is none.
+    """
     parts = urlsplit(url)
     if parts.scheme not in ("http", "https") or not parts.hostname or parts.query or parts.fragment:
         raise RunnerError(f"server: found {url!r}, expected an address such as http://localhost:8000.")
@@ -216,7 +224,11 @@ def checked_url(url: str) -> str:
 
 
 def find_token(token: str | None = None, file: Path | None = None) -> str | None:
-    """Return the given token, or that in a file, else that of the environment variables; None without any."""
+    """Return the given token, or that in a file, else that of the environment variables; None without any.
+
+    Raises:
+        RunnerError: it is no token, or its file cannot be read.
+    """
     if token is None and file is None:
         token, named = os.environ.get(TOKEN_VARIABLE), os.environ.get(TOKEN_FILE_VARIABLE)
         file = Path(named) if named else None

@@ -131,7 +131,11 @@ class JobEvent:
 
     @classmethod
     def from_json(cls, kind: str, values: JsonView, event_id: str = "") -> JobEvent:
-        """Return an event from a stream or the database."""
+        """Return an event from a stream or the database.
+
+        Raises:
+            RunnerError: it is none.
+        """
         try:
             found: type[EventData] = SweepProgress if "done" in values else RunProgress
             if kind != "progress":
@@ -167,7 +171,11 @@ class RemoteJob:
 
     @classmethod
     def from_json(cls, response: JsonView) -> RemoteJob:
-        """Return the job in a response."""
+        """Return the job in a response.
+
+        Raises:
+            RunnerError: there is none in it.
+        """
         keys = ("number", "kind", "name", "state", "runs", "error", "progress")
         try:
             begun = {int(run["seed"]): str(run["run_id"]) for run in response["begun"]}

@@ -93,7 +93,11 @@ def _pull_contents(client: Connection, run: Run, report: Report) -> None:
 
 
 def _download(client: Connection, path: str, tag: str, size: int, part: Path, report: Report) -> None:
-    """Download a file, from where it was interrupted the last time."""
+    """Download a file, from where it was interrupted the last time.
+
+    Raises:
+        StorageError: there is no room.
+    """
     backoff = client.backoff()
     with part.open("ab") as stream:
         missing, free = size - stream.tell(), shutil.disk_usage(part.parent).free

@@ -59,7 +59,11 @@ def load(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Experim
 def from_text(text: str, source: str, overrides: Sequence[str] = ()) -> ExperimentConfig:
     """Return the experiment that the text of a file describes.
 
-    `source`: the file's name, for messages and as the default name of the experiment.
+    Args:
+        source: the file's name, for messages and as the default name of the experiment.
+
+    Raises:
+        ConfigError: as for `load`.
     """
     stem, document = FilePath(source).stem, read_yaml(text, source)
     if document.value is None and not document.problems:
@@ -103,7 +107,11 @@ def packing_from(values: Mapping[str, object]) -> Recording:
 
 
 def read_text(file: FilePath) -> str:
-    """Return the text of a file."""
+    """Return the text of a file.
+
+    Raises:
+        ConfigError: it cannot be read, is too large, or is not UTF-8.
+    """
     try:
         with file.open("rb") as stream:
             content = stream.read(MAX_BYTES + 1)

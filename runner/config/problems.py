@@ -41,7 +41,8 @@ _ELSEWHERE = {
 def problems_in(error: ValidationError, value: object, schema: Schema | None = None) -> list[Problem]:
     """Return the problems of `value`, without those that are only a consequence of others.
 
-    `schema`: its schema, without references; that of a configuration unless given.
+    Args:
+        schema: its schema, without references; that of a configuration unless given.
     """
     details = error.errors(include_url=False, include_input=False)
     paths = [_path(detail) for detail in details]

@@ -251,7 +251,11 @@ def answer(
 
 
 def _resolved(source: Source, recordings: Path) -> tuple[Side, ExperimentConfig, int]:
-    """Return a name, the configuration and the seed of a run or a configuration."""
+    """Return a name, the configuration and the seed of a run or a configuration.
+
+    Raises:
+        RunnerError: there is none, or it is a loop, whose learning is the user's own.
+    """
     if isinstance(source, Mapping):
         source = from_mapping(source)
     if isinstance(source, str | os.PathLike):
@@ -296,6 +300,9 @@ def _metric_of(sides: Sequence[Readings], metric: str | None) -> str:
     """Return the metric: the one that was chosen, the success rate, or the mean return.
 
     The sides are the readings of A and of B.
+
+    Raises:
+        RunnerError: there is no such metric in evaluations of A and of B.
     """
     shared = {name for name in sides[0] if all(side.get(name) is not None for side in sides)}
     candidates = [metric] if metric is not None else ["success_percent", "mean_return"]

@@ -95,7 +95,11 @@ def remove_trained(trained: Trained) -> None:
 
 
 def read_explanation(name: str, recordings: Path) -> Explanation:
-    """Return a result from its file."""
+    """Return a result from its file.
+
+    Raises:
+        RunnerError: there is none of this name, or its file is damaged.
+    """
     from pydantic import TypeAdapter, ValidationError
 
     known = explanations_in(recordings)

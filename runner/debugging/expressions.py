@@ -101,7 +101,11 @@ class Parser:
         self._conditions: dict[str, Term] = {}
 
     def parse(self) -> Expression:
-        """Return the parsed expression."""
+        """Return the parsed expression.
+
+        Raises:
+            RunnerError: it is no condition over quantities, or too large; a line marks the place.
+        """
         condition = self._condition(self._tree())
         if not self._quantities:
             raise RunnerError(f"expression: found {self.text}, expected a quantity in it that changes.")

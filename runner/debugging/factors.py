@@ -87,6 +87,10 @@ def mix(a: ExperimentConfig, b: ExperimentConfig, at: int | None = None, exact: 
 
     They are compared after `at` training episodes, by default each at its own end; `exact` is whether
     evaluations need exact measures.
+
+    Raises:
+        RunnerError: they differ in no setting, in too many, or in settings that cannot be mixed; or one of
+            them trains fewer episodes than `at`.
     """
     for name, config in (("A", a), ("B", b)):
         if at is not None and at > config.episodes:

@@ -198,7 +198,11 @@ class Mixtures:
         return [self._found[mixture, seed] for seed in self._seeds if (mixture, seed) in self._found]
 
     def values(self, mixtures: Sequence[int], metric: str) -> NDArray[np.float64]:
-        """Return the values of a metric in mixtures, [mixtures, seeds]."""
+        """Return the values of a metric in mixtures, [mixtures, seeds].
+
+        Raises:
+            RunnerError: a mixture does not have it, or not as a finite number.
+        """
         rows = []
         for mixture in mixtures:
             row = [read.get(metric) for read in self.readings(mixture)]
@@ -303,7 +307,11 @@ def _kept(path: Path) -> Iterator[tuple[str, _Known]]:
 
 
 def _checked(values: object) -> Readings:
-    """Return readings from a file."""
+    """Return readings from a file.
+
+    Raises:
+        TypeError: they are none.
+    """
     if not isinstance(values, dict):
         raise TypeError(values)
     return {str(name): None if value is None else _finite(value) for name, value in values.items()}

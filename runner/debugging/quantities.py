@@ -339,7 +339,11 @@ class JobColumns:
 
 
 def check_lost(recording: Recording, expected: int, found: int) -> None:
-    """Refuse training steps of which some were lost before the step that was found."""
+    """Refuse training steps of which some were lost before the step that was found.
+
+    Raises:
+        RecordingError: another step was expected.
+    """
     if found != expected:
         raise RecordingError(
             f"{recording.path}: training steps {expected:,} to {found - 1:,} were lost, so what holds after "

@@ -67,6 +67,9 @@ def weights_of(
     """Return the weights of a Q-value after a number of training steps of a job that learns.
 
     `limit` is the most steps in `Weights.largest`; `report` is called with the number of steps read so far.
+
+    Raises:
+        StorageError: the temporary file cannot be written.
     """
     replay = TableReplay(recording)
     learner, model = replay.learner, replay.learner.model
@@ -125,7 +128,11 @@ def weights_of(
 def _updates(
     recording: Recording, replay: TableReplay, learner: int, stop: int
 ) -> Iterator[NDArray[np.void]]:
-    """Yield what decides the weights of a learner's updates up to a step, in parts of `STEPS_AT_ONCE`."""
+    """Yield what decides the weights of a learner's updates up to a step, in parts of `STEPS_AT_ONCE`.
+
+    Raises:
+        RecordingError: the numbers of the steps' episodes decrease; compiled code uses them as indices.
+    """
     episode = 0
     while replay.step < stop:
         first = replay.step

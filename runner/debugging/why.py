@@ -174,7 +174,11 @@ def _learner(recording: Recording, agent: str | None) -> int:
 
 
 def _step_at(recording: Recording, at: StepRef | None) -> NDArray[np.void]:
-    """Return the record of a step."""
+    """Return the record of a step.
+
+    Raises:
+        ConfigError: none is given.
+    """
     if at is None:
         raise ConfigError(
             "found no state or no action, expected both, or a step (`at`) whose state and action are meant."

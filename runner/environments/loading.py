@@ -53,7 +53,11 @@ def load_mdp(env_id: str, kwargs: Mapping[str, object], rewards: str = "team") -
 
 
 def mdp_of(env: Any, kwargs: Mapping[str, object]) -> Mdp:
-    """Return the arrays of an environment made with `kwargs`, whose agents share the reward."""
+    """Return the arrays of an environment made with `kwargs`, whose agents share the reward.
+
+    Raises:
+        EnvironmentNotUsable: it has no transition table, or one that is invalid.
+    """
     spec = env.spec
     env_id = spec.id if spec is not None else type(env.unwrapped).__qualname__
     try:

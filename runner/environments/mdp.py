@@ -184,7 +184,11 @@ def _events(mdp: Mdp, steps: NDArray[np.void]) -> NDArray[np.uint32]:
 
 
 def from_parts(description: JsonView, arrays: Mapping[str, NDArray[Any]]) -> Mdp:
-    """Return the Mdp that `description()` and `arrays()` came from, checked like a new one."""
+    """Return the Mdp that `description()` and `arrays()` came from, checked like a new one.
+
+    Raises:
+        EnvironmentNotUsable: they do not describe an environment.
+    """
     try:
         penalty = description["penalty_below"]
         mdp = Mdp(

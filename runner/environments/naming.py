@@ -73,7 +73,11 @@ def numbered_actions(mdp: Mdp) -> list[list[str]]:
 
 
 def agent_of(mdp: Mdp, name: str) -> int:
-    """Return the number of the agent with this name, written as in the environment or as people write it."""
+    """Return the number of the agent with this name, written as in the environment or as people write it.
+
+    Raises:
+        ConfigError: there is none.
+    """
     known = {text: i for i, agent in enumerate(mdp.agents) for text in (agent, spoken(agent))}
     if name not in known:
         raise ConfigError(
@@ -120,7 +124,8 @@ def agent_actions(mdp: Mdp, action: int) -> tuple[int, ...]:
 def exploration_in_words(mask: int, learners: Sequence[str]) -> str:
     """Return which learners explored in a step: `explored` if all did, `taxi 1 explored`, or nothing.
 
-    `mask`: the step's `explored`: bit i is learner i.
+    Args:
+        mask: the step's `explored`: bit i is learner i.
     """
     explorers = [spoken(name) for i, name in enumerate(learners) if mask >> i & 1]
     if not explorers or len(explorers) == len(learners):

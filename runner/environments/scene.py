@@ -73,8 +73,9 @@ def scene_mistake(
 ) -> str | None:
     """Return the first mistake of a scene and its arrays; None if there is none.
 
-    `cells`: the cell of each thing in each state, [S, things].
-    `carriers`: which thing carries it, or -1, [S, things].
+    Args:
+        cells: the cell of each thing in each state, [S, things].
+        carriers: which thing carries it, or -1, [S, things].
     """
     if scene is None:
         return None if cells is None and carriers is None else "the scene's arrays need a scene; found none"

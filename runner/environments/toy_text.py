@@ -55,7 +55,8 @@ class GridWorld:
 def grid_world(env_id: str, base: object, arrays: Arrays) -> GridWorld | None:
     """Return the additions to one of Gymnasium's grid worlds; None for any other environment.
 
-    `arrays`: its transition arrays, as `runner.environments.mdp` has them.
+    Args:
+        arrays: its transition arrays, as `runner.environments.mdp` has them.
     """
     adapt = _ADAPTERS.get(f"{type(base).__module__}.{type(base).__qualname__}")
     return None if adapt is None else adapt(env_id, base, arrays)

@@ -157,7 +157,11 @@ def chosen_actions(mdp: Mdp, action: Action | None) -> dict[str, str]:
 
 
 def _changes(now: ExperimentConfig, wanted: ExperimentConfig) -> Changes:
-    """Return the settings of a branch."""
+    """Return the settings of a branch.
+
+    Raises:
+        ConfigError: something differs that cannot change at a step.
+    """
     differing = [key for key, value in wanted if value != getattr(now, key)]
     fixed = [key for key in differing if key not in (*Changes.model_fields, *OF_THE_WHOLE)]
     if fixed:
@@ -170,7 +174,11 @@ def _changes(now: ExperimentConfig, wanted: ExperimentConfig) -> Changes:
 
 
 def _check_beginning(parent: Recording, own: Run, episodes: int) -> None:
-    """Check that the episodes before a branch are those of its parent."""
+    """Check that the episodes before a branch are those of its parent.
+
+    Raises:
+        RunnerError: they are not.
+    """
     with open_recording(own.recording) as recording:
         count = min(episodes, unbroken(parent)[1], recording.count(schema.TRAIN_EPISODE))
         ours, theirs = (one.blocks(schema.TRAIN_EPISODE, 0, count) for one in (recording, parent))

@@ -25,7 +25,8 @@ from runner.runs.run import Run
 def resolve_initial_q(config: ExperimentConfig, recordings: Path, exclude: str = "") -> ExperimentConfig:
     """Return a configuration whose `initial_q`, if it is a run's table, has the run's id and the step.
 
-    `exclude`: the id of the run that begins with the table, which is never meant.
+    Args:
+        exclude: the id of the run that begins with the table, which is never meant.
     """
     start = config.initial_q
     if not isinstance(start, RunTable):
@@ -61,7 +62,11 @@ def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Held] | None:
 def tables_of(config: ExperimentConfig, mdp: Mdp, recordings: Path, exclude: str = "") -> list[Held] | None:
     """Return what the learners of the run in `initial_q` held; None if the configuration has none.
 
-    `exclude`: the id of a run that is never meant.
+    Args:
+        exclude: the id of a run that is never meant.
+
+    Raises:
+        RunnerError: there is no such run or step, or its tables have another shape.
     """
     start = config.initial_q
     if not isinstance(start, RunTable):

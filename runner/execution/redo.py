@@ -74,9 +74,10 @@ def verify_by_redoing(
 ) -> Redone:
     """Do the episodes of a loop again, in a child process with limits, and compare every step.
 
-    `sample`: how many episodes to do again, at even distances; None for all that happened.
-    `tolerance`: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
-    `seconds`: how long a block of steps may take, which is meant to take 0.2 s.
+    Args:
+        sample: how many episodes to do again, at even distances; None for all that happened.
+        tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
+        seconds: how long a block of steps may take, which is meant to take 0.2 s.
     """
     result = Redone("impossible", tolerance=tolerance)
     with open_recording(path) as recording:

@@ -143,7 +143,8 @@ def _mark_failed(run: Run, error: BaseException) -> None:
 def _place(run: Run, described: bool) -> tuple[Path, Contents]:
     """Return the file to continue, and its undamaged contents: the recording, or its replacement.
 
-    `described`: whether the recording has the job's description.
+    Args:
+        described: whether the recording has the job's description.
     """
     if not run.recording.is_file():
         return run.recording, Contents()

@@ -90,10 +90,11 @@ def run_job(
 ) -> Run:
     """Train, evaluate and record a job; return its run, finished or interrupted.
 
-    `stop`: called every few milliseconds; when it returns True the recording is closed properly and the run
-    is marked interrupted.
-    `threads`: False records in the learning thread: quicker if it has one processor to itself.
-    `initial`: the tables to begin with instead of those that the configuration names.
+    Args:
+        stop: called every few milliseconds; when it returns True the recording is closed properly and the run
+            is marked interrupted.
+        threads: False records in the learning thread: quicker if it has one processor to itself.
+        initial: the tables to begin with instead of those that the configuration names.
     """
     started = time.monotonic()
     code = CodeCollector(run.folder.parent, job.config.recording.code)

@@ -47,6 +47,9 @@ def require_steps(recording: Recording, purpose: str, may_redo: bool = False) ->
     """Refuse a recording without steps for a purpose, such as `play`.
 
     With `may_redo` recorded actions are enough, as their steps are done again.
+
+    Raises:
+        RecordingError: it has none.
     """
     if not (recording.has_steps or (may_redo and recording.has_actions)):
         raise RecordingError(f"{recording.path}: found no steps to {purpose}: {why_no_steps(recording)}.")

@@ -70,7 +70,11 @@ LOSSLESS: Final = Format("matroska", "libx264rgb", "rgb24", {"preset": "ultrafas
 
 
 def format_of(path: Path) -> Format:
-    """Return how a film is encoded in a file of this name."""
+    """Return how a film is encoded in a file of this name.
+
+    Raises:
+        RunnerError: its ending stands for no format of films.
+    """
     if path.suffix.lower() not in FORMATS:
         raise RunnerError(
             f"{path}: found the ending {path.suffix!r}, expected one of {', '.join(FORMATS)}: "

@@ -58,6 +58,9 @@ def ranked_episodes(recording: Recording) -> tuple[str, NDArray[np.int64]]:
     """Return the phase and the numbers of its episodes from worst to best: by success, return and length.
 
     They are the trials of all evaluations; of a run without trials the training episodes.
+
+    Raises:
+        RecordingError: no episode ended, or there are no steps.
     """
     require_steps(recording, "show", may_redo=True)
     phase = "eval" if recording.count(schema.EVAL_EPISODE) else "train"
@@ -108,7 +111,11 @@ def _by_rank(records: NDArray[np.void]) -> NDArray[np.int64]:
 
 
 def typical_trial(recording: Recording) -> tuple[int, int]:
-    """Return the last evaluation (training episodes before it) and its median trial."""
+    """Return the last evaluation (training episodes before it) and its median trial.
+
+    Raises:
+        RecordingError: there is no evaluation, or no steps.
+    """
     require_steps(recording, "show", may_redo=True)
     after = last_whole_evaluation(recording)
     if after is None:

@@ -35,6 +35,9 @@ def export_mcap(run: Run, target: Path, anonymous: bool = False, force: bool = F
     """Write a run that is over into one MCAP file for `import_recording`; the same run gives the same bytes.
 
     An anonymous file leaves out host, user, command line, folder, code and output, and the text of an error.
+
+    Raises:
+        RunnerError: the run is running or only in an archive, or the file exists.
     """
     if run.status == "running":
         raise RunnerError(f"run {run.run_id} is running; wait until it has finished, or interrupt it.")
@@ -69,7 +72,11 @@ def _record(run: Run, anonymous: bool) -> dict[str, object]:
 
 
 def _without_names(name: str, entries: dict[str, str], recording: Path) -> dict[str, str]:
-    """Return the entries of a metadata record without host, user, command line and folders."""
+    """Return the entries of a metadata record without host, user, command line and folders.
+
+    Raises:
+        RecordingError: the record cannot be parsed.
+    """
     if name in {"provenance", "rerecord"} or name.startswith("resume/"):
         return {
             key: text

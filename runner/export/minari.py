@@ -61,6 +61,9 @@ def write_dataset(
     reward is the sum over the learners; with several, `infos["rewards"]` has each, [steps + 1, learners],
     where the first row is 0 as of a reset, and in a loop `infos["acted"]` has which of them took part.
     `report` is called with the number of episodes written so far.
+
+    Raises:
+        RecordingError: there is no such episode, Minari cannot store it, or the recording is damaged.
     """
     import minari
     from minari.dataset.minari_storage import MinariStorage

@@ -60,6 +60,9 @@ def export(
 
     The store, `tracking`, is `sqlite:///exports/mlflow.db` or the address of a server. `force` writes the run
     again, and deletes what the store has of it.
+
+    Raises:
+        RunnerError: the store cannot be used, or has the run with other content.
     """
     from mlflow.exceptions import MlflowException
 

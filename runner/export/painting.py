@@ -61,7 +61,11 @@ def paint_recorded(recording: Recording, phase: str, episode: int) -> Painted:
 
 
 def _pixels(recording: Recording, frame: Message, before: Pixels | None) -> Pixels:
-    """Return a recorded frame in the size of the one before it, if there is one."""
+    """Return a recorded frame in the size of the one before it, if there is one.
+
+    Raises:
+        RecordingError: it is no picture, or too large.
+    """
     from PIL import Image, UnidentifiedImageError
 
     where = f"{recording.path}: the frame at {frame['log_time']} ns"

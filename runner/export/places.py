@@ -14,7 +14,11 @@ from runner.util.files import replacing, storage_errors
 
 
 def write_new(path: Path, force: bool, write: Callable[[Path], object]) -> None:
-    """Call `write` with a temporary path next to `path`, then move that file there."""
+    """Call `write` with a temporary path next to `path`, then move that file there.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
     require_new(path, force)
     with storage_errors(path):
         try:
@@ -26,7 +30,11 @@ def write_new(path: Path, force: bool, write: Callable[[Path], object]) -> None:
 
 
 def require_new(path: Path, force: bool) -> None:
-    """Refuse a path at which no file may be written."""
+    """Refuse a path at which no file may be written.
+
+    Raises:
+        RunnerError: it is a folder, or there is a file already and `force` is not set.
+    """
     if path.is_dir():
         raise RunnerError(f"{path}: found a folder, expected a file to write.")
     if path.exists() and not force:

@@ -124,7 +124,11 @@ def times(recording: Recording) -> Callable[[int], float]:
 
 
 def created(recording: Recording) -> float:
-    """Return when the run began, in seconds since 1970."""
+    """Return when the run began, in seconds since 1970.
+
+    Raises:
+        RecordingError: the recording holds no such time.
+    """
     try:
         return datetime.fromisoformat(recording.created).timestamp()
     except (ValueError, OverflowError) as error:

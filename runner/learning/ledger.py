@@ -89,11 +89,12 @@ def spread(
 
     Return how many of the steps' rewards have a weight.
 
-    `rules`: of the run at these steps.
-    `updates`: of the steps, [N].
-    `ledger`: as it is after these steps; it is moved to before them.
-    `stretch`: episodes of a stretch.
-    `shares`: [N] of `SHARE`, filled with the steps whose rewards have a weight, the last ones first.
+    Args:
+        rules: of the run at these steps.
+        updates: of the steps, [N].
+        ledger: as it is after these steps; it is moved to before them.
+        stretch: episodes of a stretch.
+        shares: [N] of `SHARE`, filled with the steps whose rewards have a weight, the last ones first.
     """
     algorithm = len(rules.algorithm)
     width = model.width[i]

@@ -24,7 +24,8 @@ MESSAGE: Final = "Compiling a kernel for this algorithm and number of agents: a 
 def watch(module: str) -> None:
     """Recompile the functions of a package when any Python file of its folder has changed.
 
-    `module`: the package's file; call this before its functions are decorated.
+    Args:
+        module: the package's file; call this before its functions are decorated.
     """
     folder = Path(module).resolve().parent
 

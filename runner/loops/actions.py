@@ -39,7 +39,8 @@ _KNOWN_IN: Final = ("gymnasium.envs.", "mpe2.")
 def action_names(env: object, space: Space) -> tuple[str, ...]:
     """Return the names of an environment's discrete actions, the least action's first; empty if unknown.
 
-    `space`: of the actions as the user takes them: names are only returned if there is one for each.
+    Args:
+        space: of the actions as the user takes them: names are only returned if there is one for each.
     """
     layer, base = env, getattr(env, "unwrapped", env)
     while layer is not base:
@@ -76,9 +77,13 @@ def action_in_words(space: Space, action: Value, names: Names) -> str:
 def parsed_action(space: Space, given: object, recorded: Value, names: Names) -> Value:
     """Return an action in the dtypes of the recorded one.
 
-    `given`: text, or a value; of a game `AGENT=VALUE`, or a mapping by agent: the others act as recorded.
-    None for the recorded action.
-    `recorded`: the recorded action at the same step; of a game those of the agents that acted.
+    Args:
+        given: text, or a value; of a game `AGENT=VALUE`, or a mapping by agent: the others act as recorded.
+            None for the recorded action.
+        recorded: the recorded action at the same step; of a game those of the agents that acted.
+
+    Raises:
+        ConfigError: it is not in the space.
     """
     if given is None:
         return recorded

@@ -50,11 +50,11 @@ class BatchRows(VectorRows):
     ) -> None:
         """Record T steps of all environments; all or nothing of them.
 
-        `observations`: [T, N, ...], nested as their space: what the steps returned.
-        `actions`: [T, N, ...], nested as their space.
-        `rewards`, `terminated` and `truncated`: [T, N].
-        `finals`: [T, N, ...], the last observations of episodes that ended, where `observations` are already
-        of the next ones; None if they are unknown.
+        Args:
+            observations: [T, N, ...], nested as their space: what the steps returned.
+            actions: [T, N, ...], nested as their space. `rewards`, `terminated` and `truncated`: [T, N].
+            finals: [T, N, ...], the last observations of episodes that ended, where `observations` are
+                already of the next ones; None if they are unknown.
 
         Raises:
             ResetNeeded: the phase has no reset yet.

@@ -300,7 +300,11 @@ def _arrays(values: object) -> Iterator[Any]:
 
 
 def _flags(what: str, values: object, shape: tuple[int, ...]) -> Flags:
-    """Return an array of booleans, which may come as 0 and 1."""
+    """Return an array of booleans, which may come as 0 and 1.
+
+    Raises:
+        ConfigError: it holds something else, or has another shape.
+    """
     found: Array = as_array(values)
     if found.shape != shape or (found.dtype.kind != "b" and not np.isin(found, (0, 1)).all()):
         raise ConfigError(

@@ -23,7 +23,11 @@ _MAX_NUMBER: Final = 8
 def content_of(name: str, value: object, pickle: bool) -> tuple[bytes | memoryview | Path, str]:
     """Return the content of a checkpoint, and its format.
 
-    `value`: bytes, the path of a file, or a mapping of arrays or tensors.
+    Args:
+        value: bytes, the path of a file, or a mapping of arrays or tensors.
+
+    Raises:
+        ConfigError: name or value cannot be recorded.
     """
     if not is_checkpoint_name(name):
         raise ConfigError(

@@ -178,9 +178,10 @@ class CopiedExtras:
     ) -> None:
         """Copy the extras of some steps, which follow each other in the run.
 
-        `numbers`: of the steps, as their process counted them.
-        `new_step`: the number of the first step in the run.
-        `new_position`: the steps of the run before it.
+        Args:
+            numbers: of the steps, as their process counted them.
+            new_step: the number of the first step in the run.
+            new_position: the steps of the run before it.
         """
         own = self._own[source.number, phase]
         if not own:

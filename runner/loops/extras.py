@@ -102,7 +102,11 @@ class Extras:
         return take
 
     def extend(self, phase: str, rows: PhaseRows, values: Mapping[str, object]) -> None:
-        """Put down further values of the last step of the phase that is recorded now."""
+        """Put down further values of the last step of the phase that is recorded now.
+
+        Raises:
+            RunnerError: there is no such step, or it cannot be extended any more.
+        """
         step = self._taken[phase] + rows.filled - self._n
         if step <= self._final[phase]:
             raise RunnerError(
@@ -128,8 +132,12 @@ class Extras:
     def checked_batch(self, values: Mapping[str, object], shape: tuple[int, ...]) -> dict[str, Array]:
         """Return the values of T steps of N environments, by name, as `put_batch` takes them.
 
-        `values`: [T, N, ...] each.
-        `shape`: T and N.
+        Args:
+            values: [T, N, ...] each.
+            shape: T and N.
+
+        Raises:
+            ConfigError: a name or a value cannot be recorded.
         """
         if not isinstance(values, Mapping):
             raise ConfigError(f"extras: found {type(values).__name__}, expected arrays by name")
@@ -149,7 +157,8 @@ class Extras:
     def put_batch(self, phase: str, rows: PhaseRows, values: Mapping[str, Array]) -> None:
         """Hand the values of the T steps of all environments that were just taken to the recorder.
 
-        `values`: as `checked_batch` returned them.
+        Args:
+            values: as `checked_batch` returned them.
         """
         self._write(len(self._steps))
         self._phase = phase

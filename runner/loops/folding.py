@@ -36,7 +36,8 @@ _POLL_SECONDS: Final = 0.05
 def fold_if_over(run: Run, seconds: float = 0.0, report: Report = lambda *_: None) -> Run:
     """Fold the shards of a run into its recording if no process records into it; return the run as it is.
 
-    `seconds`: how long to wait for the processes of its shards to end.
+    Args:
+        seconds: how long to wait for the processes of its shards to end.
 
     Raises:
         RecordingError: a recording is damaged; all stay as they are.

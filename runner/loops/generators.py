@@ -62,8 +62,9 @@ class GeneratorWatch:
     def after(self, state: ResetState | None, seed: int | None) -> ResetState | None:
         """Return what a reset depended on; None if it is not to be recorded.
 
-        `state`: what `before` returned; None for a reset with a seed.
-        `seed`: the seed of the reset.
+        Args:
+            state: what `before` returned; None for a reset with a seed.
+            seed: the seed of the reset.
         """
         generator, before = getattr(self._base, self._name, None), self._generator
         self._generator = generator
@@ -111,7 +112,8 @@ class VectorWatch:
     def before_step(self, over: NDArray[np.bool_]) -> States:
         """Return what the resets that a step does in place of steps are going to depend on.
 
-        `over`: [N], the environments whose episodes are over.
+        Args:
+            over: [N], the environments whose episodes are over.
         """
         states = self._before(np.flatnonzero(over).tolist())
         self.due = min(watch.due for watch in self._watches)
@@ -120,8 +122,9 @@ class VectorWatch:
     def before_reset(self, which: NDArray[np.bool_], seeds: Sequence[int | None]) -> States:
         """Return what a reset is going to depend on, where it has no seed.
 
-        `which`: [N], the environments that are reset.
-        `seeds`: of all environments; empty for none.
+        Args:
+            which: [N], the environments that are reset.
+            seeds: of all environments; empty for none.
         """
         unseeded = [i for i in np.flatnonzero(which).tolist() if not seeds or seeds[i] is None]
         return self._before(unseeded)

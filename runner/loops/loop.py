@@ -143,7 +143,11 @@ class Loop(Generic[R]):
         self.active = rows
 
     def note(self, phase: str, rows: R, values: Mapping[str, object]) -> None:
-        """Record values with the last step of a phase."""
+        """Record values with the last step of a phase.
+
+        Raises:
+            RunnerError: there is no such step any more, or the loop is closed.
+        """
         with self.lock:
             if self.records() and self.position and self.active is not rows:
                 raise RunnerError(
@@ -161,7 +165,11 @@ class Loop(Generic[R]):
 
     @property
     def position(self) -> int:
-        """The number of steps executed so far."""
+        """The number of steps executed so far.
+
+        Raises:
+            RunnerError: the loop is closed.
+        """
         if self.closed:
             raise RunnerError(f"run {self.run.run_id} is closed: nothing more can be recorded in it.")
         return sum(self._recorder.steps.values()) + (self.active.filled if self.active else 0)
@@ -175,7 +183,12 @@ class Loop(Generic[R]):
         return counts["train"] + counts["eval"] + counts["elsewhere"] + active.filled, step, episode
 
     def at_step(self, steps: int) -> None:
-        """State how many training steps the whole run had when what is recorded from now on happened."""
+        """State how many training steps the whole run had when what is recorded from now on happened.
+
+        Raises:
+            ConfigError: it is no number of steps, or lower than before.
+            RunnerError: this process takes training steps itself, or the loop is closed.
+        """
         with self.lock:
             if not self.records():
                 return

@@ -102,7 +102,11 @@ class LoopRun:
             os.environ[RUN_VARIABLE] = self._absolute
 
     def _new_run(self, folder: Path | None, facts: JsonView) -> Run:
-        """Create the folder of the run, or of the shard of the run that is joined."""
+        """Create the folder of the run, or of the shard of the run that is joined.
+
+        Raises:
+            ConfigError: the spaces are others than those of the run that is joined.
+        """
         options, config = self._options, self._config
         if options.join is None:
             folder = folder or recordings_folder(options.recordings)

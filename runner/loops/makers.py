@@ -84,8 +84,9 @@ def _with_spec(
 ) -> EnvironmentMaker:
     """Return a maker with a specification.
 
-    `wrapping`: returns the fields that describe the wrappers; appends those whose arguments are unknown.
-    `top`: the top package of the environment, for versions where there is no specification.
+    Args:
+        wrapping: returns the fields that describe the wrappers; appends those whose arguments are unknown.
+        top: the top package of the environment, for versions where there is no specification.
     """
     if not isinstance(spec, EnvSpec):
         return _with_versions(maker, [top] if top else [], "it was not made by gymnasium.make")
@@ -114,7 +115,8 @@ def vector_maker_of(
 ) -> EnvironmentMaker:
     """Return how a vector environment was made.
 
-    `first`: its first environment, or one made as that was; the vector itself if there is none.
+    Args:
+        first: its first environment, or one made as that was; the vector itself if there is none.
     """
     layers = list(layers_of(envs))
     base, reason = layers[-1], ""
@@ -225,7 +227,11 @@ def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
 
 
 def checked_make(make: object) -> str:
-    """Return the `module:function` of the argument `make` of `record`; empty for None."""
+    """Return the `module:function` of the argument `make` of `record`; empty for None.
+
+    Raises:
+        ConfigError: it is something else, or cannot be imported by that name.
+    """
     if make is None:
         return ""
     text = make if isinstance(make, str) else f"{_module_of(make)}:{getattr(make, '__qualname__', '?')}"
@@ -280,7 +286,8 @@ def _with_versions(maker: EnvironmentMaker, tops: Sequence[str], reason: object 
 def package_versions(tops: Sequence[str] = ()) -> dict[str, str]:
     """Return the versions of Gymnasium, NumPy, simulators that are loaded, and the distributions of modules.
 
-    `tops`: names of further modules, without dots; those that no distribution is named after have no entry.
+    Args:
+        tops: names of further modules, without dots; those that no distribution is named after have no entry.
     """
     names = {"gymnasium", "numpy", *tops, *(name for name in _SIMULATORS if name in sys.modules)}
     found = (_installed(name) for name in sorted(names))

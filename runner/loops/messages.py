@@ -160,7 +160,11 @@ class Messages:
                 self.has_logged = True
 
     def checkpoint(self, phase: str, name: str, value: object, pickle: bool) -> str:
-        """Store a checkpoint, and record it at this moment; return its digest."""
+        """Store a checkpoint, and record it at this moment; return its digest.
+
+        Raises:
+            ConfigError: the name or the value cannot be recorded.
+        """
         with self._loop.lock:
             if not self._loop.records():
                 return ""
@@ -180,7 +184,8 @@ class Messages:
     def info(self, phase: str, info: Mapping[str, object], reset: Mapping[str, object] | None = None) -> None:
         """Record the chosen fields of an info, of the step or reset that was just put down.
 
-        `reset`: options and seed of the reset, if it is a reset.
+        Args:
+            reset: options and seed of the reset, if it is a reset.
         """
         names = self._options.info
         chosen = info if ALL_INFO in names else {key: info[key] for key in names if key in info}
@@ -234,7 +239,11 @@ class Messages:
     def frame(self, phase: str, image: object, is_reset: bool, environment: int | None = None) -> None:
         """Record a picture, [height, width, 3] of uint8; another thread encodes it.
 
-        `environment`: its number among those of a vector; None for a single one.
+        Args:
+            environment: its number among those of a vector; None for a single one.
+
+        Raises:
+            ConfigError: it is something else.
         """
         with self._loop.lock:
             if not self._loop.records():

@@ -126,7 +126,11 @@ class Options:
         checked_run_name(self.name)
 
     def config(self, described: Described) -> Json:
-        """Return the configuration that the recording carries."""
+        """Return the configuration that the recording carries.
+
+        Raises:
+            ConfigError: the steps of this environment, or of a shard, cannot be left out.
+        """
         if self.steps != "all" and (described.kind == "variable" or self.join is not None):
             reason = "a shard has whole steps" if self.join else "the environment's values vary in size"
             raise ConfigError(f"steps: found {self.steps!r}, expected all: {reason}.")
@@ -151,8 +155,12 @@ def options_of(
 ) -> Options:
     """Return the options for the arguments of `record`.
 
-    `frames_of`: the environments of a vector of which frames are recorded.
-    `valid`: the names of the arguments that the function has.
+    Args:
+        frames_of: the environments of a vector of which frames are recorded.
+        valid: the names of the arguments that the function has.
+
+    Raises:
+        ConfigError: an argument is unknown or cannot be used.
     """
     options: Arguments = dict(given)
     if unknown := sorted(set(options) - {*valid}):
@@ -196,7 +204,11 @@ def options_of(
 
 
 def settings_in(config: object) -> Mapping[Any, Any]:
-    """Return the user's own settings in a mapping, a dataclass or a namespace; none in None."""
+    """Return the user's own settings in a mapping, a dataclass or a namespace; none in None.
+
+    Raises:
+        ConfigError: it is something else.
+    """
     mapping = as_mapping({} if config is None else config)
     if mapping is None:
         raise ConfigError(

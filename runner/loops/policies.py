@@ -45,7 +45,11 @@ MakePolicy = Callable[[object, object, object], Policy]
 
 
 def policy_named(name: str) -> MakePolicy:
-    """Return the function `module:function`; the module is imported, also from the current folder."""
+    """Return the function `module:function`; the module is imported, also from the current folder.
+
+    Raises:
+        ConfigError: there is none of that name, or importing the module fails.
+    """
     module_name, _, function_name = name.partition(":")
     if not module_name or not function_name:
         raise ConfigError(f"--policy: found {name!r}, expected module:function")
@@ -77,9 +81,10 @@ def play_checkpoint(
 ) -> Run:
     """Play a checkpoint in the recorded environment; return the run that it was recorded in.
 
-    `recordings`: the recordings folder of the new run, whose settings name the run, step and digest.
-    `seed`: of the first reset; the following ones have the next numbers.
-    `trust`: whether to import what the recording names, and to load a pickle.
+    Args:
+        recordings: the recordings folder of the new run, whose settings name the run, step and digest.
+        seed: of the first reset; the following ones have the next numbers.
+        trust: whether to import what the recording names, and to load a pickle.
 
     Raises:
         CannotRedo: the environment cannot be made again.
@@ -141,8 +146,13 @@ def values_along(
     The policy is called with each recorded observation before a step. It may return a number, an array, or a
     mapping of names to these; without names, the name is `value`.
 
-    `checkpoint`: of this run, or of another one with the same spaces.
-    `trust`: whether to load a pickle.
+    Args:
+        checkpoint: of this run, or of another one with the same spaces.
+        trust: whether to load a pickle.
+
+    Raises:
+        ConfigError: the policy cannot be imported, or returns something else.
+        RecordingError: there is no such episode, or the content of the checkpoint is not here.
     """
     recording.episode_span(phase, episode)  # with its message, if there is none
     found = next(episodes_in(recording, phase, ((episode, episode + 1),)), None)
@@ -172,7 +182,11 @@ def values_along(
 
 
 def _named(value: object) -> dict[str, Array]:
-    """Return what a policy returned, by name."""
+    """Return what a policy returned, by name.
+
+    Raises:
+        ConfigError: it is no number, array, or mapping of these.
+    """
     pieces = value if isinstance(value, Mapping) else {"value": value}
     named = {}
     for name, piece in pieces.items():

@@ -263,7 +263,11 @@ class RecordedAlone(Recorded[S]):
 
 
 def require_pictures(env: object) -> None:
-    """Refuse an environment that renders no pictures, in a run with frames."""
+    """Refuse an environment that renders no pictures, in a run with frames.
+
+    Raises:
+        ConfigError: it is made with another `render_mode` than "rgb_array".
+    """
     mode = getattr(env, "render_mode", None)
     if mode != "rgb_array":
         raise ConfigError(

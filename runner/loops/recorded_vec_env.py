@@ -112,7 +112,11 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
 def record_vec_env(env: VecEnv, options: Arguments) -> VecEnv:
     """Return a `VecEnv` whose environments are recorded, as they are inside of all wrappers.
 
-    `env`: the `VecEnv`; of one with wrappers, the innermost wrapper gets the recorded environments.
+    Args:
+        env: the `VecEnv`; of one with wrappers, the innermost wrapper gets the recorded environments.
+
+    Raises:
+        ConfigError: it is recorded already, or an argument cannot be used.
     """
     base = env.unwrapped
     if isinstance(base, RecordedVecEnv):

@@ -40,7 +40,11 @@ def _lone(value: object, what: str, kinds: str, expected: str) -> Array:
 
 
 def logged_number(name: str, value: Any) -> float:
-    """Return a logged number, which may stand in an array of one."""
+    """Return a logged number, which may stand in an array of one.
+
+    Raises:
+        ConfigError: it is not a number.
+    """
     try:
         if callable(detach := getattr(value, "detach", None)):  # a tensor of PyTorch
             value = detach()
@@ -53,7 +57,11 @@ def logged_number(name: str, value: Any) -> float:
 
 
 def check_log_name(name: object, value: object) -> None:
-    """Refuse a name that a logged value cannot have."""
+    """Refuse a name that a logged value cannot have.
+
+    Raises:
+        ConfigError: it is empty, or not text.
+    """
     if name == "":
         raise ConfigError(f"log: found an empty name for {value!r}, expected a name that is not empty")
     if not isinstance(name, str) or not is_utf8(name):
@@ -61,7 +69,11 @@ def check_log_name(name: object, value: object) -> None:
 
 
 def arrays_of(name: str, value: object) -> Iterator[tuple[str, Array]]:
-    """Yield the arrays of a snapshot: the value itself, or those of a mapping as `name/key`."""
+    """Yield the arrays of a snapshot: the value itself, or those of a mapping as `name/key`.
+
+    Raises:
+        ConfigError: a value holds something else than numbers, or too many.
+    """
     if not isinstance(name, str) or not is_utf8(name):
         raise ConfigError(f"snapshot: found the name {name!r}, expected an array of numbers and a name.")
     if (inside := as_mapping(value)) is not None:
@@ -97,7 +109,11 @@ def as_array(value: Any) -> Array:
 
 
 def check_phase(phase: str) -> None:
-    """Refuse what is not a phase."""
+    """Refuse what is not a phase.
+
+    Raises:
+        ConfigError: it is not.
+    """
     if phase not in schema.PHASES:
         raise ConfigError(f"phase: found {phase!r}, expected one of {', '.join(schema.PHASES)}")
 

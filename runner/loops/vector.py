@@ -87,8 +87,9 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
     ) -> None:
         """Record a step of all environments.
 
-        `over`: [N], whether their episodes were over before; None where that does not matter.
-        `states`: what resets within the step depended on.
+        Args:
+            over: [N], whether their episodes were over before; None where that does not matter.
+            states: what resets within the step depended on.
         """
         observations, rewards, terminated, truncated, infos = result
         final = final_observations(infos) if self._mode == AutoresetMode.SAME_STEP else None
@@ -158,9 +159,10 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
     ) -> None:
         """Record a reset of some environments, or of all, that was just done.
 
-        `seeds`: of all environments; empty for none.
-        `which`: [N], the environments; all unless given.
-        `states`: what the reset depended on, as far as it is to be recorded.
+        Args:
+            seeds: of all environments; empty for none.
+            which: [N], the environments; all unless given.
+            states: what the reset depended on, as far as it is to be recorded.
         """
         which = np.ones(self.env.num_envs, np.bool_) if which is None else which
         with self._loop.lock:
@@ -231,7 +233,12 @@ def record_vector(
 
 
 def autoreset_mode_of(envs: AnyVectorEnv | None, chosen: AutoresetMode | str | None) -> AutoresetMode:
-    """Return how environments reset themselves: as chosen, else as their metadata states."""
+    """Return how environments reset themselves: as chosen, else as their metadata states.
+
+    Raises:
+        ConfigError: there is no such mode.
+        EnvironmentNotUsable: none is chosen and none is stated.
+    """
     if chosen is not None or envs is None:
         try:
             return AutoresetMode(chosen)

@@ -53,11 +53,12 @@ def counts_of(
 ) -> EpisodeCounts:
     """Return the counts of a block.
 
-    `over`: [rows, N], whether the episode ended with the step.
-    `only_reset`: [rows, N], where no step was taken.
-    `rewards`: [rows, N].
-    `length`: [N], the steps before the block of the episode in progress.
-    `carried`: [N], its return before the block.
+    Args:
+        over: [rows, N], whether the episode ended with the step.
+        only_reset: [rows, N], where no step was taken.
+        rewards: [rows, N].
+        length: [N], the steps before the block of the episode in progress.
+        carried: [N], its return before the block.
     """
     rows, n = over.shape
     ended_before, taken = np.zeros((2, rows + 1, n), np.int64)

@@ -154,9 +154,11 @@ class VectorRows:
         """Record a step of all environments.
 
         `rewards`, `terminated` and `truncated`: [N].
-        `final`: the last observations of episodes that ended, where `observations` are already of the next
-        ones; None where they are not.
-        `states`: what the resets in place of steps depended on, if it is to be recorded.
+
+        Args:
+            final: the last observations of episodes that ended, where `observations` are already of the next
+                ones; None where they are not.
+            states: what the resets in place of steps depended on, if it is to be recorded.
         """
         if not self._room:
             self._first_action(actions)
@@ -199,9 +201,10 @@ class VectorRows:
     def reset(self, observation: object, seeds: Sequence[int | None], which: Flags, states: States) -> None:
         """Record a reset of some environments; it ends episodes in progress in them.
 
-        `seeds`: of all environments; empty for none.
-        `which`: [N], the environments.
-        `states`: what the reset depended on, if it is to be recorded.
+        Args:
+            seeds: of all environments; empty for none.
+            which: [N], the environments.
+            states: what the reset depended on, if it is to be recorded.
         """
         chosen = np.flatnonzero(which)
         own_seeds = [seeds[i] if len(seeds) else None for i in chosen.tolist()]

@@ -81,8 +81,9 @@ def evaluate_policy(mdp: Mdp, policy: NDArray[np.int32], learners: int, discount
     In a deterministic environment every state has one successor, and each path ends, or closes a cycle;
     otherwise the probabilities are propagated step by step up to the limit.
 
-    `policy`: [S]: the joint action of each state.
-    `learners`: 1, or the number of agents; each has its own return.
+    Args:
+        policy: [S]: the joint action of each state.
+        learners: 1, or the number of agents; each has its own return.
     """
     return _measured(mdp, _chosen(mdp, policy, learners), discount)
 
@@ -92,9 +93,10 @@ def evaluate_stochastic_policy(
 ) -> Outcome:
     """Return the exact outcome of learners that draw their actions, in expectation over all draws.
 
-    `policies`: for each learner [S, n]: the probability of each of its own n actions. Learners draw
-    independently of each other.
-    `learners`: 1, whose actions are the joint ones, or the number of agents.
+    Args:
+        policies: for each learner [S, n]: the probability of each of its own n actions. Learners draw
+            independently of each other.
+        learners: 1, whose actions are the joint ones, or the number of agents.
     """
     return _measured(mdp, _drawn(mdp, joint_probabilities(policies), learners), discount)
 
@@ -106,8 +108,9 @@ def policy_values(
 
     The horizon is infinite: an episode that the environment cuts off counts as if it went on.
 
-    `joint`: [S, J]: the probability of each joint action.
-    `learners`: 1, or the number of agents; each has its own reward.
+    Args:
+        joint: [S, J]: the probability of each joint action.
+        learners: 1, or the number of agents; each has its own reward.
     """
     require_discount(discount)
     chosen = _drawn(mdp, joint, learners)
@@ -122,8 +125,9 @@ def action_values(
 ) -> NDArray[np.float64]:
     """Return what each joint action in a state is worth if later steps are worth `values`, [J, n].
 
-    `values`: [S, n]: the values of the states.
-    `rewards`: [S, J, K, n]: those that count.
+    Args:
+        values: [S, n]: the values of the states.
+        rewards: [S, J, K, n]: those that count.
     """
     outcome = rewards[state] + discount * (~mdp.terminated[state])[..., None] * values[mdp.next_state[state]]
     return np.asarray((mdp.probability[state][..., None] * outcome).sum(axis=1))

@@ -28,8 +28,9 @@ class ExactEvaluator:
 
         With a discount of 1 the values are nan: those of a process without end are not defined.
 
-        `policy`: [S]: the joint action of each state; or, for learners that draw, an array for each, [S, n]:
-        the probability of each of its own actions.
+        Args:
+            policy: [S]: the joint action of each state; or, for learners that draw, an array for each, [S,
+                n]: the probability of each of its own actions.
         """
         if isinstance(policy, np.ndarray):
             outcome = evaluate_policy(self._mdp, policy, self._learners, discount)

@@ -44,9 +44,10 @@ def best_response(
 ) -> NDArray[np.float64]:
     """Return what one learner can get at most from each state while all others keep to a policy, [S].
 
-    `policy`: [S]: the joint action of each state.
-    `learner`: whose own action is free, and whose reward counts.
-    `learners`: how many there are; 1 is all agents together, whose best response is the optimum.
+    Args:
+        policy: [S]: the joint action of each state.
+        learner: whose own action is free, and whose reward counts.
+        learners: how many there are; 1 is all agents together, whose best response is the optimum.
     """
     widths = mdp.action_counts if learners > 1 else (mdp.joint_actions,)
     stride = int(np.prod(widths[learner + 1 :], dtype=np.int64))
@@ -63,9 +64,10 @@ def best_response_to_stochastic(
 ) -> NDArray[np.float64]:
     """Return what one learner can get at most from each state while all others draw from their policies, [S].
 
-    `policies`: one a learner, [S, n]: the probability of each of its own actions; a single one is over joint
-    actions, and its best response is the optimum.
-    `learner`: whose own action is free, and whose reward counts.
+    Args:
+        policies: one a learner, [S, n]: the probability of each of its own actions; a single one is over
+            joint actions, and its best response is the optimum.
+        learner: whose own action is free, and whose reward counts.
     """
     widths = tuple(policy.shape[1] for policy in policies)
     states, outcomes = mdp.states, mdp.probability.shape[2]
@@ -86,7 +88,11 @@ def best_response_to_stochastic(
 
 
 def require_discount(discount: float) -> None:
-    """Refuse a discount with which an infinite process may have no value."""
+    """Refuse a discount with which an infinite process may have no value.
+
+    Raises:
+        EnvironmentNotUsable: it is not below 1.
+    """
     if not 0 <= discount < 1:
         raise EnvironmentNotUsable(
             f"found discount {discount}, expected one from 0 up to below 1: "

@@ -41,7 +41,8 @@ def kept_dtype(step: np.dtype[np.void]) -> np.dtype[np.void]:
 
     `digest` is that of the episode up to this step, or all zeros where none was recorded.
 
-    `step`: the dtype of whole records.
+    Args:
+        step: the dtype of whole records.
     """
     kept = [(name, step[name]) for name in COLUMNS if name in (step.names or ())]
     return np.dtype([("step", "<i8"), *kept, ("digest", f"V{DIGEST_BYTES}")])
@@ -118,7 +119,11 @@ def packed(rows: Rows, n: int) -> dict[str, object]:
 def unpacked(fields: Message, dtype: np.dtype[np.void], n: int, where: str) -> Rows:
     """Return the steps in a message.
 
-    `n`: how many environments take turns.
+    Args:
+        n: how many environments take turns.
+
+    Raises:
+        RecordingError: the message is damaged.
     """
     count, data = fields["count"], fields["data"]
     names = [name for name in dtype.names or () if name in COLUMNS]

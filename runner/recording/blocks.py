@@ -57,7 +57,8 @@ def record_dtype(message: MessageType, sizes: Sizes) -> np.dtype[np.void]:
 
     Fields named `tag…` hold protobuf's constant bytes (see `blank_records`).
 
-    `sizes`: of each repeated field the number of elements, of each bytes field its dtype, in order.
+    Args:
+        sizes: of each repeated field the number of elements, of each bytes field its dtype, in order.
     """
     layout: list[tuple[object, ...]] = list(HEADER)
     for field, value in zip(message.fields, _value_dtypes(message, sizes), strict=True):

@@ -69,9 +69,10 @@ def encode_chunk(
 ) -> Chunk:
     """Return the chunk that holds these whole message records of one topic.
 
-    `log_times`: nanoseconds of each, ascending.
-    `offsets`: where each begins in `records`.
-    `packed`: may return the records packed; by default, and if it does not, they are packed here.
+    Args:
+        log_times: nanoseconds of each, ascending.
+        offsets: where each begins in `records`.
+        packed: may return the records packed; by default, and if it does not, they are packed here.
     """
     name = "" if packing.compression == "none" else packing.compression
     width = len(records) // len(log_times) if topic.message is TRANSITION else 0
@@ -156,8 +157,12 @@ class ChunkHead:
 def chunk_head(body: bytes | memoryview, length: int, where: str) -> ChunkHead:
     """Return the head of a chunk record.
 
-    `body`: the body of the record, or its first 60 bytes.
-    `length`: bytes of the whole body.
+    Args:
+        body: the body of the record, or its first 60 bytes.
+        length: bytes of the whole body.
+
+    Raises:
+        RecordingError: it contradicts itself, or declares more than `MAX_CHUNK_BYTES`.
     """
     try:
         start, end, size, crc, name_length = CHUNK_HEAD.unpack_from(body)
@@ -178,7 +183,11 @@ def chunk_head(body: bytes | memoryview, length: int, where: str) -> ChunkHead:
 
 
 def unpack_chunk(body: bytes | memoryview, where: str) -> tuple[ChunkHead, bytes]:
-    """Return the head of a chunk and its message records, after comparing their checksum."""
+    """Return the head of a chunk and its message records, after comparing their checksum.
+
+    Raises:
+        RecordingError: it is damaged, or larger than any that a recorder writes.
+    """
     view = memoryview(body)
     head = chunk_head(view, len(view), where)
     if head.uncompressed_size > _PLAIN_BYTES:
@@ -194,6 +203,9 @@ def _check_message_count(body: memoryview, head: ChunkHead, where: str) -> None:
 
     A few kilobytes can unpack to the largest chunk there is; thousands of them would keep a reader busy for
     minutes before their messages were found to make no sense.
+
+    Raises:
+        RecordingError: it declares more, or holds no message.
     """
     length, channel = _first_message(body, head, where)
     messages = head.uncompressed_size // (RECORD_HEAD.size + length)
@@ -218,7 +230,12 @@ def _first_message(body: memoryview, head: ChunkHead, where: str) -> tuple[int, 
 
 
 def decompress(data: bytes | memoryview, compression: str, size: int, where: str) -> bytes:
-    """Return the `size` bytes that a chunk's data hold; never allocates more than that."""
+    """Return the `size` bytes that a chunk's data hold; never allocates more than that.
+
+    Raises:
+        RecordingError: the data do not give exactly that many bytes, or it is more than any chunk has;
+            `where` is named.
+    """
     if size > MAX_CHUNK_BYTES:
         raise RecordingError(f"{where}: declares {size:,} bytes, expected at most {MAX_CHUNK_BYTES:,}")
     records, more = _unpack(data, compression, size, where)

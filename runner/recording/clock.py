@@ -121,7 +121,11 @@ class Clock:
 
 
 def read_clock(recording: TopicReader) -> Clock | None:
-    """Return the clock of a recording; None if it has no samples, as those of earlier versions."""
+    """Return the clock of a recording; None if it has no samples, as those of earlier versions.
+
+    Raises:
+        RecordingError: samples are damaged, or more than 1,048,576.
+    """
     rows: list[tuple[int, float, float]] = []
     for fields in recording.decoded(schema.CLOCK_TOPIC, max_bytes=1024):
         row = (fields["log_time"] // STEP_NANOSECONDS, fields["seconds"], fields["started"])

@@ -51,7 +51,11 @@ class Code:
 
 
 def parse_code(data: bytes, where: str) -> Code:
-    """Return the code in an attachment."""
+    """Return the code in an attachment.
+
+    Raises:
+        RecordingError: it is damaged, or too large.
+    """
     try:
         with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data) as stream:
             text = stream.read(_MAX_UNPACKED + 1)

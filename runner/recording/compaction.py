@@ -128,8 +128,9 @@ def compacted(
 
     Metadata, attachments and all messages are the same, but that more actions share a message.
 
-    `file`: the recording; it is closed.
-    `steps`: the dtype of whole steps, by the topic of their actions.
+    Args:
+        file: the recording; it is closed.
+        steps: the dtype of whole steps, by the topic of their actions.
 
     Raises:
         OSError: the new recording cannot be written; the old one is as before.

@@ -62,9 +62,10 @@ class _State:
 def check_phase(recording: Recording, phase: str, complete: bool, on_block: OnBlock) -> Findings:
     """Compare the steps, resets and episodes of a phase with one another; each block is read once.
 
-    `complete`: whether the recording was completed; else it is checked up to its last reset, as later ones
-    may not have been written.
-    `on_block`: called with each block of a fixed-width topic, also of what is not compared.
+    Args:
+        complete: whether the recording was completed; else it is checked up to its last reset, as later ones
+            may not have been written.
+        on_block: called with each block of a fixed-width topic, also of what is not compared.
 
     Raises:
         Inconsistent: something does not follow from the rest.
@@ -75,7 +76,8 @@ def check_phase(recording: Recording, phase: str, complete: bool, on_block: OnBl
 def check_extras(recording: Recording, phase: str, complete: bool, on_block: OnBlock) -> None:
     """Compare the extras of a phase with its steps: each belongs to a step, at its time, in their order.
 
-    `complete`: whether the recording was completed; else the steps of the last extras may be missing.
+    Args:
+        complete: whether the recording was completed; else the steps of the last extras may be missing.
 
     Raises:
         Inconsistent: one does not.
@@ -279,8 +281,9 @@ class _Phase:
     ) -> None:
         """Compare the records of the episodes that ended in a block with its steps.
 
-        `ended`: whether each segment's episode ended in the block.
-        `interrupted`: whether a reset before the segment ended the episode of the block before.
+        Args:
+            ended: whether each segment's episode ended in the block.
+            interrupted: whether a reset before the segment ended the episode of the block before.
         """
         n, state, done = self._n, self._state, np.flatnonzero(ended)
         owners = b.heads[np.flatnonzero(interrupted)] // b.times

@@ -265,7 +265,11 @@ class ConsoleLine:
 
 
 def read_console(recording: TopicReader, clock: Clock | None) -> list[ConsoleLine]:
-    """Return the recorded output of a run, in the order in which lines began."""
+    """Return the recorded output of a run, in the order in which lines began.
+
+    Raises:
+        RecordingError: a line is damaged.
+    """
     lines: dict[tuple[float, int, int], ConsoleLine] = {}
     left = _MAX_READ
     for count, fields in enumerate(recording.decoded(schema.CONSOLE_TOPIC, max_bytes=_MAX_MESSAGE)):

@@ -80,7 +80,11 @@ class ExtraLayout:
 def read_layouts(columns: Iterable[tuple[int, str]], where: str) -> list[ExtraLayout]:
     """Return the layouts of a recording.
 
-    `columns`: log time and text of each `ExtraColumns`, in order.
+    Args:
+        columns: log time and text of each `ExtraColumns`, in order.
+
+    Raises:
+        RecordingError: they are not what a recorder writes.
     """
     layouts: list[ExtraLayout] = []
     for time, text in columns:

@@ -54,7 +54,11 @@ class Part:
 
 
 def parts_of(space: Space, where: str) -> list[Part]:
-    """Return the parts of a space in the order of its description."""
+    """Return the parts of a space in the order of its description.
+
+    Raises:
+        EnvironmentNotUsable: one of them cannot be recorded; the message names `where`.
+    """
     parts = list(_kind(space).parts(space, where, ()))
     size = sum(part.dtype.itemsize for part in parts if part.dtype is not None)
     if size > MAX_VALUE_BYTES:

@@ -48,7 +48,11 @@ class Leaf:
     def fit(self, value: object, batch: tuple[int, ...] = ()) -> Array:
         """Return a value as an array that can be recorded.
 
-        `batch`: the shape of the batch that it is, if it is one.
+        Args:
+            batch: the shape of the batch that it is, if it is one.
+
+        Raises:
+            RecordingError: it has another shape, holds no numbers, or numbers out of the dtype's range.
         """
         array = np.asarray(value)
         shape = batch + self.shape
@@ -99,8 +103,9 @@ def leaves_of(space: Space, what: str, where: str = "", on_rounded: OnRounded = 
 def filler(leaves: Sequence[Leaf], column: Array, batch: tuple[int, ...] = ()) -> Put:
     """Return a function that puts a value of a space into a row of a column.
 
-    `column`: [rows, *batch] values of the space.
-    `batch`: the shape of the batch that each value is, if it is one.
+    Args:
+        column: [rows, *batch] values of the space.
+        batch: the shape of the batch that each value is, if it is one.
     """
     if len(leaves) == 1 and not leaves[0].part.keys:
         return _leaf_filler(leaves[0], column, batch)

@@ -161,7 +161,11 @@ class HostMetrics:
 
 
 def read_host(recording: TopicReader, clock: Clock | None) -> HostMetrics | None:
-    """Return what a run used of its machine; None if that was not recorded."""
+    """Return what a run used of its machine; None if that was not recorded.
+
+    Raises:
+        RecordingError: samples are damaged, or too many.
+    """
     rows: list[tuple[float, ...]] = []
     gpus: list[list[list[float]]] = []
     name = schema.HOST_TOPIC.name

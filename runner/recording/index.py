@@ -77,7 +77,11 @@ class ChunkTable:
         return ChunkEntry(*_ENTRY.unpack_from(self._packed, k * _ENTRY.size))
 
     def append(self, entry: ChunkEntry) -> None:
-        """Add a chunk after the last one."""
+        """Add a chunk after the last one.
+
+        Raises:
+            RecordingError: no recorder writes a chunk of the size, or at the place, that it declares.
+        """
         where = f"the chunk at {entry.offset}"
         if entry.length > MAX_CHUNK_BYTES or entry.uncompressed_size > MAX_CHUNK_BYTES:
             size = max(entry.length, entry.uncompressed_size)
@@ -94,7 +98,11 @@ class ChunkTable:
         self._packed += _ENTRY.pack(*entry)
 
     def set_channel(self, channel: int) -> None:
-        """Set the channel of the last chunk's messages."""
+        """Set the channel of the last chunk's messages.
+
+        Raises:
+            RecordingError: it was set before, or no recording has such a channel.
+        """
         last = self[len(self) - 1]
         if last.channel or channel not in TOPIC_OF:
             raise RecordingError(
@@ -128,7 +136,11 @@ class Index:
 
 
 def read_index(stream: BinaryIO, path: str) -> Index:
-    """Return the index of a recording: by its summary if it is finished, else by walking its records."""
+    """Return the index of a recording: by its summary if it is finished, else by walking its records.
+
+    Raises:
+        RecordingError: it is not a dualtaxi recording, or is damaged before its first chunk.
+    """
     size = stream.seek(0, 2)
     try:
         _check_beginning(stream)

@@ -45,7 +45,11 @@ N = TypeVar("N", AttachmentIndex, MetadataIndex)
 
 
 def refuse_foreign(path: Path) -> None:
-    """Refuse a file of another program, or one that is not an MCAP file."""
+    """Refuse a file of another program, or one that is not an MCAP file.
+
+    Raises:
+        RecordingError: it is such a file, or cannot be read.
+    """
     try:
         with open_regular(path) as stream:
             start = stream.read(4096)
@@ -72,7 +76,11 @@ def refuse_foreign(path: Path) -> None:
 
 
 def check_integrity(path: Path, report: Report = lambda *_: None) -> None:
-    """Check every byte of a finished recording."""
+    """Check every byte of a finished recording.
+
+    Raises:
+        RecordingError: something is wrong; the first such thing is named with its offset.
+    """
     contents = survey(path, keep_result=True, report=report)
     if contents.reason:
         advice = "; `dualtaxi repair` mends it" if contents.end else ""
@@ -88,7 +96,11 @@ def check_integrity(path: Path, report: Report = lambda *_: None) -> None:
 
 
 def is_merely_cut_off(path: Path) -> bool:
-    """Return whether an unfinished recording is, as far as it goes, what its recorder wrote."""
+    """Return whether an unfinished recording is, as far as it goes, what its recorder wrote.
+
+    Raises:
+        RecordingError: the file cannot be read, or begins as no recording does.
+    """
     contents = survey(path, keep_result=True)
     if contents.reason:
         if not contents.end:
@@ -101,7 +113,8 @@ def is_merely_cut_off(path: Path) -> bool:
 def survey(path: Path, keep_result: bool = False, report: Report = lambda *_: None) -> Contents:
     """Return what of a recording is good to the last byte, from its beginning to the first damaged record.
 
-    `keep_result`: whether a `result` record counts; when a recording is resumed, it is written again.
+    Args:
+        keep_result: whether a `result` record counts; when a recording is resumed, it is written again.
     """
     with _reading(path) as stream:
         contents = Contents(size=stream.seek(0, 2))
@@ -117,7 +130,8 @@ def survey(path: Path, keep_result: bool = False, report: Report = lambda *_: No
 def may_be_cut(path: Path, contents: Contents) -> bool:
     """Return whether nothing is missing among the good records, and nothing good comes after them.
 
-    `contents`: its good records, as `survey` found them.
+    Args:
+        contents: its good records, as `survey` found them.
     """
     if any(entry.name == "repair" for entry in contents.metadata):
         return False
@@ -163,7 +177,11 @@ def _check_beginning(stream: BinaryIO) -> None:
 
 
 def _take_records(stream: BinaryIO, contents: Contents, keep_result: bool, report: Report) -> None:
-    """Note the good records of the data section."""
+    """Note the good records of the data section.
+
+    Raises:
+        RecordingError: one is damaged, or the file ends before the data section does.
+    """
     indexed, is_taken = True, False
     chunk: ReadChunk | None = None
     """The last chunk, if an index may follow; `is_taken` if it need not."""

@@ -72,7 +72,11 @@ def labels_from(values: Mapping[str, object]) -> Labels:
 
 
 def change_labels(folder: Path, change: Callable[[Labels], Labels]) -> Labels:
-    """Change the labels of the run in a folder, under a lock, and return them."""
+    """Change the labels of the run in a folder, under a lock, and return them.
+
+    Raises:
+        StorageError: the folder cannot be written.
+    """
     from filelock import FileLock, Timeout
 
     with storage_errors(folder / LABELS_FILE):

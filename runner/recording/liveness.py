@@ -32,7 +32,8 @@ def _of_process(pid: int) -> dict[str, object]:
 def is_alive(owner: JsonView, heartbeat: Path) -> bool:
     """Return whether an owner is alive: its process, if it is on this machine; else by its last heartbeat.
 
-    `heartbeat`: the file whose modification time is set at each heartbeat.
+    Args:
+        heartbeat: the file whose modification time is set at each heartbeat.
     """
     if owner.get("host") == socket.gethostname() and owner.get("boot_id") == boot_id():
         started = process_start(owner.get("pid", 0))

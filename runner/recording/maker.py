@@ -220,7 +220,11 @@ class Shard(NamedTuple):
 
 
 def parse_shards(text: str | None, where: str) -> tuple[Shard, ...]:
-    """Return the shards in a metadata record `run`; none for a run of one process."""
+    """Return the shards in a metadata record `run`; none for a run of one process.
+
+    Raises:
+        RecordingError: they are damaged.
+    """
     if text is None:
         return ()
     try:

@@ -129,7 +129,11 @@ def _scalar_struct(before_value: int, before_step: int, after: str) -> struct.St
 
 
 def decode(message: MessageType, payload: bytes) -> Message:
-    """Return the values of a message's fields; repeated ones as lists."""
+    """Return the values of a message's fields; repeated ones as lists.
+
+    Raises:
+        RecordingError: the payload is not such a message.
+    """
     try:
         parsed = message_class(message).FromString(payload)
     except DecodeError as error:
@@ -146,7 +150,8 @@ def unknown_measures(message: MessageType, schema_data: bytes) -> list[str]:
 
     Protobuf reads such a field as 0, as if that had been measured.
 
-    `schema_data`: the schema in the recording, a serialized FileDescriptorSet.
+    Args:
+        schema_data: the schema in the recording, a serialized FileDescriptorSet.
     """
     try:
         files = descriptor_pb2.FileDescriptorSet.FromString(schema_data).file
@@ -178,7 +183,11 @@ def encode_q_table(table: QTable) -> bytes:
 
 
 def decode_q_table(payload: bytes) -> QTable:
-    """Return the snapshot in a `dualtaxi.QTable`."""
+    """Return the snapshot in a `dualtaxi.QTable`.
+
+    Raises:
+        RecordingError: shape, dtype and data do not fit together.
+    """
     fields = decode(schema.Q_TABLE, payload)
     shape, data = tuple(fields["shape"]), fields["data"]
     if fields["dtype"] != "<f8" or len(shape) != 2 or shape[0] * shape[1] * 8 != len(data):
@@ -202,7 +211,11 @@ class Snapshot:
 
 
 def decode_array(payload: bytes) -> Snapshot:
-    """Return the array in a `dualtaxi.Array`."""
+    """Return the array in a `dualtaxi.Array`.
+
+    Raises:
+        RecordingError: shape, dtype and data do not fit together.
+    """
     fields = decode(schema.ARRAY, payload)
     shape, kind, data = tuple(fields["shape"]), fields["dtype"], fields["data"]
     if not NUMBERS.fullmatch(kind) or math.prod(shape) * np.dtype(kind).itemsize != len(data):

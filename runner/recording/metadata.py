@@ -63,10 +63,11 @@ def run_metadata(
 ) -> dict[str, str]:
     """Return the entries of the metadata record `run` that every recording has.
 
-    `seed`: its job's seed; None for a loop without one.
-    `job`: the identity of its job.
-    `agents`: the learners: one reward each.
-    `events`: number of event counters of an episode.
+    Args:
+        seed: its job's seed; None for a loop without one.
+        job: the identity of its job.
+        agents: the learners: one reward each.
+        events: number of event counters of an episode.
     """
     return {
         "format_version": str(schema.FORMAT_VERSION),
@@ -83,7 +84,11 @@ def run_metadata(
 
 
 def check_file(run: Mapping[str, str], index: Index, path: str) -> None:
-    """Check the metadata record `run` of a file, and that it has the channels of its kind of recording."""
+    """Check the metadata record `run` of a file, and that it has the channels of its kind of recording.
+
+    Raises:
+        RecordingError: it is of another version, is damaged, or has another channel.
+    """
     check_run(run, path)
     topics = {topic.channel: topic.name for topic in schema.KINDS[kind_of(run)]}
     for number, channel in index.channels.items():
@@ -95,7 +100,11 @@ def check_file(run: Mapping[str, str], index: Index, path: str) -> None:
 
 
 def check_run(run: Mapping[str, str], path: str) -> None:
-    """Refuse a metadata record `run` of another version, or without all entries with possible values."""
+    """Refuse a metadata record `run` of another version, or without all entries with possible values.
+
+    Raises:
+        RecordingError: it is not.
+    """
     version = run.get("format_version", "?")
     if version != str(schema.FORMAT_VERSION):
         raise RecordingError(
@@ -169,7 +178,11 @@ def sizes_in(kind: str, learners: int, events: int, spaces: JsonView, path: str)
 
 
 def json_object(text: str | bytes | None, what: str) -> dict[str, object]:
-    """Return the JSON object in a text."""
+    """Return the JSON object in a text.
+
+    Raises:
+        RecordingError: it holds none, is too long or nested too deeply; the message names `what`.
+    """
     try:
         if text is None or len(text) > MAX_METADATA_BYTES:
             raise ValueError("it is missing, or too long")
@@ -182,7 +195,11 @@ def json_object(text: str | bytes | None, what: str) -> dict[str, object]:
 
 
 def lost_ranges(repair: Mapping[str, object], path: str) -> dict[str, list[list[int]]]:
-    """Return the messages that a repair could not save: by topic, ranges (first, stop) of their numbers."""
+    """Return the messages that a repair could not save: by topic, ranges (first, stop) of their numbers.
+
+    Raises:
+        RecordingError: the metadata record has no such ranges.
+    """
 
     def are_ranges(value: object) -> bool:
         if not isinstance(value, list) or not all(isinstance(one, list) and len(one) == 2 for one in value):
@@ -215,7 +232,11 @@ def _indented(text: str) -> str:
 
 
 def environment_description(text: bytes, path: str) -> dict[str, object]:
-    """Return the description in `environment.json`."""
+    """Return the description in `environment.json`.
+
+    Raises:
+        RecordingError: it does not name the environment's arrays and events.
+    """
     description = json_object(text, f"{path}: environment.json")
     for key in ("arrays", "event_names", "success_events"):
         names = description.get(key)
@@ -225,7 +246,11 @@ def environment_description(text: bytes, path: str) -> dict[str, object]:
 
 
 def environment_of(description: JsonView, attachment: Callable[[str], bytes], path: str) -> Mdp:
-    """Return the environment that a recording describes."""
+    """Return the environment that a recording describes.
+
+    Raises:
+        RecordingError: an array is missing, damaged or too large.
+    """
     if not description["arrays"]:
         raise RecordingError(
             f"{path}: has no transition table of {description.get('env_id')}, which is not tabular: it was "
@@ -256,7 +281,11 @@ def _packed_packages(packages: tuple[tuple[str, str], ...]) -> str:
 
 
 def unpacked_provenance(entries: Mapping[str, str], path: str) -> dict[str, str]:
-    """Return the provenance in the entries of its record, of earlier recordings too."""
+    """Return the provenance in the entries of its record, of earlier recordings too.
+
+    Raises:
+        RecordingError: the versions of packages are damaged.
+    """
     others = dict(entries)
     what = f"{path}: the packages of its provenance"
     try:
@@ -341,7 +370,11 @@ def pack_array(array: Array) -> bytes:
 
 
 def unpack_array(data: bytes, max_bytes: int, where: str) -> Array:
-    """Return the array in a compressed `.npy` file; never unpickles or takes more memory than it declares."""
+    """Return the array in a compressed `.npy` file; never unpickles or takes more memory than it declares.
+
+    Raises:
+        RecordingError: it holds no array, or one of more than `max_bytes`.
+    """
     try:
         with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data) as stream:
             return _read_array(stream, max_bytes, where)

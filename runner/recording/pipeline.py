@@ -108,11 +108,12 @@ class Pipeline:
     ) -> None:
         """Send message records of one topic; waits while too much is pending.
 
-        `records`: their bytes; must not change until `done` is called.
-        `log_times`: nanoseconds, one a record.
-        `write`: False leaves them out of the file; the digest covers them all the same.
-        `done`: called when they were written, by the thread that writes.
-        `packed`: as for `encode_chunk`.
+        Args:
+            records: their bytes; must not change until `done` is called.
+            log_times: nanoseconds, one a record.
+            write: False leaves them out of the file; the digest covers them all the same.
+            done: called when they were written, by the thread that writes.
+            packed: as for `encode_chunk`.
         """
         encode = None
         if write and self._file is not None:
@@ -122,7 +123,8 @@ class Pipeline:
     def submit(self, topic: Topic, make: Callable[[], bytes], log_time: int) -> None:
         """Send one message of a topic that an encoder thread makes; waits while too much is pending.
 
-        `topic`: its topic, which the digest must not cover.
+        Args:
+            topic: its topic, which the digest must not cover.
         """
         assert not topic.digested
 

@@ -47,7 +47,11 @@ class RecordStore:
         self._stream.close()
 
     def record(self, opcode: int, offset: int, length: int, max_bytes: int = MAX_CHUNK_BYTES) -> memoryview:
-        """Return the body of a record; its length includes the head."""
+        """Return the body of a record; its length includes the head.
+
+        Raises:
+            RecordingError: it is of another kind, cut off, larger than `max_bytes`, or cannot be read.
+        """
         if length > max_bytes:
             raise RecordingError(
                 f"{self._path}: the record at {offset} declares {length:,} bytes, "
@@ -66,7 +70,11 @@ class RecordStore:
         return memoryview(data)[RECORD_HEAD.size :]
 
     def metadata(self, name: str, offset: int, length: int) -> dict[str, str]:
-        """Return the entries of a metadata record."""
+        """Return the entries of a metadata record.
+
+        Raises:
+            RecordingError: it cannot be read, or has another name.
+        """
         try:
             body = bytes(self.record(Opcode.METADATA, offset, length, MAX_METADATA_BYTES))
             found, entries = metadata_of(body)
@@ -79,7 +87,11 @@ class RecordStore:
         return entries
 
     def attachment(self, name: str, offset: int, length: int) -> tuple[str, bytes]:
-        """Return an attachment's media type and data, after comparing its checksum."""
+        """Return an attachment's media type and data, after comparing its checksum.
+
+        Raises:
+            RecordingError: it cannot be read, is damaged, or has another name.
+        """
         body = bytes(self.record(Opcode.ATTACHMENT, offset, length))
         try:
             found, media_type, data = attachment_of(body, offset)

@@ -238,7 +238,8 @@ class Recorder:
     def extend(self, topic: Topic, payloads: Sequence[bytes], positions: Sequence[int]) -> None:
         """Record messages of variable size, in a chunk with others of their topic.
 
-        `positions`: for each message the number of steps executed so far.
+        Args:
+            positions: for each message the number of steps executed so far.
         """
         self._pipeline.raise_failure()
         self._batches.extend(topic, [position * STEP_NANOSECONDS for position in positions], payloads)
@@ -316,7 +317,8 @@ class Recorder:
     def take(self, topic: Topic, positions: NDArray[np.uint64]) -> None:
         """Take the next filled records of the topic's block: set their times, compare or keep them.
 
-        `positions`: for each record the number of steps executed so far, 0.1 s each.
+        Args:
+            positions: for each record the number of steps executed so far, 0.1 s each.
 
         Raises:
             Diverged: a record differs from the one that the recording already holds.

@@ -138,7 +138,11 @@ def declared_bytes(stream: BinaryIO, size: int, path: str) -> int:
 
 
 def check_unpacked_size(size: int, unpacked: int, path: str) -> None:
-    """Refuse chunks that declare far more bytes than those of any recording of the file's size."""
+    """Refuse chunks that declare far more bytes than those of any recording of the file's size.
+
+    Raises:
+        RecordingError: they do.
+    """
     if unpacked > size * MAX_UNPACKED_RATIO + _ALWAYS_UNPACKED:
         raise RecordingError(f"{path}: {size:,} bytes declare to hold {unpacked:,}; made to exhaust memory.")
 
@@ -205,7 +209,8 @@ def _checked_messages(records: bytes, where: str) -> tuple[int, NDArray[np.uint6
 def copied_chunk(chunk: ReadChunk, body: bytes, indexed: bool) -> Chunk:
     """Return a chunk to be written as it was read, with its times and its message index made again.
 
-    `indexed`: whether the recording has message indexes.
+    Args:
+        indexed: whether the recording has message indexes.
     """
     summary, start, end = chunk.summary, int(chunk.times[0]), int(chunk.times[-1])
     body = _CHUNK_TIMES.pack(start, end) + body[_CHUNK_TIMES.size :]  # no checksum covers them
@@ -223,7 +228,11 @@ def copied_chunk(chunk: ReadChunk, body: bytes, indexed: bool) -> Chunk:
 
 
 def attachment_of(body: bytes, offset: int) -> tuple[str, str, bytes]:
-    """Return the name, media type and data of an attachment record."""
+    """Return the name, media type and data of an attachment record.
+
+    Raises:
+        RecordingError: its checksum does not match, or it has times, which no recorder writes.
+    """
     stream = ReadDataStream(BytesIO(body))
     times = stream.read8(), stream.read8()
     name, media_type = stream.read_prefixed_string(), stream.read_prefixed_string()
@@ -235,7 +244,11 @@ def attachment_of(body: bytes, offset: int) -> tuple[str, str, bytes]:
 
 
 def metadata_of(body: bytes) -> tuple[str, dict[str, str]]:
-    """Return the name and entries of a metadata record."""
+    """Return the name and entries of a metadata record.
+
+    Raises:
+        RecordingError: it is larger than `MAX_METADATA_BYTES`.
+    """
     if len(body) > MAX_METADATA_BYTES:
         raise RecordingError(f"metadata of {len(body):,} bytes, expected {MAX_METADATA_BYTES:,} at most")
     record = Metadata.read(ReadDataStream(BytesIO(body)))
@@ -243,7 +256,11 @@ def metadata_of(body: bytes) -> tuple[str, dict[str, str]]:
 
 
 def asks_for_indexes(config: dict[str, str]) -> bool:
-    """Return whether a recording's configuration asks for message indexes."""
+    """Return whether a recording's configuration asks for message indexes.
+
+    Raises:
+        RecordingError: the entries do not say.
+    """
     try:
         return bool(json.loads(config["json"])["recording"]["index"] == "message")
     except (KeyError, TypeError, ValueError, RecursionError) as error:

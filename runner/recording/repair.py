@@ -129,7 +129,11 @@ def _kind(file: DamagedFile, path: Path) -> str:
 
 
 def _read_back(fresh: Path, done: Repair, report: Report) -> None:
-    """Check every byte of the new file, and count its messages."""
+    """Check every byte of the new file, and count its messages.
+
+    Raises:
+        RecordingError: it is not as it should be; the old file stays.
+    """
     check_integrity(fresh, report)
     with open_recording(fresh) as recording:
         for topic in recording.topics:
@@ -265,7 +269,11 @@ class _Salvage:
 
 
 def _recorded_counts(result: dict[str, str]) -> dict[str, int]:
-    """Return how many messages of each topic were recorded, according to a result."""
+    """Return how many messages of each topic were recorded, according to a result.
+
+    Raises:
+        RecordingError: it does not say.
+    """
     values = json_object(result.get("json"), "the metadata 'result'")
     counts = values.get("messages", {})
     if not isinstance(counts, dict) or not all(is_whole(n, 0, _MAX_MESSAGES) for n in counts.values()):

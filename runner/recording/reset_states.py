@@ -72,7 +72,11 @@ def packed_generator(state: JsonView) -> bytes:
 
 
 def decode_reset_state(payload: bytes) -> ResetState:
-    """Return the state in a `dualtaxi.ResetState`."""
+    """Return the state in a `dualtaxi.ResetState`.
+
+    Raises:
+        RecordingError: a value has another size than expected.
+    """
     fields = decode(schema.RESET_STATE, payload)
     seed, packed, ale = fields["np_random_seed"], fields["bit_generator"], fields["ale_state"]
     if len(seed) not in (0, SEED_BYTES) or len(packed) not in (0, _PCG64.size) or len(ale) > MAX_ALE_STATE:

@@ -44,9 +44,10 @@ def rewrite(
     Of a recording that was cut off, everything up to its last whole chunk is written; the new file has
     an index and a summary, but no result either.
 
-    `change`: what becomes of each metadata record.
-    `more`: metadata records to add, by name.
-    `left_out`: the names of attachments and topics to leave out.
+    Args:
+        change: what becomes of each metadata record.
+        more: metadata records to add, by name.
+        left_out: the names of attachments and topics to leave out.
 
     Raises:
         OSError: the new file exists or cannot be written.
@@ -84,6 +85,9 @@ def content_of(path: Path) -> str:
     """Return the content digest of a recording, after checking every checksum and every message.
 
     If the recording states a digest, it must be the same; of a killed run, it is that of the whole chunks.
+
+    Raises:
+        RecordingError: it is damaged, or states another digest than its messages have.
     """
     seen = ContentHash()
     for topic, chunk in _chunks(path):
@@ -134,7 +138,11 @@ def _chunks(path: Path) -> Iterator[tuple[Topic, ReadChunk]]:
 
 
 def whole_records(path: Path) -> Iterator[tuple[int, int, bytes]]:
-    """Yield (opcode, offset, body) of the data section's records, up to where the file may be cut off."""
+    """Yield (opcode, offset, body) of the data section's records, up to where the file may be cut off.
+
+    Raises:
+        RecordingError: it is damaged.
+    """
     with open_recording(path) as recording:
         finished = recording.finished
     if finished:

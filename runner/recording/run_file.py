@@ -144,7 +144,8 @@ class RunFile:
 def parse_run_file(record: JsonView) -> RunFile:
     """Return the contents of a `run.json`; invalid values are named in `problems`.
 
-    `record`: the JSON object; its `run_id` must be valid.
+    Args:
+        record: the JSON object; its `run_id` must be valid.
     """
     problems: list[str] = []
     values = _valid(_without_deep_values(record, problems), _RUN, "", problems)

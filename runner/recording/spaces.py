@@ -51,7 +51,11 @@ class Leaf:
 
 
 def leaves_of(description: object, where: str) -> list[Leaf]:
-    """Return the leaves of a space in order."""
+    """Return the leaves of a space in order.
+
+    Raises:
+        RecordingError: this describes no space; `where` is named.
+    """
     try:
         leaves = list(_leaves(description, ()))
         if len(leaves) > _MAX_LEAVES:
@@ -72,7 +76,11 @@ def dtype_of(description: Any, where: str) -> np.dtype[np.generic] | None:
 
 
 def decode(description: Description, data: bytes, where: str) -> Value:
-    """Return the value that stands in these bytes: dictionaries, tuples, texts and arrays."""
+    """Return the value that stands in these bytes: dictionaries, tuples, texts and arrays.
+
+    Raises:
+        RecordingError: it is no value of the space; `where` is named.
+    """
     try:
         value, end = _value(description, data, 0)
     except (struct.error, ValueError) as error:

@@ -207,7 +207,11 @@ class TopicReader(RunDescription):
         max_bytes: int = MAX_CHUNK_BYTES,
         times: range | None = None,
     ) -> Iterator[tuple[int, M]]:
-        """Yield (log time in nanoseconds, parsed message) of a topic's messages, in order."""
+        """Yield (log time in nanoseconds, parsed message) of a topic's messages, in order.
+
+        Raises:
+            RecordingError: one cannot be parsed, or has more than `max_bytes` bytes; it is named.
+        """
         chunks = self._chunks(topic)
         found = (
             chunks.messages(first_chunk)

@@ -84,7 +84,8 @@ class RecordingFile:
     def reopen(cls, path: Path, contents: Contents) -> RecordingFile:
         """Open a recording to resume it: what follows its last whole chunk is cut off.
 
-        `contents`: its good records, as `integrity.survey` found them.
+        Args:
+            contents: its good records, as `integrity.survey` found them.
 
         Raises:
             OSError: it cannot be written.
@@ -177,8 +178,9 @@ class RecordingFile:
     ) -> None:
         """Write a last metadata record, if one is named, summary and footer, and sync the file.
 
-        `name`: of the record; empty for none.
-        `synced`: False leaves syncing the file to the caller.
+        Args:
+            name: of the record; empty for none.
+            synced: False leaves syncing the file to the caller.
 
         Raises:
             OSError: it could not all be written; the file is then as it was before.
@@ -259,7 +261,11 @@ class RecordingFile:
 
 
 def create_recording(path: Path, topics: Sequence[Topic] = KINDS["job"]) -> RecordingFile:
-    """Return the file of a new recording with these topics."""
+    """Return the file of a new recording with these topics.
+
+    Raises:
+        StorageError: it exists, or cannot be created.
+    """
     try:
         return RecordingFile(path, topics)
     except OSError as error:

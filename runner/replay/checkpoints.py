@@ -46,7 +46,8 @@ class Checkpoints:
     def nearest(self, step: int, shapes: Sequence[tuple[int, ...]]) -> tuple[int, list[NDArray[np.float64]]]:
         """Return the last checkpoint at or before a step, and its tables; step -1 if there is none.
 
-        `shapes`: of the tables, in the order of a snapshot.
+        Args:
+            shapes: of the tables, in the order of a snapshot.
         """
         for found in sorted((found for found in self._steps() if found <= step), reverse=True):
             tables = self._load(found, shapes)

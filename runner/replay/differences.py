@@ -50,8 +50,9 @@ class Difference:
 def first_differing_row(recorded: Array, got: Array, tolerance: float) -> int | None:
     """Return the number of the first row that differs; None if none does.
 
-    `recorded`: a column of records, [rows, ...].
-    `tolerance`: absolute and relative, for floating-point numbers; 0 compares bytes.
+    Args:
+        recorded: a column of records, [rows, ...].
+        tolerance: absolute and relative, for floating-point numbers; 0 compares bytes.
     """
     n = len(recorded)
     if recorded.dtype == object:
@@ -91,7 +92,8 @@ def differing_value(
 ) -> tuple[str, object, object]:
     """Return where in two observations the first difference is, such as `[2]`, and both values there.
 
-    `recorded`: a NumPy value of a space, or its bytes.
+    Args:
+        recorded: a NumPy value of a space, or its bytes.
     """
     if isinstance(recorded, bytes):
         recorded, got = (decode(description, each, "an observation") for each in (recorded, got))

@@ -97,7 +97,8 @@ class Replay:
     def steps(self, piece: Piece, environment: int, draws: bool) -> Iterator[RedoneSteps]:
         """Yield the steps of one environment in a piece, in blocks, up to the first difference.
 
-        `environment`: the number of one in `environments`; `ALL` yields the steps of each in turn.
+        Args:
+            environment: the number of one in `environments`; `ALL` yields the steps of each in turn.
         """
         phase, width = piece.phase, self._recording.environments if environment == ALL else 1
         rows, resets = own_steps(piece, environment, self._recording.environments)

@@ -108,8 +108,9 @@ def redo_in_child(
 
     The child works ahead of the caller by a block at most.
 
-    `seconds`: how long a block of steps may take, and making the environment.
-    `memory_bytes`: how much the process may allocate.
+    Args:
+        seconds: how long a block of steps may take, and making the environment.
+        memory_bytes: how much the process may allocate.
 
     Raises:
         CannotRedo: see `redo`; or the environment hangs, crashes, or needs more memory.
@@ -134,8 +135,9 @@ def stream_from_child(
 ) -> Iterator[Any]:
     """Yield what a function that runs foreign code passes to `report_progress` in a child process.
 
-    `function`: of a module; called with the path and the other arguments.
-    `seconds`: how long it may take for each value.
+    Args:
+        function: of a module; called with the path and the other arguments.
+        seconds: how long it may take for each value.
 
     Raises:
         CannotRedo: the process hangs, crashes or needs more memory.

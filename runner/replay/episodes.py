@@ -51,7 +51,8 @@ def redo_episode(
 ) -> Iterator[RedoneSteps]:
     """Yield the steps of one episode, begun as late as possible.
 
-    `make`: returns a new replay.
+    Args:
+        make: returns a new replay.
     """
     target = _target(recording, phase, number)
     with closing(make()) as replay:
@@ -73,9 +74,10 @@ def episode_at(
 ) -> Iterator[None]:
     """Bring an environment to a step of an episode, by the recorded resets and actions; close it afterwards.
 
-    `t`: the number of steps to take.
-    `on_reset`: called before the reset that begins the episode, with the recorded actions from `t` on; it may
-    wrap `RowStepper.env`.
+    Args:
+        t: the number of steps to take.
+        on_reset: called before the reset that begins the episode, with the recorded actions from `t` on; it
+            may wrap `RowStepper.env`.
 
     Raises:
         CannotRedo: the environment differs from the recording, or cannot be brought there.
@@ -120,7 +122,11 @@ def _right_start(recording: Recording, target: _Target, make: Callable[[], Repla
 
 
 def _target(recording: Recording, phase: str, number: int) -> _Target:
-    """Return where an episode is, and its reset."""
+    """Return where an episode is, and its reset.
+
+    Raises:
+        RecordingError: there is no such episode, or it has no reset.
+    """
     span, n = recording.episode_span(phase, number), recording.environments
     ended = recording.episodes(phase, number, number + 1)
     stop_time = int(ended["log_time"][0]) if len(ended) else _step_time(recording, phase, span[-1])

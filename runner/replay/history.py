@@ -61,7 +61,8 @@ def _note_changes(
 ) -> tuple[NDArray[np.void], NDArray[np.float64]]:
     """Note which visit last changed each value; return the last visit, whose effect only the next shows.
 
-    `rows`: the state's values before each of them, [visits, learners, most actions].
+    Args:
+        rows: the state's values before each of them, [visits, learners, most actions].
     """
     if len(rows) > 1:
         bits = rows.view(np.int64)

@@ -64,7 +64,8 @@ def why_not_made(maker: EnvironmentMaker | None, trust: bool) -> str:
 def make_environment(maker: EnvironmentMaker, trust: bool, render: bool = False) -> Any:
     """Return an environment as a loop had it; of a vector of separate environments, one of them.
 
-    `render`: whether the environment draws pictures: its `render()` returns them.
+    Args:
+        render: whether the environment draws pictures: its `render()` returns them.
 
     Raises:
         CannotRedo: it cannot be made; the message is why.
@@ -116,7 +117,8 @@ def why_not_alone(maker: EnvironmentMaker) -> str:
 def make_vector(maker: EnvironmentMaker, trust: bool, render: bool = False) -> object:
     """Return a vector environment as a loop had it, an asynchronous one as a `SyncVectorEnv`.
 
-    `render`: whether its `render()` returns pictures, one of each environment.
+    Args:
+        render: whether its `render()` returns pictures, one of each environment.
 
     Raises:
         CannotRedo: it cannot be made; the message is why.

@@ -85,8 +85,9 @@ def pieces(
 ) -> Iterator[Piece]:
     """Yield what happened in some phases, in the order of time.
 
-    `start_time`: the earliest `log_time` of resets; steps come after it.
-    `stop_time`: the last `log_time` of steps; resets after that step are left out. By default all.
+    Args:
+        start_time: the earliest `log_time` of resets; steps come after it.
+        stop_time: the last `log_time` of steps; resets after that step are left out. By default all.
     """
     streams = [_pieces_of(recording, phase, start_time, stop_time) for phase in phases]
     if recording.shards:

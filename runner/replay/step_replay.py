@@ -121,11 +121,12 @@ class StepReplay:
     ) -> None:
         """Apply the updates of the training steps that follow.
 
-        `steps`: a block of records; the first is step number `self.step`.
-        `rows`: filled with each learner's values of a step's state before its update, [steps, learners, most
-        actions]; empty if they are not needed.
-        `probe`: states to look at on the way.
-        `trace`: filled with what decides the weights of the updates; not together with `probe`.
+        Args:
+            steps: a block of records; the first is step number `self.step`.
+            rows: filled with each learner's values of a step's state before its update, [steps, learners,
+                most actions]; empty if they are not needed.
+            probe: states to look at on the way.
+            trace: filled with what decides the weights of the updates; not together with `probe`.
         """
         if probe is not None:
             _check_probe(probe, self._mdp)
@@ -147,7 +148,8 @@ class StepReplay:
     def watch(self, steps: NDArray[np.void], watch: Watch) -> Changes:
         """Apply updates as `apply` does, and return the watched values after each that could change them.
 
-        `watch`: `begin_watch` was called with it at `step`, or this method for the steps before.
+        Args:
+            watch: `begin_watch` was called with it at `step`, or this method for the steps before.
         """
         found = [(empty_changes(watch, 0), 0)]
         for state, part in self._segments(steps):

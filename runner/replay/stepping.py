@@ -70,8 +70,9 @@ class Results:
     def part(self, first: int, stride: int, rows: NDArray[np.bool_], resets: Sequence[int]) -> Results:
         """Return the results of one environment of a vector.
 
-        `first`: its number.
-        `stride`: the number of environments.
+        Args:
+            first: its number.
+            stride: the number of environments.
         """
         part = Results.__new__(Results)
         for name in ("observations", "rewards", "terminated", "truncated"):
@@ -112,7 +113,8 @@ class Stepper(ABC):
     def run(self, rows: NDArray[np.void], resets: Sequence[tuple[int, RecordedReset]]) -> Results:
         """Do recorded steps again, until the environment raises an error.
 
-        `resets`: row and reset, in order; each comes before its row.
+        Args:
+            resets: row and reset, in order; each comes before its row.
         """
 
     def check_spaces(self) -> None:

@@ -50,8 +50,9 @@ class VectorStepper(Stepper):
     def run(self, rows: NDArray[np.void], resets: Sequence[tuple[int, RecordedReset]]) -> Results:
         """Do recorded steps again, until the environment raises an error.
 
-        `rows`: the recorded steps, as many of each environment.
-        `resets`: step of each environment, and reset, in order; each comes before its step.
+        Args:
+            rows: the recorded steps, as many of each environment.
+            resets: step of each environment, and reset, in order; each comes before its step.
         """
         n, times = self._n, len(rows) // self._n
         results = Results(len(rows), len(resets), self.dtypes, 1, self._drawn)

@@ -21,7 +21,11 @@ _END_OF_TIME: Final = 2**62
 
 
 def step_of_episode(recording: Recording, episode: int) -> int:
-    """Return the number of training steps taken when `episode` episodes had ended."""
+    """Return the number of training steps taken when `episode` episodes had ended.
+
+    Raises:
+        RecordingError: fewer episodes were recorded, or the last of them was lost.
+    """
     ended = recording.count(schema.TRAIN_EPISODE)
     if not 0 <= episode <= ended:
         raise NotInRecording(
@@ -46,7 +50,11 @@ def transitions_of(recording: Recording, phase: str, episode: int) -> Iterator[A
 
 
 def episode_blocks(recording: Recording, phase: str, episode: int) -> Iterator[NDArray[np.void]]:
-    """Yield an episode's steps in blocks, where they have one size."""
+    """Yield an episode's steps in blocks, where they have one size.
+
+    Raises:
+        RecordingError: the recording has no such episode, or steps of it were lost.
+    """
     topic, numbers = recording.topic(f"/{phase}/step"), recording.episode_span(phase, episode)
     if recording.has_actions_alone(phase):
         yield whole_steps(recording, phase, episode)
@@ -101,7 +109,11 @@ def reset_of(recording: Recording, phase: str, episode: int) -> Any | None:
 def recorded_frames(recording: Recording, phase: str, episode: int, start: int = 0) -> Iterator[Message]:
     """Yield the last frame that was recorded up to each step of an episode, as a decoded message.
 
-    `start`: steps before the first one; 0 for the frame after the reset.
+    Args:
+        start: steps before the first one; 0 for the frame after the reset.
+
+    Raises:
+        RecordingError: the recording has no such episode, steps of it were lost, or its first frame.
     """
     span, n = recording.episode_span(phase, episode), recording.environments
     first = max(0, start - frames_every(recording))
@@ -156,7 +168,11 @@ def last_step(recording: Recording) -> int:
 
 
 def check_steps(block: NDArray[np.void], mdp: Mdp, where: str, phase: str = "training") -> None:
-    """Refuse steps with a state or an action that the environment does not have: they are used as indices."""
+    """Refuse steps with a state or an action that the environment does not have: they are used as indices.
+
+    Raises:
+        RecordingError: there is such a step.
+    """
     bounds = {"state": mdp.states, "next_state": mdp.states, "action": mdp.joint_actions}
     for name, bound in bounds.items():
         if (found := int(block[name].max())) >= bound:

@@ -55,6 +55,9 @@ class TableReplay(StepReplay):
 
         Returns:
             [steps] of `UPDATE`.
+
+        Raises:
+            RecordingError: the step is earlier, or not recorded; or the environment cannot have such steps.
         """
         trace = Trace(np.empty(max(stop - self.step, 0), UPDATE), learner)
         first = self.step
@@ -102,7 +105,11 @@ class TableReplay(StepReplay):
         return (at, held_of(tables, self.kinds)) if at > nearest[0] else nearest
 
     def advance(self, stop: int, rows: NDArray[np.float64] = NO_ROWS, trace: Trace | None = None) -> None:
-        """Replay up to a later step; `rows` and `trace` are filled as `apply` fills them."""
+        """Replay up to a later step; `rows` and `trace` are filled as `apply` fills them.
+
+        Raises:
+            RecordingError: the step is earlier, or not recorded.
+        """
         first = self.step
         if stop < first:
             raise RecordingError(f"a replay at step {first} cannot go back to {stop}; start another.")

@@ -152,7 +152,11 @@ def is_checkpoint_name(name: object) -> bool:
 
 
 def read_checkpoints(recording: Recording, recordings: Path) -> list[Checkpoint]:
-    """Return the checkpoints in a recording, in order; their contents are in a recordings folder's store."""
+    """Return the checkpoints in a recording, in order; their contents are in a recordings folder's store.
+
+    Raises:
+        RecordingError: one is invalid.
+    """
     if schema.CHECKPOINT_TOPIC not in recording.topics:
         return []
     store = Store(recordings)
@@ -198,7 +202,11 @@ def find_checkpoint(every: Sequence[Checkpoint], reference: str, where: str) -> 
 
 
 def arrays_in(data: bytes, where: str) -> dict[str, Array]:
-    """Return the arrays in a safetensors file, by name; those of bfloat16 become float32, exactly."""
+    """Return the arrays in a safetensors file, by name; those of bfloat16 become float32, exactly.
+
+    Raises:
+        RecordingError: it is not such a file, or has a dtype that NumPy lacks; `where` is named.
+    """
     safetensors = require("safetensors", extra="safetensors", purpose="reading a safetensors file")
     try:
         entries = safetensors.deserialize(data)

@@ -149,7 +149,8 @@ class CodeCollector:
     def write(self, file: RecordingFile, wait: bool = False) -> None:
         """Write the code into a recording, once, if it is known; nothing else may write into it meanwhile.
 
-        `wait`: wait for it, up to `WAIT_SECONDS` after the start; then write that it is not known.
+        Args:
+            wait: wait for it, up to `WAIT_SECONDS` after the start; then write that it is not known.
         """
         if not self._is_wanted or self.entries:
             return
@@ -226,8 +227,9 @@ def collect(
 ) -> RecordedCode:
     """Return the code in a folder.
 
-    `cells`: the cells of a notebook that were executed.
-    `recordings`: a folder whose untracked files are no code.
+    Args:
+        cells: the cells of a notebook that were executed.
+        recordings: a folder whose untracked files are no code.
     """
 
     def used(root: Path) -> list[str]:

@@ -73,8 +73,9 @@ def read_repository(
 ) -> Repository:
     """Return the state of the repository that a folder is in.
 
-    `used`: returns the paths of files in the repository, whose root it gets: those that are ignored count as
-    untracked.
+    Args:
+        used: returns the paths of files in the repository, whose root it gets: those that are ignored count
+            as untracked.
 
     Raises:
         NotRecorded: there is none, or it cannot be read; after its commit is known, what cannot be read is

@@ -75,12 +75,13 @@ def import_recording(
     labels, as does the preview of an upload. When this returns the run is on disk, even if the power fails
     now.
 
-    `recording`: the file, to which nothing is written any more. If it is finished, nothing in it changes and
-    it is on the same disk, it is linked instead of copied.
-    `details`: the contents of `run.json` where the run comes from; the file's own record of it by default.
-    Values that the recording contradicts are ignored.
-    `labels`: name, tags and note of the run; the file's own record of them by default.
-    `as_new`: give the run a new id, so that it can stand next to another run of its id.
+    Args:
+        recording: the file, to which nothing is written any more. If it is finished, nothing in it changes
+            and it is on the same disk, it is linked instead of copied.
+        details: the contents of `run.json` where the run comes from; the file's own record of it by default.
+            Values that the recording contradicts are ignored.
+        labels: name, tags and note of the run; the file's own record of them by default.
+        as_new: give the run a new id, so that it can stand next to another run of its id.
 
     Raises:
         RecordingError: the recording is damaged or inconsistent; nothing was written.
@@ -168,7 +169,11 @@ def _export_record(recording: Recording) -> dict[str, object]:
 
 
 def checked_facts(recording: Recording, details: JsonView) -> Json:
-    """Return the contents of `run.json`."""
+    """Return the contents of `run.json`.
+
+    Raises:
+        RecordingError: the recording's description of the run is invalid.
+    """
     try:
         facts = run_facts(recording, details)
         problems = parse_run_file(facts).problems
@@ -189,7 +194,11 @@ def checked_facts(recording: Recording, details: JsonView) -> Json:
 
 
 def _existing_run(target: Path) -> Run | None:
-    """Return the run whose id a folder is to have as its name; None if there is none."""
+    """Return the run whose id a folder is to have as its name; None if there is none.
+
+    Raises:
+        StorageError: something that is not a run has the folder's name.
+    """
     found = run_with_id(target.name, target.parent)
     if found is None and os.path.lexists(target):
         raise StorageError(f"{target}: exists and is not a run; move it away.")
@@ -256,9 +265,10 @@ def _merged(own: Labels, more: Labels) -> Labels:
 def _place(source: Path, target: Path, facts: Json, rewritten: bool) -> None:
     """Copy, link or rewrite a recording, and set its size in the facts.
 
-    `target`: the new file. A finished recording that is not rewritten becomes a link on the same disk; others
-    are copied, as `resume` continues them in place, which must not change the source.
-    `rewritten`: write it with the id of the facts and without its export record.
+    Args:
+        target: the new file. A finished recording that is not rewritten becomes a link on the same disk;
+            others are copied, as `resume` continues them in place, which must not change the source.
+        rewritten: write it with the id of the facts and without its export record.
 
     Raises:
         OSError: the target cannot be written.

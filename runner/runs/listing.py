@@ -30,7 +30,11 @@ def list_runs(recordings: str | os.PathLike[str] | None = None) -> list[Run]:
 
 
 def run_entries(recordings: Path) -> list[str]:
-    """Return the names of the folders that may have a run: all but the hidden ones."""
+    """Return the names of the folders that may have a run: all but the hidden ones.
+
+    Raises:
+        StorageError: the recordings folder is there and cannot be read.
+    """
     try:
         with os.scandir(recordings) as entries:
             return [entry.name for entry in entries if entry.name[0] != "." and entry.is_dir()]

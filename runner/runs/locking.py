@@ -47,8 +47,9 @@ def locked(run: Run, archived: bool = False) -> Iterator[Run]:
 def acquired(path: Path, busy: RunnerError) -> FileLock:
     """Acquire the lock of a file without waiting; the caller releases it.
 
-    `path`: the lock file; its folder is created if it is missing.
-    `busy`: raised if another process has the lock.
+    Args:
+        path: the lock file; its folder is created if it is missing.
+        busy: raised if another process has the lock.
     """
     from filelock import FileLock, Timeout
 

@@ -246,8 +246,9 @@ def create_run(
 ) -> Run:
     """Create the folder of a new run with its `run.json`; an id is never used twice.
 
-    `name`: the name of the run; the configuration's name by default.
-    `run_id`: an id from `new_run_id`; replaced if it is taken by now.
+    Args:
+        name: the name of the run; the configuration's name by default.
+        run_id: an id from `new_run_id`; replaced if it is taken by now.
     """
     return new_run(recordings, config.to_mapping(), seed, name or config.name, run_id)
 
@@ -327,7 +328,11 @@ def recordings_folder(chosen: str | os.PathLike[str] | None = None) -> Path:
 
 
 def check_folder_name(recordings: str | os.PathLike[str]) -> None:
-    """Refuse a recordings folder whose path is not UTF-8, which neither the index nor JSON can store."""
+    """Refuse a recordings folder whose path is not UTF-8, which neither the index nor JSON can store.
+
+    Raises:
+        StorageError: it is not UTF-8.
+    """
     path = os.path.abspath(recordings)  # noqa: PTH100 - links stay what they are
     if not is_utf8(path):
         raise StorageError(

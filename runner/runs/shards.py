@@ -34,8 +34,9 @@ _LOCK: Final = "shards.lock"
 def find_joined(join: object, recordings: str | os.PathLike[str] | None) -> Run:
     """Return the run that a process wants to join, which is running.
 
-    `join`: a run, or its id, the beginning of its id, its name or the path of its folder; True for the one in
-    $DUALTAXI_RUN.
+    Args:
+        join: a run, or its id, the beginning of its id, its name or the path of its folder; True for the one
+            in $DUALTAXI_RUN.
 
     Raises:
         RunNotFound: there is no such run.
@@ -75,8 +76,12 @@ def _require_open(run: Run) -> None:
 def new_shard(joined: Run, name: str | None, config: JsonView, seed: int | None, **more: Any) -> Run:
     """Create the folder of a new shard; where the name is taken, `-2`, `-3` ... is added.
 
-    `name`: of letters, digits and `_.-`; that of the process in `multiprocessing` by default.
-    `more`: further facts for its `run.json`.
+    Args:
+        name: of letters, digits and `_.-`; that of the process in `multiprocessing` by default.
+        more: further facts for its `run.json`.
+
+    Raises:
+        ConfigError: the name is not valid.
     """
     if name is None:
         import multiprocessing

@@ -39,7 +39,11 @@ class Store:
         self._folder = recordings / FOLDER
 
     def path(self, digest: str) -> Path:
-        """Return the path of a content, whether or not it is there."""
+        """Return the path of a content, whether or not it is there.
+
+        Raises:
+            RecordingError: it is not a digest; anything else could lead out of the store.
+        """
         if not DIGEST.fullmatch(digest):
             raise RecordingError(f"found the digest {digest[:80]!r}, expected 64 hexadecimal digits.")
         return self._folder / "objects" / digest[:2] / digest
@@ -54,8 +58,12 @@ class Store:
     def put(self, run: str, content: bytes | memoryview | Path, expected: str = "") -> tuple[str, int]:
         """Store a content that a run refers to; return its digest and its number of bytes.
 
-        `content`: the bytes, or a file with them.
-        `expected`: its digest, if it is known.
+        Args:
+            content: the bytes, or a file with them.
+            expected: its digest, if it is known.
+
+        Raises:
+            StorageError: the file cannot be read, or the store cannot be written.
         """
         if not isinstance(content, Path):
             return self._put(run, [content], expected)

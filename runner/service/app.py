@@ -57,7 +57,11 @@ class Ready(BaseModel):
 
 
 def create_app(settings: Settings) -> FastAPI:
-    """Return the application."""
+    """Return the application.
+
+    Raises:
+        RunnerError: it would be reachable from other machines and there is no token.
+    """
     tokens = Tokens(settings.tokens)
     if settings.needs_token and not tokens.all():
         option = (

@@ -63,7 +63,11 @@ FoundRun = Annotated[Run, Depends(found_run)]
 
 
 def recorded_run(run: FoundRun) -> Run:
-    """Return the run that the path names, its recording restored if it is archived."""
+    """Return the run that the path names, its recording restored if it is archived.
+
+    Raises:
+        RecordingError: it has no recording, or its archive is damaged or missing.
+    """
     restored = at_hand(run)
     if not restored.recording.is_file():
         raise RecordingError(f"run {run.run_id} has no recording: it ended before there was one.")

@@ -121,7 +121,11 @@ class Guard:
             )
 
     def _token(self, request: Request) -> Token | None:
-        """Return the token of a request, or of its session; None if it has none."""
+        """Return the token of a request, or of its session; None if it has none.
+
+        Raises:
+            Unauthorized: it is a wrong one.
+        """
         scheme, _, secret = request.headers.get("authorization", "").partition(" ")
         if scheme:
             if scheme.lower() != "bearer" or not secret.strip():
@@ -157,7 +161,11 @@ class Body:
         self._began, self._length, self._more = time.monotonic(), 0, True
 
     async def receive(self) -> Message:
-        """Return its next part; after its end there is no limit on waiting."""
+        """Return its next part; after its end there is no limit on waiting.
+
+        Raises:
+            HTTPException: it is too long, or too slow.
+        """
         if not self._more:
             return await self._receive()
         try:

@@ -140,7 +140,11 @@ class PictureStreams:
             stream.join(_JOIN_SECONDS)
 
     def open(self, key: Hashable, make: Make, start: int) -> PictureStream:
-        """Return a stream that has the picture at step `start` before it: one that was kept, or a new one."""
+        """Return a stream that has the picture at step `start` before it: one that was kept, or a new one.
+
+        Raises:
+            Busy: there are too many.
+        """
         self._streams = [stream for stream in self._streams if stream.is_alive or stream.can_continue]
         own = [stream for stream in self._streams if stream.key == key and stream.can_continue]
         for stream in own:

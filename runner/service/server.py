@@ -23,7 +23,11 @@ _DISCARD: Final = struct.pack("ii", 1, 0)
 
 
 def bind(settings: Settings) -> socket.socket:
-    """Return the socket that the service will listen on, so that its port is known before it starts."""
+    """Return the socket that the service will listen on, so that its port is known before it starts.
+
+    Raises:
+        RunnerError: the host or port is not available.
+    """
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     try:
         return socket.create_server((settings.host, settings.port), family=family, backlog=BACKLOG)

@@ -90,7 +90,11 @@ class _RecordsFile(Generic[Record]):
         self._records: tuple[Record, ...] = ()
 
     def all(self) -> tuple[Record, ...]:
-        """Return the records; the file is read again when it has changed."""
+        """Return the records; the file is read again when it has changed.
+
+        Raises:
+            StorageError: the file exists and cannot be read as one of them.
+        """
         try:
             stat = self.path.stat()
             version = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
@@ -133,7 +137,11 @@ class Tokens:
         return matching[-1] if matching else None
 
     def create(self, name: str, scopes: tuple[str, ...]) -> tuple[Token, str]:
-        """Return a new token and its secret, which is not stored."""
+        """Return a new token and its secret, which is not stored.
+
+        Raises:
+            RunnerError: the name is invalid or in use, or there are too many tokens.
+        """
         if not _NAME.fullmatch(name):
             raise RunnerError(f"token: found the name {name!r}, expected 1 to 64 letters, digits, _ . @ -")
         secret = PREFIX + secrets.token_urlsafe(32)
@@ -155,7 +163,11 @@ class Tokens:
         return token, secret
 
     def revoke(self, name: str) -> Token:
-        """Remove the token with an id or a name, at once also for a running service; return it."""
+        """Remove the token with an id or a name, at once also for a running service; return it.
+
+        Raises:
+            RunnerError: there is none, or there are several of the name.
+        """
         matching = [token for token in self.all() if name in (token.id, token.name)]
         if len(matching) != 1:
             known = ", ".join(f"{token.id} ({token.name})" for token in self.all()) or "none"

@@ -102,7 +102,11 @@ class Uploads:
         return sorted(self._uploads.copy().values(), key=lambda upload: upload.created, reverse=True)
 
     def get(self, upload_id: str, owner: str) -> Upload:
-        """Return an upload of this owner."""
+        """Return an upload of this owner.
+
+        Raises:
+            RunNotFound: there is none with this id, or it is another owner's.
+        """
         upload = self._uploads.get(upload_id)
         if upload is None or upload.owner != owner:
             raise RunNotFound("no such upload: it was deleted, is long over, or belongs to another token.")
@@ -164,7 +168,12 @@ class Uploads:
         return upload, True
 
     def _checkpointed(self, announced: Announcement) -> Run | None:
-        """Return the run with a checkpoint of these bytes; None if they are a recording."""
+        """Return the run with a checkpoint of these bytes; None if they are a recording.
+
+        Raises:
+            RunNotFound: there is no such run.
+            UploadConflict: it has no checkpoint of this digest and size.
+        """
         if not announced.checkpoint_of:
             return None
         run = run_of_id(announced.checkpoint_of, self._recordings)
@@ -241,7 +250,11 @@ class Uploads:
         return upload
 
     def delete(self, upload_id: str, owner: str) -> None:
-        """Forget an upload, and remove what was received."""
+        """Forget an upload, and remove what was received.
+
+        Raises:
+            UploadConflict: it is being verified.
+        """
         with self._lock:
             upload = self.get(upload_id, owner)
             if upload.state == "verifying":

@@ -82,7 +82,11 @@ class Picture:
 
 
 def picture_of(results: Results) -> Picture:
-    """Return the trials of a sweep that can be drawn."""
+    """Return the trials of a sweep that can be drawn.
+
+    Raises:
+        RunnerError: no trial has a result yet.
+    """
     drawn = tuple(
         trial
         for trial in results.ranking
@@ -107,7 +111,11 @@ def picture_of(results: Results) -> Picture:
 
 
 def learning(results: Results, recordings: Path) -> tuple[list[Group], list[Panel]]:
-    """Return the runs of the median and of the best trial, and their metrics over episodes."""
+    """Return the runs of the median and of the best trial, and their metrics over episodes.
+
+    Raises:
+        RunnerError: no trial is finished yet, or a run cannot be read.
+    """
     finished = [trial for trial in results.ranking if trial.state == "finished"]
     if not finished:
         raise RunnerError(_nothing_to_draw(results))

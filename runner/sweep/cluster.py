@@ -33,6 +33,9 @@ def connect(address: str | None, processors: int | None = None) -> Any:
 
     The address is that of the cluster, or `auto`; None starts Ray on this machine, which may
     use a number of its processors, or all.
+
+    Raises:
+        RunnerError: the cluster cannot be reached.
     """
     ray = require_ray()
     options = {"log_to_driver": False, "logging_level": "ERROR"}

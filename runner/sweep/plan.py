@@ -96,7 +96,11 @@ def _estimated_bytes(config: ExperimentConfig, mdp: Mdp) -> int:
 
 
 def require_disk(plan: Plan, done: int, recordings: Path) -> None:
-    """Refuse a sweep that does not fit on the disk; `done` of its runs exist already."""
+    """Refuse a sweep that does not fit on the disk; `done` of its runs exist already.
+
+    Raises:
+        StorageError: there is too little space.
+    """
     needed, free = max(0, plan.runs - done) * plan.bytes_per_run, free_bytes(recordings)
     if needed > free:
         raise StorageError(

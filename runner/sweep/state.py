@@ -39,7 +39,11 @@ class SweepBusy(RunnerError):
 
 
 def read_sweep(name: str, recordings: Path) -> Sweep:
-    """Return a sweep as it was started."""
+    """Return a sweep as it was started.
+
+    Raises:
+        RunnerError: there is none of this name, or its file is damaged.
+    """
     names = sweeps_in(recordings)
     if name not in names:
         listed = f" There are {', '.join(names)}." if names else " `dualtaxi sweep run FILE` starts one."

@@ -127,7 +127,11 @@ def storage_errors(path: str | os.PathLike[str], advice: str = "") -> Iterator[N
 
     The `Timeout` of a `FileLock` is an `OSError` too: catch it within the block.
 
-    `advice`: the end of the message, such as `free some disk`.
+    Args:
+        advice: the end of the message, such as `free some disk`.
+
+    Raises:
+        StorageError: there was one.
     """
     try:
         yield

@@ -67,7 +67,8 @@ def _without_main_module() -> Iterator[None]:
 def process_context(preload: Sequence[str] = ()) -> Any:
     """Return the multiprocessing context that starts processes, from a fork server where there is one.
 
-    `preload`: modules that the fork server imports once, for all processes.
+    Args:
+        preload: modules that the fork server imports once, for all processes.
     """
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
@@ -115,9 +116,10 @@ class ChildProcess:
     ) -> Result:
         """Return what a function returns in the process.
 
-        `function`: of a module, not nested.
-        `seconds`: the time limit; the process is of no use after it.
-        `args`: of the function; they and the result are pickled.
+        Args:
+            function: of a module, not nested.
+            seconds: the time limit; the process is of no use after it.
+            args: of the function; they and the result are pickled.
 
         Raises:
             TimedOut, OutOfMemory, ProcessDied: the call did not end by itself.

@@ -27,14 +27,22 @@ RUN_NAME_EXPECTED: Final = (
 
 
 def checked_name(name: str | None) -> str | None:
-    """Return the name if a configuration can have it."""
+    """Return the name if a configuration can have it.
+
+    Raises:
+        ConfigError: it cannot.
+    """
     if name is not None and not re.fullmatch(NAME_PATTERN, name):
         raise ConfigError(f"name: found {name!r}, expected {NAME_EXPECTED}")
     return name
 
 
 def checked_run_name(name: str | None) -> str | None:
-    """Return the name if a recorded loop, or a renamed run, can have it, such as `ALE/Pong-v5__ppo+1`."""
+    """Return the name if a recorded loop, or a renamed run, can have it, such as `ALE/Pong-v5__ppo+1`.
+
+    Raises:
+        ConfigError: it cannot.
+    """
     if name is not None and not re.fullmatch(RUN_NAME_PATTERN, name):
         raise ConfigError(f"name: found {name!r}, expected {RUN_NAME_EXPECTED}")
     return name
@@ -67,7 +75,8 @@ def as_utf8(text: str) -> str:
 def flatten(values: Mapping[str, object], keep_empty: bool = False, prefix: str = "") -> dict[str, object]:
     """Return the values in nested mappings by dotted key, such as `evaluation.trials`.
 
-    `keep_empty`: whether an empty mapping counts as a value.
+    Args:
+        keep_empty: whether an empty mapping counts as a value.
     """
     flat: dict[str, object] = {}
     for key, value in values.items():

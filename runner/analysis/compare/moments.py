@@ -157,6 +157,9 @@ def moment_of(
 
     A moment is `last`, `best`, `area`, or a position: a number of training episodes, or of the axis. A
     target, a metric and its level, replaces it.
+
+    Raises:
+        RunnerError: it is none of these, or both are given.
     """
     if target is not None:
         if moment != "last" or chosen:

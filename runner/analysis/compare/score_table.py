@@ -40,6 +40,9 @@ def read_table(path: Path) -> dict[str, Bounds]:
     """Return the scores of a random policy and of an expert by environment, from CSV, YAML or JSON.
 
     CSV has the columns task, random and expert; YAML and JSON map an environment to `random` and `expert`.
+
+    Raises:
+        RunnerError: the file cannot be read, or is no such table.
     """
     try:
         if path.stat().st_size > _MAX_TABLE:
@@ -52,7 +55,11 @@ def read_table(path: Path) -> dict[str, Bounds]:
 
 
 def parse_table(text: str, name: str) -> dict[str, Bounds]:
-    """Return the table of a text, see `read_table`; its format follows the ending of the name."""
+    """Return the table of a text, see `read_table`; its format follows the ending of the name.
+
+    Raises:
+        RunnerError: it is no such table.
+    """
     ending = Path(name).suffix.lower()
     if ending not in (".csv", ".yaml", ".yml", ".json"):
         raise RunnerError(f"{name}: found the ending {ending!r}, expected .csv, .yaml or .json.")

@@ -90,7 +90,11 @@ class TaskComparison:
 
 
 def metric_of_tasks(groups: Sequence[Group], chosen: Sequence[str]) -> tuple[str, str]:
-    """Return the metric and line that environments are compared by: the one chosen, or the return."""
+    """Return the metric and line that environments are compared by: the one chosen, or the return.
+
+    Raises:
+        RunnerError: several are chosen, or the metric has several lines, or no run has it.
+    """
     pairs = metrics_of(groups, chosen)
     if not chosen:
         pairs = [pair for pair in pairs if pair[0].endswith("mean_return")] or pairs[:1]
@@ -126,6 +130,9 @@ def compare_tasks(
     The groups are the runs of each algorithm, as `grouped` returns them for several tasks; the metric is
     (metric, line); a crossing cannot be normalised. The table has the scores 0 and 1 of each environment,
     None for the worst and the best value there; the notes are added to the comparison's own.
+
+    Raises:
+        RunnerError: there is no common environment, or the table lacks one.
     """
     statistics.require_scipy()
     if moment.level is not None:

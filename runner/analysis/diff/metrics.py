@@ -40,7 +40,11 @@ class MetricDiff:
 
 
 def metric_diffs(a: Recording, b: Recording, targets: Mapping[str, float]) -> list[MetricDiff]:
-    """Return how each metric of the evaluations differs, with the first crossing of each target's level."""
+    """Return how each metric of the evaluations differs, with the first crossing of each target's level.
+
+    Raises:
+        RunnerError: they have no metric of that name.
+    """
     values = [_values(recording) for recording in (a, b)]
     names = [name for name in values[0] if name in values[1]]
     for name in targets:

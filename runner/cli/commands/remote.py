@@ -38,7 +38,11 @@ class Server:
     token: str | None
 
     def client(self, default_url: str | None = None) -> Client:
-        """Return a client of the server."""
+        """Return a client of the server.
+
+        Raises:
+            UsageError: no server was named.
+        """
         from runner.client.client import Client
 
         url = self.url or default_url

@@ -15,7 +15,11 @@ _DPI: Final = 160
 
 
 def check_suffix(path: Path) -> None:
-    """Check that a file can be written as what its suffix says."""
+    """Check that a file can be written as what its suffix says.
+
+    Raises:
+        RunnerError: the suffix is not in `SUFFIXES`.
+    """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise RunnerError(f"{path}: found the ending {path.suffix!r}, expected one of {', '.join(SUFFIXES)}.")

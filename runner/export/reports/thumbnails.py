@@ -59,7 +59,11 @@ def thumbnails(path: Path, phase: str, episode: int, frames: int) -> Thumbnails:
 
 
 def _small(data: bytes) -> str:
-    """Return a picture as an address that contains it, made small."""
+    """Return a picture as an address that contains it, made small.
+
+    Raises:
+        RunnerError: it is no picture, or too large.
+    """
     from PIL import Image, UnidentifiedImageError
 
     try:

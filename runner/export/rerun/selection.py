@@ -242,7 +242,11 @@ def _describe_evaluations(
 
 
 def _select_loop(recording: Recording, request: Request, selection: Selection) -> Selection:
-    """Return the steps of a loop in a request; by default all of them unless there are too many."""
+    """Return the steps of a loop in a request; by default all of them unless there are too many.
+
+    Raises:
+        RecordingError: an episode does not exist, or an evaluation is requested, of which a loop has none.
+    """
     if request.evaluations:
         raise RecordingError(
             f"{recording.path}: a loop has no numbered evaluations; --all exports all steps."

@@ -49,7 +49,11 @@ def require_rerun(purpose: str) -> None:
 
 
 def viewer_program() -> Path:
-    """Return the viewer's executable, which comes with the package."""
+    """Return the viewer's executable, which comes with the package.
+
+    Raises:
+        ViewerError: it is missing.
+    """
     import rerun_cli  # type: ignore[import-untyped,unused-ignore]
 
     folder = Path(rerun_cli.__file__).parent
@@ -65,7 +69,11 @@ def free_port() -> int:
 
 
 def check_port(port: int) -> int:
-    """Return the port if it is free, or any free port for 0."""
+    """Return the port if it is free, or any free port for 0.
+
+    Raises:
+        ViewerError: something listens on it.
+    """
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -78,7 +86,12 @@ def check_port(port: int) -> int:
 
 
 def check_address(url: str) -> str:
-    """Return the address of a viewer if something listens there."""
+    """Return the address of a viewer if something listens there.
+
+    Raises:
+        RunnerError: it is no address of a viewer.
+        ViewerError: nothing listens there.
+    """
     parts = urlsplit(url)
     try:
         if not parts.scheme.startswith("rerun") or parts.hostname is None:
@@ -189,7 +202,11 @@ def headless(path: Path, step: int, size: str = "1600x900") -> Iterator[ViewerCl
 
 
 def screenshot(path: Path, step: int, picture: Path, size: str = "1600x900") -> None:
-    """Draw a file at a step into a PNG."""
+    """Draw a file at a step into a PNG.
+
+    Raises:
+        ViewerError: the viewer cannot be started, or draws nothing.
+    """
     with tempfile.TemporaryDirectory() as folder:
         drawn = Path(folder) / "screenshot.png"
         with headless(path, step, size) as client:

@@ -176,7 +176,11 @@ _ALIASES: Final = {
 
 
 def field_of(name: str) -> Column:
-    """Return the column of a name that a filter can use."""
+    """Return the column of a name that a filter can use.
+
+    Raises:
+        RunnerError: there is none.
+    """
     column = FIELDS.get(_ALIASES.get(name, name))
     if column is None:
         hint = nearest(name, [*FIELDS, *_ALIASES])
@@ -188,7 +192,11 @@ def field_of(name: str) -> Column:
 
 
 def columns_of(text: str) -> list[str]:
-    """Return the columns in a list of names, separated by commas."""
+    """Return the columns in a list of names, separated by commas.
+
+    Raises:
+        RunnerError: there is no such column.
+    """
     names = [name.strip() for name in text.split(",") if name.strip()]
     if not names:
         raise RunnerError("columns: found nothing, expected names such as id,name,success_percent.")
@@ -210,7 +218,8 @@ def with_same_as(
 ) -> Iterator[IndexRow]:
     """Yield rows with `same_as`: the id of another run that recorded the same content first, or None.
 
-    `originals`: as `Index.originals` returns them.
+    Args:
+        originals: as `Index.originals` returns them.
     """
     for row in rows:
         first = originals.get(row["digest"])

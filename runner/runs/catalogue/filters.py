@@ -72,7 +72,11 @@ ANY_RUN: Final = Filter(None)
 def parse(text: str, now: datetime | None = None) -> Filter:
     """Return the filter in a text; an empty one matches every run.
 
-    `now`: the time from which ages are counted; the present by default.
+    Args:
+        now: the time from which ages are counted; the present by default.
+
+    Raises:
+        RunnerError: it is no filter, or has an unknown field; the message shows the place.
     """
     if not text.strip():
         return ANY_RUN

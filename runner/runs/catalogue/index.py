@@ -57,7 +57,9 @@ class Index:
         """Yield the rows that match a filter, the newest first.
 
         `order`: expressions to sort by before the age.
-        `columns`: the stored columns that are needed; all by default.
+
+        Args:
+            columns: the stored columns that are needed; all by default.
         """
         self._check_settings(chosen)
         query = self._of(chosen, *_stored(columns)).order_by(*order, Row.created.desc(), Row.id, Row.root)
@@ -79,7 +81,8 @@ class Index:
     ) -> tuple[list[IndexRow], int]:
         """Return some of the rows that match a filter, and how many match.
 
-        `limit`: the maximum number of rows; None for all.
+        Args:
+            limit: the maximum number of rows; None for all.
         """
         if limit is None:
             every = self.select(chosen, *order, columns=columns)
@@ -99,7 +102,8 @@ class Index:
     ) -> list[IndexRow]:
         """Return the rows with the largest `size`, an expression, that match a filter.
 
-        `size`: what to sort by, descending.
+        Args:
+            size: what to sort by, descending.
         """
         self._check_settings(chosen)
         if limit is None:
@@ -148,7 +152,8 @@ class Index:
     def originals(self, digests: Sequence[str] | None = None) -> dict[str, tuple[str, str, str]]:
         """Return root, entry and id of the first run with each content that was recorded twice or more.
 
-        `digests`: the contents; all by default, or if they are very many.
+        Args:
+            digests: the contents; all by default, or if they are very many.
         """
         several = self._recorded_twice(digests)
         if not list(self._tuples(several.limit(1))):
@@ -236,7 +241,11 @@ class Index:
         return tuples_of(self._database, query)
 
     def _check_settings(self, chosen: Filter) -> None:
-        """Refuse a filter with a path that no configuration has."""
+        """Refuse a filter with a path that no configuration has.
+
+        Raises:
+            RunnerError: it has one; the message suggests a similar path.
+        """
         for path in sorted(chosen.settings):
             kind = fn.json_type(Row.settings, setting_path(path))
             some = self._of(ANY_RUN, Row.entry).limit(1)
@@ -257,8 +266,9 @@ def look(
 ) -> Result:
     """Return the result of some work on the index of these folders, which is brought up to date before.
 
-    `work`: called once, or once more if the index turns out to be damaged.
-    `cached`: use the index as it is, without checking the folders.
+    Args:
+        work: called once, or once more if the index turns out to be damaged.
+        cached: use the index as it is, without checking the folders.
     """
     paths = (os.path.abspath(root) for root in roots)  # noqa: PTH100 - links stay as they are
     places = list(dict.fromkeys(paths))

@@ -73,7 +73,8 @@ class Removal:
 def plan(run: Run, root: Path, foreign: bool = False) -> Removal:
     """Return the removal of a run.
 
-    `foreign`: also remove foreign files in its folder.
+    Args:
+        foreign: also remove foreign files in its folder.
     """
     row = row_of(run, None) | {"root": root, "entry": run.folder.name}
     return _removal(row, run.folder, _why_not_in(run, root) or _protected(run), foreign)

@@ -116,7 +116,8 @@ Row._meta.add_field("settings", TextField(null=True))  # the configuration: a JS
 def row_of(run: Run, size: int | None) -> dict[str, object]:
     """Return the row of a run, by column, without place and fingerprint.
 
-    `size`: bytes of its recording; None if there is none.
+    Args:
+        size: bytes of its recording; None if there is none.
     """
     config, summary = run.file.config, run.summary
     last, recent = summary.last_evaluation or EvaluationMetrics(), summary.recent_training

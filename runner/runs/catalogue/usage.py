@@ -91,7 +91,8 @@ def belongs(name: str) -> bool:
 def cached(part: str) -> Counter[str]:
     """Return the bytes cached for each run, by its id; what is for several counts for the first.
 
-    `part`: the folder in the cache: `EXPORTS`, `TABLES` or `RESTORED`.
+    Args:
+        part: the folder in the cache: `EXPORTS`, `TABLES` or `RESTORED`.
     """
     found: Counter[str] = Counter()
     with contextlib.suppress(OSError), os.scandir(cache_folder() / part) as entries:
@@ -167,7 +168,8 @@ class Sums:
     def freeable(self, recordings: Sequence[Path]) -> dict[str, int]:
         """Return the bytes that could be freed, by reason.
 
-        `recordings`: the folders searched for runs whose removal was interrupted.
+        Args:
+            recordings: the folders searched for runs whose removal was interrupted.
         """
         interrupted = [contents_of(stray) for root in recordings for stray in strays(root)]
         return {
@@ -200,7 +202,8 @@ def usage_of(
     SQLite adds up and sorts what the index has. Folders that are new or changed are measured here, after the
     index was read: that may take long, and must not keep others from writing to it.
 
-    `read`: calls some work with the index and returns its result, as `look` does.
+    Args:
+        read: calls some work with the index and returns its result, as `look` does.
     """
     exports, restored = cached(EXPORTS) + cached(TABLES), cached(RESTORED)
     contents_in = lru_cache(lambda root: Store(Path(root)).sizes())

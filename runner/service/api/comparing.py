@@ -54,7 +54,11 @@ def explanation(pair: Part, metric: Part, settings: SettingsOf) -> dict[str, obj
 
 
 def found_explanation(pair: str, metric: str, settings: Settings) -> Explanation:
-    """Return an explanation in the recordings folders."""
+    """Return an explanation in the recordings folders.
+
+    Raises:
+        RunNotFound: there is none.
+    """
     name = f"{pair}/{metric}"
     folder = next((folder for folder in settings.recordings if name in explanations_in(folder)), None)
     if folder is None:

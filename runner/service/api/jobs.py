@@ -94,7 +94,11 @@ _YAML: Final[dict[str, object]] = {
 
 
 async def text_of(request: Request) -> str:
-    """Return the text in the body of a request, whatever its media type."""
+    """Return the text in the body of a request, whatever its media type.
+
+    Raises:
+        Refused: it is not UTF-8.
+    """
     content = await request.body()
     try:
         return content.decode("utf-8-sig")

@@ -108,7 +108,11 @@ class PipeChannel:
 
 
 def wait_for_owners(runs: Iterable[Run], stop: Callable[[], bool]) -> None:
-    """Wait until no process owns one of these runs: the workers of a server that was killed are stopping."""
+    """Wait until no process owns one of these runs: the workers of a server that was killed are stopping.
+
+    Raises:
+        RunnerError: one is still owned after a minute.
+    """
     deadline = time.monotonic() + OTHER_OWNER_SECONDS
     for run in runs:
         while run.status == "running" and not stop():

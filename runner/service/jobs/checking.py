@@ -62,6 +62,9 @@ def check(text: str, source: str, recordings: Path) -> CheckedJob:
     """Return the meaning of the text of a YAML file, a configuration or a sweep.
 
     `source` is the file's name, for messages and as the default name of the job.
+
+    Raises:
+        ConfigError: it cannot be used; a line for each problem, with line, column and key.
     """
     document = read_yaml(text, source)
     is_sweep = isinstance(document.value, Mapping) and not document.value.keys().isdisjoint(SWEEP_KEYS)
@@ -136,7 +139,11 @@ class JobChecker:
         self.close = self._pool.close
 
     async def check(self, text: str, source: str = DEFAULT_SOURCE) -> CheckedJob:
-        """Return the meaning of a text, without blocking a thread of the server; see the function `check`."""
+        """Return the meaning of a text, without blocking a thread of the server; see the function `check`.
+
+        Raises:
+            ConfigError: as for `check`, or it is too large, or its check took too much time or memory.
+        """
         if len(text) > MAX_BYTES or len(text.encode()) > MAX_BYTES:
             raise ConfigError(f"{source}: larger than 1 MiB, expected a configuration of a few kilobytes")
         return await self.call(source, _check_as_config_errors, text, source, self._recordings)

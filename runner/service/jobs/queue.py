@@ -59,7 +59,11 @@ class JobQueue:
         self.store.close()
 
     def add(self, text: str, checked: CheckedJob) -> Job:
-        """Queue a text that was checked."""
+        """Queue a text that was checked.
+
+        Raises:
+            StorageError: the disk would not hold its recordings.
+        """
         free = free_bytes(self.recordings)
         if checked.bytes > free:
             raise StorageError(
@@ -74,7 +78,11 @@ class JobQueue:
             )
 
     def cancel(self, number: int) -> Job:
-        """Cancel a job; its worker closes its recording, which stays."""
+        """Cancel a job; its worker closes its recording, which stays.
+
+        Raises:
+            JobStateConflict: it is over.
+        """
         with self.store.lock:
             job = self.store.job(number)
             if job.is_over:
@@ -87,6 +95,9 @@ class JobQueue:
         """Queue a failed or cancelled job again; it continues where it stopped.
 
         Runs that other code started are resumed only if the changes are accepted.
+
+        Raises:
+            JobStateConflict: it is finished, or not over yet.
         """
         with self.store.lock:
             job = self.store.job(number)

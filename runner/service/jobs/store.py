@@ -174,7 +174,11 @@ class JobStore:
             return list(self._jobs.values())
 
     def job(self, number: int) -> Job:
-        """Return a job."""
+        """Return a job.
+
+        Raises:
+            JobNotFound: there is none.
+        """
         with self.lock:
             if number not in self._jobs:
                 raise JobNotFound(f"no job {number}; `dualtaxi remote jobs` and the page /queue list them.")
@@ -187,6 +191,9 @@ class JobStore:
 
         The text is `submitted`, `values` what it means, every value present; jobs of the numbers in `keep`
         are not forgotten although they are over: a worker is still closing them.
+
+        Raises:
+            QueueFull: there are too many unfinished jobs.
         """
         with self.lock:
             unfinished = sum(not job.is_over for job in self._jobs.values())

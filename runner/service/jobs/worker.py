@@ -133,7 +133,11 @@ class Reporter:
 
 
 def run_seed_on_ray(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed: int) -> str:
-    """Run a seed in a Ray actor, and forward its messages; return the run's status."""
+    """Run a seed in a Ray actor, and forward its messages; return the run's status.
+
+    Raises:
+        RunnerError: the cluster cannot be reached, the run fails, or the actor dies.
+    """
     ray = connect(spec.ray)
     try:
         actor = start_actor(ray)

@@ -274,7 +274,11 @@ async def replay(
 
 
 async def _chosen(catalogue: CatalogueOf, names: list[str] | None) -> list[Run]:
-    """Return the runs to compare."""
+    """Return the runs to compare.
+
+    Raises:
+        RunnerError: there are fewer than two of them, or too many.
+    """
     names = list(dict.fromkeys(names or []))
     if not 2 <= len(names) <= MAX_RUNS:
         raise RunnerError(

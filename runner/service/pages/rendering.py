@@ -100,7 +100,11 @@ def _age(moment: datetime | str) -> str:
 
 
 async def form_of(request: Request) -> dict[str, str]:
-    """Return the fields of a form as text, with the line ends of files."""
+    """Return the fields of a form as text, with the line ends of files.
+
+    Raises:
+        RunnerError: the body is not a form.
+    """
     body = await request.body()
     try:
         pairs = parse_qsl(

@@ -306,7 +306,11 @@ def _facts(episode: JsonView, i: int) -> list[tuple[str, str]]:
 
 
 def _whole(text: str) -> int:
-    """Return a whole number from a form; 0 for an empty field."""
+    """Return a whole number from a form; 0 for an empty field.
+
+    Raises:
+        RunnerError: the field contains something else.
+    """
     if text and not (text.isdecimal() and len(text) < 16):
         raise RunnerError(f"found {text[:40]!r}, expected a number of an episode or a trial, from 0.")
     return int(text or 0)

@@ -155,7 +155,11 @@ class _SweepState:
 
 
 def _state_of(name: str, folders: tuple[Path, ...], catalogue: Catalogue) -> _SweepState:
-    """Return the present state of a sweep."""
+    """Return the present state of a sweep.
+
+    Raises:
+        RunNotFound: there is no sweep of this name.
+    """
     folder = next((folder for folder in folders if name in sweeps_in(folder)), None)
     if folder is None:
         raise RunNotFound(f"no sweep {name!r}: the page of sweeps lists those there are.")
