@@ -41,8 +41,8 @@ _DATA_LENGTH: Final = struct.Struct("<Q")
 _MAX_NAME_BYTES: Final = 4
 """The length of the longest name of a compression, `zstd`."""
 
-Packed = Callable[[str, int, int], bytes | memoryview | None]
-"""Returns records packed, by compression, size and checksum, if they were packed before."""
+Packed = Callable[[str, bytes | memoryview], bytes | memoryview | None]
+"""Returns records packed with a compression, if they were packed before."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def encode_chunk(
     name = "" if packing.compression == "none" else packing.compression
     width = len(records) // len(log_times) if topic.message is TRANSITION else 0
     start, end, size, crc = int(log_times[0]), int(log_times[-1]), len(records), zlib.crc32(records)
-    data = (packed and packed(name, size, crc)) or _compress(records, packing, width)
+    data = (packed and packed(name, records)) or _compress(records, packing, width)
     if topic.message is ACTIONS and len(data) * _MOSTLY_ZEROS < len(records):  # quick at any level
         data = _compress(records, replace(packing, level=MAX_LEVEL), width)
     head = CHUNK_HEAD.pack(start, end, size, crc, len(name)) + name.encode()

@@ -40,8 +40,6 @@ _OFFSET_ENTRY: Final = struct.Struct("<HQ")
 FOOTER_HEAD: Final = struct.Struct("<BQQQ")
 """The part of the footer that its checksum covers: opcode, length, starts of summary and summary offsets."""
 FOOTER_BODY_BYTES: Final = 20
-DATA_END: Final = struct.Struct("<BQI")
-"""The record before the summary: opcode, length, and the checksum of all before it."""
 _TAIL_BYTES: Final = RECORD_HEAD.size + FOOTER_BODY_BYTES + len(MCAP0_MAGIC)
 
 

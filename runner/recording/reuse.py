@@ -7,17 +7,15 @@ was packed before, the packed data are taken over instead of packing them again.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Self
 
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.chunks import chunk_head, decompress
 from runner.recording.index import ChunkEntry
 from runner.recording.reader import Recording
 from runner.recording.schema import Topic
 from runner.recording.topic_chunks import ChunkSpan
-
-_LARGE_SHARE: Final = 0.2
-"""The share of all steps from which on one checksum of the whole file is quicker than those of its chunks."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +26,6 @@ class PackedChunks:
     """The recording; stays open while they are in use."""
     until: int
     """Log time in nanoseconds from which on messages may differ: later chunks are not used."""
-    is_unaltered: bool
-    """Whether the file matches its checksum; if not, each chunk is unpacked to compare its own."""
 
     @classmethod
     def before(cls, recording: Recording, step: int) -> Self | None:
@@ -42,21 +38,28 @@ class PackedChunks:
             for topic in schema.BLOCK_TOPICS:
                 recording.chunk_holding(topic, 0)
             after = [block["log_time"][0] for block in recording.blocks(schema.TRAIN_STEP, step, step + 1)]
-            is_unaltered = step >= steps * _LARGE_SHARE and recording.has_its_checksum()
         except (RecordingError, OSError):
             return None
-        return cls(recording, int(after[0]) if after else 2**64, is_unaltered) if steps else None
+        return cls(recording, int(after[0]) if after else 2**64) if steps else None
 
     def span(self, topic: Topic, number: int) -> ChunkSpan | None:
         """Return the chunk that holds a message of a fixed-width topic; None if there is none to use."""
         found = self.recording.chunk_holding(topic, number)
         return None if found is None or found.entry.end_time >= self.until else found
 
-    def data(self, entry: ChunkEntry, compression: str, size: int, crc: int) -> memoryview | None:
-        """Return the packed data of an undamaged chunk, if its records have this size and checksum."""
+    def data(self, entry: ChunkEntry, compression: str, records: bytes | memoryview) -> memoryview | None:
+        """Return the packed data of a chunk if they are packed so, and unpack to these records.
+
+        They are unpacked, whatever checksums the file has: its maker may have written any.
+        """
+        where = f"{self.recording.path}: chunk at {entry.offset}"
         try:
-            head, data = self.recording.packed_chunk(entry, unpacked=not self.is_unaltered)
+            body = self.recording.chunk_body(entry)
+            head = chunk_head(body, len(body), where)
+            if (head.compression, head.uncompressed_size) != (compression, len(records)):
+                return None
+            data = body[head.data_at :]
+            unpacked = decompress(data, compression, len(records), where)
         except RecordingError:
             return None
-        found = (head.compression, head.uncompressed_size, head.crc)
-        return data if found == (compression, size, crc) else None
+        return data if unpacked == bytes(records) else None

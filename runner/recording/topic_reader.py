@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.blocks import record_dtype
-from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkHead, chunk_head, unpack_chunk
+from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.description import RunDescription
-from runner.recording.index import DATA_END, ChunkEntry, checksum, read_index
+from runner.recording.index import ChunkEntry, read_index
 from runner.recording.messages import Message, decode
 from runner.recording.metadata import check_file, sizes_of
 from runner.recording.record_store import RecordStore
@@ -156,27 +156,13 @@ class TopicReader(RunDescription):
         """Return the chunk that holds a message of a fixed-width topic; None if there is none."""
         return self._chunks(topic).holding(number)
 
-    def packed_chunk(self, entry: ChunkEntry, unpacked: bool) -> tuple[ChunkHead, memoryview]:
-        """Return the head of a chunk, and its packed data; safe to call from several threads.
-
-        Args:
-            entry: which chunk.
-            unpacked: whether to unpack it, and compare its checksum.
+    def chunk_body(self, entry: ChunkEntry) -> memoryview:
+        """Return the body of a chunk's record, still packed; safe to call from several threads.
 
         Raises:
-            RecordingError: there is no such chunk, or it is damaged.
+            RecordingError: there is no such chunk.
         """
-        body = self._store.record(Opcode.CHUNK, entry.offset, entry.length)
-        where = f"{self.path}: chunk at {entry.offset}"
-        head = unpack_chunk(body, where)[0] if unpacked else chunk_head(body, len(body), where)
-        return head, body[head.data_at :]
-
-    def has_its_checksum(self) -> bool:
-        """Return whether the recording is finished, and its data have the checksum that was written then."""
-        end = self._index.end - DATA_END.size
-        self._stream.seek(max(end, 0))
-        written = self._stream.read(DATA_END.size)
-        return self.finished and written == DATA_END.pack(Opcode.DATA_END, 4, checksum(self._stream, 0, end))
+        return self._store.record(Opcode.CHUNK, entry.offset, entry.length)
 
     def messages(self, topic: Topic, first_chunk: int = 0) -> Iterator[tuple[int, bytes]]:
         """Yield (log time in nanoseconds, payload) of a topic's messages, in order."""

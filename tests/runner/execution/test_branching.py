@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from runner.execution.session import run_job
 from runner.execution.verify import verify
 from runner.learning.learner import Learner
 from runner.recording import schema
+from runner.recording.blocks import RECORD_HEAD
 from runner.recording.chunks import CHUNK_HEAD, encode_chunk
 from runner.recording.reader import open_recording
 from runner.recording.records import attachment_of, metadata_of, read_chunk, walk
@@ -298,10 +300,11 @@ def long_parent(folder):
     return make_run(folder, TAXIS, SAMPLED, recording={"chunk_steps": 256})
 
 
-def repacked(run, folder, compression="zstd", level=19, damaged=None, altered=None):
+def repacked(run, folder, compression="zstd", level=19, damaged=None, altered=None, forged=None):
     """Return a copy of a run with chunks that its recorder would not have written.
 
-    The chunk of steps number `damaged` cannot be unpacked, and that number `altered` has another last byte.
+    The chunk of steps number `damaged` cannot be unpacked, and that number `altered` has another last byte;
+    so has that number `forged`, with the checksum that it had before.
     """
     copy = runner.Run(Path(shutil.copytree(run.folder, folder / run.run_id)), run.facts)
     copy.recording.unlink()
@@ -315,11 +318,14 @@ def repacked(run, folder, compression="zstd", level=19, damaged=None, altered=No
             elif opcode == Opcode.CHUNK:
                 chunk = read_chunk(body, offset)
                 records = bytearray(chunk.records)
-                records[-1] ^= altered is not None and offset == places[altered]
+                records[-1] ^= offset in (places[k] for k in (altered, forged) if k is not None)
                 topic, packing = TOPIC_OF[chunk.summary.channel], Packing(compression, level)
-                file.add_chunk(
-                    topic, encode_chunk(topic, bytes(records), chunk.times, chunk.offsets, packing)
-                )
+                fresh = encode_chunk(topic, bytes(records), chunk.times, chunk.offsets, packing)
+                if forged is not None and offset == places[forged]:
+                    own = bytearray(fresh.record)
+                    CHUNK_HEAD.pack_into(own, RECORD_HEAD.size, *CHUNK_HEAD.unpack_from(body))
+                    fresh = replace(fresh, record=bytes(own))
+                file.add_chunk(topic, fresh)
         file.finish()
     if damaged is not None:
         data = bytearray(copy.recording.read_bytes())
@@ -346,7 +352,7 @@ def shared_chunks(a, b):
     return len(ours & theirs)
 
 
-@pytest.mark.parametrize("share", [0.1, 0.9], ids=["each chunk is unpacked", "the file is compared"])
+@pytest.mark.parametrize("share", [0.1, 0.9])
 def test_chunks_before_the_branch_are_not_packed_again(long_parent, tmp_path, share):
     step, copy = middle_of(long_parent, share), repacked(long_parent, tmp_path / "copy")
     assert shared_chunks(copy, long_parent) == 0
@@ -367,10 +373,17 @@ def test_chunks_before_the_branch_are_not_packed_again(long_parent, tmp_path, sh
     [
         ([], {"damaged": 1}),
         ([], {"altered": 1}),
+        ([], {"forged": 1}),
         ([], {"compression": "lz4"}),
         (["recording.level=9"], {}),
     ],
-    ids=["damaged", "other steps than the job's", "not packed as configured", "to be packed otherwise"],
+    ids=[
+        "damaged",
+        "other steps than the job's",
+        "with their checksum too",
+        "not packed as configured",
+        "to be packed otherwise",
+    ],
 )
 def test_a_chunk_that_cannot_be_used_is_packed_again(long_parent, tmp_path, share, changes, options):
     copy = repacked(long_parent, tmp_path / "copy", **options)
@@ -381,7 +394,7 @@ def test_a_chunk_that_cannot_be_used_is_packed_again(long_parent, tmp_path, shar
     assert (checked := verify(branch.recording)).sound, checked.finding
     used = {body for _, body, _ in packed_steps(branch)}
     assert [body in used for _, body, _ in packed_steps(copy)[:3]] == [
-        bool(options.keys() & {"damaged", "altered"}) and k != 1 for k in range(3)
+        bool(options.keys() & {"damaged", "altered", "forged"}) and k != 1 for k in range(3)
     ]
 
 
