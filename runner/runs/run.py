@@ -270,12 +270,16 @@ def new_run(
     check_folder_name(recordings)
     with storage_errors(recordings, f"choose another folder by --recordings or {RECORDINGS_VARIABLE}"):
         run_id = run_id or (next(ids) if ids else _random_id())
+        is_made = False
         while True:
             try:
                 (folder := recordings / run_id).mkdir()
                 break
             except FileNotFoundError:
+                if is_made:  # the id is the path of a folder inside of another
+                    raise
                 recordings.mkdir(parents=True, exist_ok=True)
+                is_made = True
             except FileExistsError:
                 run_id = next(ids) if ids else _random_id()
         facts = {

@@ -50,6 +50,11 @@ def test_ids_are_never_used_twice(folder, monkeypatch):
     assert [create_run(folder, CONFIG, 0).run_id for _ in range(2)] == ["aaaaaaaa", "baaaaaaa"]
 
 
+def test_an_id_that_is_a_path_is_refused(folder):
+    with pytest.raises(StorageError, match="cannot be written"):
+        create_run(folder, CONFIG, 0, run_id="no/folder")
+
+
 def test_a_folder_that_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="cannot be written"):
