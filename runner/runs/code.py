@@ -142,9 +142,13 @@ class CodeCollector:
 
     def made_by(self, run: Run) -> dict[str, str]:
         """Return the provenance in `run.json`, with the commit if it is known."""
-        return dict(run.facts.get("provenance", {})) | {
-            key: self.entries[key] for key in ("git",) if key in self.entries
-        }
+        found = run.facts.get("provenance")  # of a resumed run, whose file may hold anything
+        own = (
+            {key: text for key, text in found.items() if isinstance(text, str)}
+            if isinstance(found, dict)
+            else {}
+        )
+        return own | {key: self.entries[key] for key in ("git",) if key in self.entries}
 
     def write(self, file: RecordingFile, wait: bool = False) -> None:
         """Write the code into a recording, once, if it is known; nothing else may write into it meanwhile.

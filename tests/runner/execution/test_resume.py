@@ -190,6 +190,16 @@ def test_description_damaged(whole, tmp_path):
     assert_same(resume(run), whole)
 
 
+@pytest.mark.parametrize("provenance", [None, ["host"], "host", {"host": "here", "git": 3}])
+def test_a_damaged_provenance_in_the_run_file_costs_no_run(whole, tmp_path, provenance):
+    run = copy_of(whole, tmp_path, provenance=provenance)
+    cut(run, whole.recording.stat().st_size // 2)
+    done = resume(run)
+    assert_same(done, whole)
+    assert done.file.problems == ()
+    assert done.file.provenance.get("host") == ("here" if isinstance(provenance, dict) else None)
+
+
 @pytest.mark.parametrize("more", [bytes(5000), b"\x06" + b"\xff" * 40, b"hello"])
 def test_bytes_after_the_end(whole, tmp_path, more):
     run = copy_of(whole, tmp_path, summary={})
