@@ -152,9 +152,10 @@ def _settings(with_command: bool) -> dict[str, str]:
     """Return what may change during a process: environment variables, flags, states of random generators."""
     names = _used_names(tuple(os.environ))
     present = frozenset((name, os.environ[name]) for name in names if name in os.environ)
-    variables, command = _redacted(present, tuple(sys.argv))
+    has_command = with_command and is_code_wanted()
+    variables, command = _redacted(present, tuple(sys.argv) if has_command else ())
     facts = {"host": socket.gethostname(), "directory": _directory(), "user": _user()}
-    if with_command and is_code_wanted():
+    if has_command:
         facts["command"] = command
     if hasattr(os, "sched_getaffinity"):
         facts["processors.usable"] = str(len(os.sched_getaffinity(0)))

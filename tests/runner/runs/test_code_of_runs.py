@@ -200,6 +200,13 @@ def test_show_code_restores_it(project, tmp_path):
     assert "Packages" not in dualtaxi(project, "show", run)
 
 
+def test_a_command_that_is_not_wanted_is_not_read(project, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [Path("train.py"), 3])  # as some programs set it
+    run = job_in(project, recording={"code": False})
+    with open_recording(run.recording) as recording:
+        assert "command" not in recording.provenance
+
+
 def test_show_code_of_a_run_without_it(project, monkeypatch):
     monkeypatch.setenv("DUALTAXI_CODE", "off")
     run = loop_in(project, 10)
