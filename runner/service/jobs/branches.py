@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from pydantic import BaseModel, Field
 
 from runner.archive.places import at_hand
@@ -13,7 +15,6 @@ from runner.execution.session import Report, Stop
 from runner.recording.reader import open_recording
 from runner.runs.resolve import run_of_id
 from runner.runs.run import Run
-from runner.service.jobs.channel import JobSpec
 from runner.service.jobs.checking import CheckedJob
 
 
@@ -39,11 +40,16 @@ def check_branch(run: Run, question: BranchQuestion) -> CheckedJob:
     return CheckedJob("branch", branch_name(run, question.name), 1, size, job.config.to_mapping())
 
 
-def run_branch(spec: JobSpec, job: Job, run: Run, report: Report, stop: Stop) -> Run:
-    """Train a branch; its parent must still be there."""
+def parent_of(job: Job, recordings: Path) -> Run:
+    """Return the run that a branch changes, which must still be there."""
     number = job.config.branches[-1].run
-    parent = run_of_id(number, spec.recordings)
+    parent = run_of_id(number, recordings)
     if parent is None:
         raise RunnerError(f"run {number}, the parent of this branch, is no longer there.")
-    with open_recording(at_hand(parent).recording) as recording:
+    return at_hand(parent)
+
+
+def run_branch(parent: Run, job: Job, run: Run, report: Report, stop: Stop) -> Run:
+    """Train a branch."""
+    with open_recording(parent.recording) as recording:
         return train_branch(recording, job, run, report, stop)

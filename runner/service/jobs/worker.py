@@ -19,7 +19,7 @@ from runner.execution.session import Progress, evaluation_brief, run_job
 from runner.learning.numba_cache import MESSAGE, announced
 from runner.runs.listing import run_at
 from runner.runs.run import Run, create_run
-from runner.service.jobs.branches import run_branch
+from runner.service.jobs.branches import parent_of, run_branch
 from runner.service.jobs.channel import (
     REPORT_SECONDS,
     JobChannel,
@@ -75,12 +75,14 @@ def run_seed(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed:
         reporter = Reporter(channel, run.run_id, config, seed)
         run = resume(run, spec.accept_changes, reporter.report, channel.stop)
     else:
+        job = Job(config, seed)
+        parent = parent_of(job, spec.recordings) if spec.kind == "branch" else None
         run = create_run(spec.recordings, config, seed, spec.name, spec.run_ids[seed])
-        reporter, job = Reporter(channel, run.run_id, config, seed), Job(config, seed)
-        if spec.kind == "branch":
-            run = run_branch(spec, job, run, reporter.report, channel.stop)
-        else:
+        reporter = Reporter(channel, run.run_id, config, seed)
+        if parent is None:
             run = run_job(job, run, reporter.report, channel.stop)
+        else:
+            run = run_branch(parent, job, run, reporter.report, channel.stop)
     reporter.end()
     return run.status
 

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import re
+import shutil
 import time
 
 import pytest
 
 import runner
+from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
 from runner.runs.run import Run
+from runner.service.jobs.branches import BranchQuestion, check_branch
+from runner.service.jobs.store import JobStore
+from runner.service.settings import Settings
 
 BRANCH = "/api/v1/runs/first/branch"
 
@@ -92,3 +97,19 @@ def test_the_replay_leads_to_the_form_which_queues_the_branch(client):
 
 def test_a_trial_offers_no_branch_of_training(client):
     assert "data-to-branch" not in client.get("/runs/first/replay/eval/10/0").text
+
+
+def test_a_branch_whose_parent_was_removed_fails_and_leaves_no_run(connect, recordings, tmp_path):
+    with JobStore(recordings) as store:
+        parent = find_run("first", recordings)
+        checked = check_branch(parent, BranchQuestion(at="20:1", overrides=("epsilon=0.5",)))
+        job = store.add("branch", "orphan", 1, "", checked.values)
+    before = {run.run_id for run in list_runs(recordings)} - {parent.run_id}
+    shutil.rmtree(parent.folder)
+    client = connect(Settings(recordings=(recordings,), tokens=tmp_path / "tokens.json"))
+    for _ in range(2):
+        ended = finished(client, job.number)
+        assert (ended["state"], ended["begun"]) == ("failed", [])
+        assert f"{parent.run_id}, the parent of this branch, is no longer there" in ended["error"]
+        assert {run.run_id for run in list_runs(recordings)} == before
+        client.post(f"/api/v1/jobs/{job.number}/resume")
