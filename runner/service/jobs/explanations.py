@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Final
 
 from pydantic import BaseModel, Field
 
@@ -11,6 +12,7 @@ from runner.client.jobs import LogEvent, SweepProgress
 from runner.config.sections import RunTable
 from runner.debugging.explain import (
     DEFAULT_SEEDS,
+    EPISODES,
     RUNS,
     ExplanationBusy,
     Question,
@@ -21,10 +23,17 @@ from runner.debugging.explain import (
 from runner.debugging.explanation import summary
 from runner.debugging.mixtures import Measured, Measurement
 from runner.errors import ConfigError
-from runner.service.jobs.channel import OTHER_OWNER_SECONDS, REPORT_SECONDS, JobSpec, Outcome, PipeChannel
+from runner.service.jobs.channel import REPORT_SECONDS, JobSpec, Outcome, PipeChannel
 from runner.service.jobs.checking import MAX_RUNS, CheckedJob, is_path
 from runner.service.jobs.sweeps import slotted_workers
 from runner.sweep.local import Workers
+
+BUSY: Final = "busy"
+LINES: Final = {
+    BUSY: "another job or command is explaining the same two; waiting for it",
+    EPISODES: "two short runs are recorded to find the first step that differs",
+}
+"""Lines of the log, each at the first report of a stage."""
 
 
 class ExplainQuestion(BaseModel, extra="forbid", frozen=True):
@@ -61,14 +70,14 @@ def check_explanation(given: ExplainQuestion, recordings: Path) -> CheckedJob:
 def run_explain_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
     """Train what is left of an explanation, and store it."""
     question = _question(ExplainQuestion.model_validate(spec.values), spec.recordings)
-    deadline, stages = time.monotonic() + OTHER_OWNER_SECONDS, set[str]()
+    stages = set[str]()
 
     def report(done: int, total: int, what: str) -> None:
         if what == RUNS:
             channel.send(SweepProgress(done, total, 0, 0, 0, 0, None))
         elif what not in stages:
             stages.add(what)
-            channel.send((LogEvent("two short runs are recorded to find the first step that differs"),))
+            channel.send((LogEvent(LINES[what]),))
 
     workers: Workers[Measurement, Measured]
     try:
@@ -77,9 +86,10 @@ def run_explain_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
                 try:
                     found = answer(question, workers, report, stop=channel.stop)
                     break
-                except ExplanationBusy:  # perhaps by the worker of a server that was killed
-                    if time.monotonic() > deadline or channel.stop():
-                        raise
+                except ExplanationBusy:  # another job or command asks for another metric, or more seeds
+                    report(0, 0, BUSY)
+                    if channel.stop():
+                        return Outcome("interrupted")
                     time.sleep(REPORT_SECONDS)
     except KeyboardInterrupt:
         return Outcome("interrupted")

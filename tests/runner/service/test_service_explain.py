@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 
 import pytest
+from loop_replays import serving
 from test_service_branch import finished
 
 import runner
+from runner.debugging.explain import ask
+from runner.debugging.explanation_files import FOLDER, LOCK
+from runner.errors import RunnerError
+from runner.runs.locking import acquired
 from runner.runs.resolve import find_run
+from tests.waiting import until
 
 EXPLAIN = "/api/v1/explanations"
 
@@ -75,3 +82,20 @@ def test_a_comparison_leads_to_the_form_and_a_cancelled_explanation_stops(client
     number = queued.headers["location"].rpartition("/")[2]
     assert client.post(f"/api/v1/jobs/{number}/cancel").status_code == 200
     assert finished(client, number)["state"] == "cancelled"
+
+
+def test_a_job_waits_for_another_explanation_of_the_same_two_and_survives_a_restart(recordings, changed):
+    sent = {"a": "first", "b": changed, "metric": "mean_length", "at": 30, "seeds": 2}
+    name = ask(**sent, recordings=recordings).name
+    with contextlib.ExitStack() as stack:
+        lock = acquired(recordings / FOLDER / name / LOCK, RunnerError("busy"))
+        stack.callback(lock.release)
+        with serving(recordings) as client:
+            own = {"Origin": str(client.base_url)}
+            number = client.post(EXPLAIN, json=sent, headers=own).json()["number"]
+            until(lambda shown: "waiting for it" in shown, lambda: client.get(f"/queue/{number}").text)
+            assert client.get(f"/api/v1/jobs/{number}").json()["state"] == "running"
+        stack.close()
+        with serving(recordings) as client:
+            job = finished(client, number)
+    assert (job["state"], job["error"]) == ("finished", "")
