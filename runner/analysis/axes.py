@@ -7,8 +7,9 @@ such moments are on an axis. Pages, plots, reports, comparisons and exports read
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,8 @@ from runner.recording.reader import Recording
 from runner.recording.schema import SCALAR_TOPIC, STEP_NANOSECONDS, TRAIN_EPISODE
 
 Values = NDArray[np.float64]
+Place = TypeVar("Place", int, float)
+"""A position on an axis."""
 
 UPDATE_NAMES: Final = ("updates", "n_updates")
 """Names, or last parts of names such as `train/n_updates`, under which a loop logs its number of updates."""
@@ -189,3 +192,19 @@ def _updates(recording: Recording) -> tuple[Values, Values]:
             'rec.log("updates", COUNT) records it.'
         )
     return np.array(steps, np.float64), np.array(values, np.float64)
+
+
+def first_crossing(points: Mapping[Place, float], level: float) -> Place | None:
+    """Return the first position at which a curve is at a level, or on the other side than where it began."""
+    below = points[min(points)] < level
+    for place in sorted(points):
+        if points[place] >= level if below else points[place] <= level:
+            return place
+    return None
+
+
+def mean_height(places: Sequence[float], values: Sequence[float]) -> float:
+    """Return the area under a curve, by the trapezoid rule, over its span; nan for fewer than two points."""
+    if len(places) < 2:
+        return math.nan
+    return float(np.trapezoid(values, places)) / (places[-1] - places[0])

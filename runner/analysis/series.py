@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,9 +38,6 @@ LOGGED: Final = "training.logged."
 _MAX_TITLE: Final = 40
 _MAX_POINTS: Final = 200
 _MAX_NAMES: Final = 64
-
-Place = TypeVar("Place", int, float)
-"""A position on an axis."""
 
 
 @dataclass(frozen=True)
@@ -142,22 +138,6 @@ def points_of(run: RunSeries, metric: str, line: str, aligned: bool) -> dict[flo
         if metric in readings and (not at_evaluations or place in at_evaluations)
     }
     return {place: value for place, value in points.items() if not np.isnan(value)}
-
-
-def first_crossing(points: Mapping[Place, float], level: float) -> Place | None:
-    """Return the first position at which a curve is at a level, or on the other side than where it began."""
-    below = points[min(points)] < level
-    for place in sorted(points):
-        if points[place] >= level if below else points[place] <= level:
-            return place
-    return None
-
-
-def mean_height(places: Sequence[float], values: Sequence[float]) -> float:
-    """Return the area under a curve, by the trapezoid rule, over its span; nan for fewer than two points."""
-    if len(places) < 2:
-        return math.nan
-    return float(np.trapezoid(values, places)) / (places[-1] - places[0])
 
 
 def parse_target(text: str) -> tuple[str, float]:

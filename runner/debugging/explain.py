@@ -10,7 +10,6 @@ A mixture has some settings of the one and the others of the other.
 from __future__ import annotations
 
 import json
-import math
 import os
 import re
 import time
@@ -19,26 +18,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 from blake3 import blake3
-from numpy.typing import NDArray
 
-from runner.analysis.compare.statistics import Estimate, bootstrap_means
 from runner.config import ExperimentConfig, from_mapping, load
 from runner.config.shipped import shipped
 from runner.debugging.explanation import (
-    ENOUGH,
     Explanation,
-    Interaction,
-    Mixture,
-    Setting,
     Side,
 )
 from runner.debugging.explanation_files import FOLDER, LOCK, write_explanation
 from runner.debugging.factors import MAX_ALL, Mixing, mix
 from runner.debugging.first_step import first_step
+from runner.debugging.game import Game, Plan, interactions_of, mixture_bounds, settings_of
 from runner.debugging.mixtures import Measured, Measurement, Mixtures, Readings, measure
-from runner.debugging.shapley import minimal_set, shapley_interactions, shapley_values
 from runner.errors import RunnerError, RunNotFound, nearest
 from runner.execution.initial_tables import resolve_initial_q
 from runner.runs.locking import acquired
@@ -50,45 +42,12 @@ from runner.sweep.local import Workers
 Source = str | os.PathLike[str] | Mapping[str, Any] | ExperimentConfig | Run
 DEFAULT_SEEDS: Final = 20
 MAX_SEEDS: Final = 10_000
-_START_SECONDS: Final = 10.0
-"""About the time to start workers, load kernels in them, and record the two short runs of the first step."""
 _PROBES: Final = 2
 """Seeds of A and of B that are trained first, to see how long a run takes; the first one loads kernels."""
 
 
 class ExplanationBusy(RunnerError):
     """Another process computes the explanation."""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What an explanation will train."""
-
-    settings: int
-    mixtures: int
-    """The mixtures that will be run, at least."""
-    most_mixtures: int
-    """The same, at most; delta debugging depends on what it finds."""
-    seeds: int
-    known: int
-    """Runs that were trained before; delta debugging need not use all of them."""
-    run_seconds: float
-    """The time that one run takes of a worker; 0 if all are known."""
-    workers: int
-
-    @property
-    def seconds(self) -> float:
-        """The estimated time of the whole, at least; 0 if all runs are known."""
-        return self._seconds(self.mixtures)
-
-    @property
-    def most_seconds(self) -> float:
-        """The same, at most."""
-        return self._seconds(self.most_mixtures)
-
-    def _seconds(self, mixtures: int) -> float:
-        left = mixtures * self.seeds - self.known
-        return _START_SECONDS + left * self.run_seconds / self.workers if left > 0 else 0.0
 
 
 Report = Callable[[int, int, str], None]
@@ -158,10 +117,7 @@ class Question:
     @property
     def mixtures(self) -> tuple[int, int]:
         """How many mixtures are run, at least and at most."""
-        count = len(self.mixing.factors)
-        if count <= MAX_ALL:
-            return 2**count, 2**count
-        return 2 + math.ceil(math.log2(count)), 2 + 3 * count + count**2 + 2**MAX_ALL
+        return mixture_bounds(len(self.mixing.factors))
 
 
 def ask(
@@ -211,10 +167,10 @@ def answer(
             check_metric(question)
         mixtures.measure(mixtures.ends, pool, _PROBES)
         sides = [mixtures.readings(side)[0] for side in mixtures.ends]
-        game = _Game(question, mixtures, pool, _metric_of(sides, question.metric))
+        game = Game(mixtures, pool, _metric_of(sides, question.metric))
         planned(game.plan())
         players = game.players()
-        settings = _settings(game, players)
+        settings = settings_of(game, players)
         step = None
         if settings[0].share is not None:
             strongest = next(i for i, each in enumerate(mixing.factors) if each.name == settings[0].name)
@@ -236,7 +192,7 @@ def answer(
             value_b=game.mean(mixing.everything),
             difference=game.difference,
             settings=settings,
-            interactions=_interactions(game, players),
+            interactions=interactions_of(game, players),
             smallest=game.smallest(players),
             mixtures=tuple(game.mixture(number) for number in game.ordered()),
             first_step=step,
@@ -314,121 +270,3 @@ def _metric_of(sides: Sequence[Readings], metric: str | None) -> str:
             f"{nearest(metric or '', shared)}"
         )
     return found
-
-
-class _Game:
-    """The values of mixtures, measured when they are needed: settings are players, mixtures coalitions."""
-
-    def __init__(
-        self,
-        question: Question,
-        mixtures: Mixtures,
-        pool: Workers[Measurement, Measured],
-        metric: str,
-    ) -> None:
-        self.question, self.mixing, self.metric = question, question.mixing, metric
-        self._mixtures, self._pool, self._seeds = mixtures, pool, len(question.seeds)
-        self._count = len(self.mixing.factors)
-
-    def plan(self) -> Plan:
-        """Return what will be trained."""
-        mixtures, pool, (least, most) = self._mixtures, self._pool, self.question.mixtures
-        known = mixtures.known(range(least)) if least == most else mixtures.in_file
-        return Plan(self._count, least, most, self._seeds, known, mixtures.seconds, max(1, pool.idle))
-
-    def players(self) -> list[int]:
-        """Return the numbers of the settings among which the difference is shared; measure their mixtures.
-
-        These are all of them, or those of a minimal set; none if there is no difference to look for, or if
-        too many are needed.
-        """
-        players = list(range(self._count))
-        if self._count > MAX_ALL:
-            self._mixtures.measure((0, self.mixing.everything), self._pool)
-            players = minimal_set(players, self._makes_enough) if self.difference.excludes_zero else []
-        if len(players) <= MAX_ALL:
-            self._mixtures.measure(_coalitions(players), self._pool)
-        return players
-
-    def _makes_enough(self, players: Sequence[int]) -> bool:
-        number = sum(1 << i for i in players)
-        self._mixtures.measure([number], self._pool)
-        return self._part(number) >= ENOUGH
-
-    def _part(self, number: int) -> float:
-        """Return the part of the difference that a mixture makes."""
-        low, own, high = self.values((0, number, self.mixing.everything)).mean(axis=1).tolist()
-        return float((own - low) / (high - low)) if high != low else math.nan
-
-    def values(self, numbers: Sequence[int]) -> NDArray[np.float64]:
-        """Return the values of mixtures that were measured, [mixtures, seeds]."""
-        return self._mixtures.values(numbers, self.metric)
-
-    def mean(self, number: int) -> Estimate:
-        """Return the mean of a mixture over the seeds."""
-        return bootstrap_means(self.values([number]))[0]
-
-    @property
-    def difference(self) -> Estimate:
-        """B less A."""
-        low, high = self.values((0, self.mixing.everything))
-        return bootstrap_means((high - low)[np.newaxis])[0]
-
-    def ordered(self) -> list[int]:
-        """Return the numbers of the mixtures that were measured, by the number of settings of B."""
-        return sorted(self._mixtures.complete(), key=lambda number: (number.bit_count(), number))
-
-    def mixture(self, number: int) -> Mixture:
-        """Return a mixture that was measured."""
-        names = tuple(factor.name for factor in self.mixing.chosen(number))
-        return Mixture(names, self.mean(number), tuple(self.values([number])[0].tolist()))
-
-    def smallest(self, players: Sequence[int]) -> Mixture | None:
-        """Return the fewest settings that make `ENOUGH` of the difference, of several the most of it."""
-        if not players or not self.difference.excludes_zero:
-            return None
-        if self._count > MAX_ALL:
-            return self.mixture(sum(1 << i for i in players))
-        enough = [number for number in self.ordered() if self._part(number) >= ENOUGH]
-        return self.mixture(min(enough, key=lambda number: (number.bit_count(), -self._part(number))))
-
-
-def _coalitions(players: Sequence[int]) -> list[int]:
-    """Return the mixtures of some settings: bit j of a position stands for the j-th of them."""
-    return [
-        sum(1 << i for j, i in enumerate(players) if position >> j & 1)
-        for position in range(2 ** len(players))
-    ]
-
-
-def _settings(game: _Game, players: Sequence[int]) -> tuple[Setting, ...]:
-    """Return the settings, those with a share first, the largest first."""
-    factors = game.mixing.factors
-    shares: dict[int, tuple[Estimate, Estimate, Estimate]] = {}
-    if players and len(players) <= MAX_ALL:
-        values = game.values(_coalitions(players))
-        bits = [1 << j for j in range(len(players))]
-        own = shapley_values(values)
-        alone, last = values[bits] - values[0], values[-1] - values[[len(values) - 1 - bit for bit in bits]]
-        rows = zip(*map(bootstrap_means, (own, alone, last)), strict=True)
-        shares = dict(zip(players, rows, strict=True))
-    order = sorted(shares, key=lambda i: -abs(shares[i][0].value))
-    order += [i for i in range(len(factors)) if i not in shares]
-    return tuple(
-        Setting(factors[i].name, factors[i].a, factors[i].b, *shares.get(i, (None, None, None)))
-        for i in order
-    )
-
-
-def _interactions(game: _Game, players: Sequence[int]) -> tuple[Interaction, ...]:
-    """Return the interactions of settings in pairs, the largest first."""
-    if not 2 <= len(players) <= MAX_ALL:
-        return ()
-    names = [game.mixing.factors[i].name for i in players]
-    beyond = shapley_interactions(game.values(_coalitions(players)))
-    estimates = bootstrap_means(np.array(list(beyond.values())))
-    found = [
-        Interaction((names[i], names[j]), estimate)
-        for (i, j), estimate in zip(beyond, estimates, strict=True)
-    ]
-    return tuple(sorted(found, key=lambda pair: -abs(pair.beyond.value)))

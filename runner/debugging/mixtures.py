@@ -162,10 +162,10 @@ class Mixtures:
         folder: Path,
         report: Callable[[int, int], None] = lambda *_: None,
     ) -> None:
-        self._mixing, self._seeds, self._recordings = mixing, tuple(seeds), recordings
+        self.mixing, self.seeds, self._recordings = mixing, tuple(seeds), recordings
         self._path, self._report = folder / VALUES, report
         self._kept = dict(_kept(self._path))
-        self.in_file = sum(known.seed in self._seeds for known in self._kept.values())
+        self.in_file = sum(known.seed in self.seeds for known in self._kept.values())
         """Runs in the file that have one of the seeds, of whatever mixtures."""
         self._found: dict[tuple[int, int], Readings] = {}
         self._batch = 1
@@ -181,21 +181,21 @@ class Mixtures:
     @property
     def ends(self) -> tuple[int, int]:
         """The numbers of A and of B."""
-        return 0, self._mixing.everything
+        return 0, self.mixing.everything
 
     def complete(self) -> list[int]:
         """Return the mixtures of which all seeds were measured."""
         numbers = {number for number, _ in self._found}
-        return [n for n in numbers if all((n, seed) in self._found for seed in self._seeds)]
+        return [n for n in numbers if all((n, seed) in self._found for seed in self.seeds)]
 
     def known(self, mixtures: Sequence[int]) -> int:
         """Return the number of runs of mixtures that need not be trained."""
-        missing = sum(len(task.seeds) for task in self._tasks(mixtures, self._seeds))
-        return len(mixtures) * len(self._seeds) - missing
+        missing = sum(len(task.seeds) for task in self._tasks(mixtures, self.seeds))
+        return len(mixtures) * len(self.seeds) - missing
 
     def readings(self, mixture: int) -> list[Readings]:
         """Return the readings of a mixture that were measured, by the order of the seeds."""
-        return [self._found[mixture, seed] for seed in self._seeds if (mixture, seed) in self._found]
+        return [self._found[mixture, seed] for seed in self.seeds if (mixture, seed) in self._found]
 
     def values(self, mixtures: Sequence[int], metric: str) -> NDArray[np.float64]:
         """Return the values of a metric in mixtures, [mixtures, seeds].
@@ -207,7 +207,7 @@ class Mixtures:
         for mixture in mixtures:
             row = [read.get(metric) for read in self.readings(mixture)]
             if None in row:
-                names = ", ".join(factor.name for factor in self._mixing.chosen(mixture)) or "none"
+                names = ", ".join(factor.name for factor in self.mixing.chosen(mixture)) or "none"
                 raise RunnerError(
                     f"--metric: {metric!r} has no finite value in the mixture with these settings of B: "
                     f"{names}. Choose a metric that every mixture has, such as success_percent."
@@ -219,7 +219,7 @@ class Mixtures:
         self, mixtures: Sequence[int], workers: Workers[Measurement, Measured], seeds: int | None = None
     ) -> None:
         """Measure mixtures with all seeds, or the first `seeds`, if they are not known yet."""
-        waiting = deque(self._tasks(mixtures, self._seeds[:seeds]))
+        waiting = deque(self._tasks(mixtures, self.seeds[:seeds]))
         left = sum(len(task.seeds) for task in waiting)
         busy, died = 0, list[Measurement]()
         while waiting or busy:
@@ -245,7 +245,7 @@ class Mixtures:
         """Yield tasks for what is not known."""
         batch = max(1, round(TASK_SECONDS / self.seconds)) if self.seconds else len(seeds)
         for mixture in mixtures:
-            config = self._mixing.config(mixture)
+            config = self.mixing.config(mixture)
             missing = []
             for seed in seeds:
                 known = self._kept.get(self._identity(config, seed))
@@ -277,7 +277,7 @@ class Mixtures:
         return f"{identity_of(values, seed)}-{environment}-{__version__}"
 
     def _failed(self, task: Measurement, reason: str) -> RunnerError:
-        names = ", ".join(factor.name for factor in self._mixing.chosen(task.mixture)) or "none"
+        names = ", ".join(factor.name for factor in self.mixing.chosen(task.mixture)) or "none"
         return RunnerError(f"the mixture with these settings of B: {names}: {reason}")
 
 

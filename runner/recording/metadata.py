@@ -28,14 +28,7 @@ from runner.recording.schema import Topic
 from runner.recording.spaces import dtype_of, leaves_of
 from runner.recording.writer import RecordingFile, storage_error
 from runner.util.arrays import Array
-from runner.util.values import (
-    MAX_JSON_DEPTH,
-    Json,
-    JsonView,
-    is_too_deep,
-    is_whole,
-    without_surrogates,
-)
+from runner.util.values import MAX_JSON_DEPTH, Json, JsonView, is_too_deep, is_whole, without_surrogates
 
 REQUIRED_RECORDS: Final = frozenset({"run", "config", "provenance"})
 """The metadata records without which a recording's messages cannot be interpreted."""

@@ -8,13 +8,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from runner.analysis.axes import first_crossing, mean_height
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.evaluations import evaluation_record
 from runner.analysis.series import (
     evaluation_readings,
     exact_readings,
-    first_crossing,
-    mean_height,
     training_readings,
 )
 from runner.errors import RunnerError, nearest

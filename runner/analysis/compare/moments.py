@@ -11,10 +11,10 @@ from typing import Final, Literal
 
 import numpy as np
 
-from runner.analysis.axes import EPISODES, Axis
+from runner.analysis.axes import EPISODES, Axis, first_crossing, mean_height
 from runner.analysis.compare.statistics import FEW_SEEDS, NEVER
 from runner.analysis.groups import Group
-from runner.analysis.series import RunSeries, first_crossing, mean_height, points_of
+from runner.analysis.series import RunSeries, points_of
 from runner.errors import RunnerError
 from runner.recording.metrics import METRIC_OF
 from runner.util.humanize import listed

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from runner.analysis.series import first_crossing, mean_height
+from runner.analysis.axes import first_crossing, mean_height
 from runner.errors import RunnerError, nearest
 from runner.recording.metrics import METRIC_OF, METRICS
 from runner.recording.reader import Recording

@@ -18,7 +18,7 @@ from runner.cli.progress import total_line
 from runner.util.humanize import counted, duration
 
 if TYPE_CHECKING:
-    from runner.debugging.explain import Plan
+    from runner.debugging.game import Plan
 
 
 class _Planned(Exception):

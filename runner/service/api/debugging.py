@@ -1,4 +1,4 @@
-"""Where other actions at a recorded step would have led."""
+"""What if, when and why: questions about how a run learned, answered from its recording."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from pydantic import BaseModel
 
 from runner.analysis.step_reference import EXPECTED, StepRef
 from runner.debugging.action_outcomes import ActionOutcome, Outcome
+from runner.debugging.expressions import MAX_CHARACTERS
+from runner.debugging.why import LIMIT, MAX_LIMIT
 from runner.service import computed, fragments
 from runner.service.api.replay import STEPS, Part, Start, Steps
 from runner.service.dependencies import RunComputationOf
 from runner.service.problems import error_docs
 
 router = APIRouter(
-    prefix="/runs/{run}/what-if",
+    prefix="/runs/{run}",
     tags=["reading"],
     responses=error_docs(
         HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT, HTTPStatus.SERVICE_UNAVAILABLE
@@ -24,6 +26,24 @@ router = APIRouter(
 )
 MAX_ACTIONS = 1000
 At = Annotated[str, Path(max_length=60, description=EXPECTED, examples=["eval:3000:17:5"])]
+Expression = Annotated[
+    str, Query(max_length=MAX_CHARACTERS, description="A condition.", examples=["max(q[300]) > 20"])
+]
+StepText = Annotated[
+    str | None, Query(max_length=40, description="A training step: its number, or EPISODE:T.")
+]
+StateName = Annotated[
+    str | None, Query(max_length=1000, description="A state, by number or name; default: that of `at`.")
+]
+ActionName = Annotated[
+    str | None, Query(max_length=1000, description="An action, by number or name; default: that of `at`.")
+]
+AgentName = Annotated[
+    str | None, Query(max_length=200, description="Whose Q-table, where each agent has its own.")
+]
+StepName = Annotated[
+    str | None, Query(max_length=60, description="The value before this step, EPISODE:T or eval:N:TRIAL:T.")
+]
 ActionPath = Annotated[str, Path(max_length=200, description="A joint action: its number or its name.")]
 
 
@@ -49,7 +69,7 @@ class WhatIf(BaseModel):
     notes: list[str]
 
 
-@router.get("/{at}", response_model=WhatIf, summary="Where each joint action at a step leads.")
+@router.get("/what-if/{at}", response_model=WhatIf, summary="Where each joint action at a step leads.")
 async def what_if(
     compute: RunComputationOf,
     at: At,
@@ -61,9 +81,44 @@ async def what_if(
     return await compute.json(computed.where_actions_lead, StepRef.parse(at), tuple(action or ()))
 
 
-@router.get("/{at}/{action}", response_model=Part, summary="A part of the episode to which an action leads.")
+@router.get(
+    "/what-if/{at}/{action}", response_model=Part, summary="A part of the episode to which an action leads."
+)
 async def branch(
     compute: RunComputationOf, at: At, action: ActionPath, start: Start = 0, steps: Steps = STEPS
 ) -> Response:
     """Return steps in the form of a replay: those recorded up to the step, then those played."""
     return await compute.json(fragments.branch_part, StepRef.parse(at), action, start, steps)
+
+
+@router.get(
+    "/when",
+    response_model=dict[str, object],
+    summary="The training steps after which an expression holds.",
+)
+async def when(
+    compute: RunComputationOf,
+    expression: Expression,
+    every: Annotated[bool, Query(alias="all", description="Find every interval.")] = False,
+    first: Annotated[StepText, Query(alias="from")] = None,
+    last: Annotated[StepText, Query(alias="to")] = None,
+) -> Response:
+    """Return what `dualtaxi when --json` prints; of a run that was trained here."""
+    return await compute.json(computed.when, expression, every, first, last)
+
+
+@router.get(
+    "/why",
+    response_model=dict[str, object],
+    summary="The rewards that a Q-value is the sum of.",
+)
+async def why(
+    compute: RunComputationOf,
+    state: StateName = None,
+    action: ActionName = None,
+    agent: AgentName = None,
+    at: StepName = None,
+    limit: Annotated[int, Query(ge=0, le=MAX_LIMIT, description="Most steps, 0 for all.")] = LIMIT,
+) -> Response:
+    """Return where a Q-value comes from, as `dualtaxi why --json` prints it; of a run trained here."""
+    return await compute.json(computed.why, "json", state, action, agent, at, limit, alone=True)

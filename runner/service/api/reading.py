@@ -10,8 +10,6 @@ from pydantic import BaseModel
 
 from runner.analysis.axes import AXES, EPISODES
 from runner.analysis.frames import Phase, episode_columns, step_columns
-from runner.debugging.expressions import MAX_CHARACTERS
-from runner.debugging.why import LIMIT, MAX_LIMIT
 from runner.export.plots.metrics import CurveStyle
 from runner.recording.reader import Recording
 from runner.service import computed
@@ -50,26 +48,6 @@ Stop = Annotated[
 Step = Annotated[int | None, Query(ge=0, lt=2**62, description="After this number of training steps.")]
 Episode = Annotated[int | None, Query(ge=0, lt=2**62, description="After this number of training episodes.")]
 PhasePath = Annotated[Phase, Path(description="`train`, or `eval`: the trials of evaluations.")]
-
-
-Expression = Annotated[
-    str, Query(max_length=MAX_CHARACTERS, description="A condition.", examples=["max(q[300]) > 20"])
-]
-StepText = Annotated[
-    str | None, Query(max_length=40, description="A training step: its number, or EPISODE:T.")
-]
-StateName = Annotated[
-    str | None, Query(max_length=1000, description="A state, by number or name; default: that of `at`.")
-]
-ActionName = Annotated[
-    str | None, Query(max_length=1000, description="An action, by number or name; default: that of `at`.")
-]
-AgentName = Annotated[
-    str | None, Query(max_length=200, description="Whose Q-table, where each agent has its own.")
-]
-StepName = Annotated[
-    str | None, Query(max_length=60, description="The value before this step, EPISODE:T or eval:N:TRIAL:T.")
-]
 AxisName = Annotated[str, Query(max_length=20, description=f"The horizontal axis: one of {', '.join(AXES)}.")]
 Metrics = Annotated[list[str] | None, Query(max_length=100, description="Default: all.")]
 FirstPosition = Annotated[float, Query(ge=0, allow_inf_nan=False, description="The first position.")]
@@ -322,41 +300,6 @@ async def q_table(
     """Return size, fill and range of each learner's exact table, as `dualtaxi qtable --json` prints it."""
     _refuse_both(step, episode)
     return await compute.json(computed.q_table, step, episode, state, "json")
-
-
-@router.get(
-    "/when",
-    response_model=dict[str, object],
-    responses=BUSY,
-    summary="The training steps after which an expression holds.",
-)
-async def when(
-    compute: RunComputationOf,
-    expression: Expression,
-    every: Annotated[bool, Query(alias="all", description="Find every interval.")] = False,
-    first: Annotated[StepText, Query(alias="from")] = None,
-    last: Annotated[StepText, Query(alias="to")] = None,
-) -> Response:
-    """Return what `dualtaxi when --json` prints; of a run that was trained here."""
-    return await compute.json(computed.when, expression, every, first, last)
-
-
-@router.get(
-    "/why",
-    response_model=dict[str, object],
-    responses=BUSY,
-    summary="The rewards that a Q-value is the sum of.",
-)
-async def why(
-    compute: RunComputationOf,
-    state: StateName = None,
-    action: ActionName = None,
-    agent: AgentName = None,
-    at: StepName = None,
-    limit: Annotated[int, Query(ge=0, le=MAX_LIMIT, description="Most steps, 0 for all.")] = LIMIT,
-) -> Response:
-    """Return where a Q-value comes from, as `dualtaxi why --json` prints it; of a run trained here."""
-    return await compute.json(computed.why, "json", state, action, agent, at, limit, alone=True)
 
 
 @router.get(

@@ -1,0 +1,172 @@
+"""The settings of an explanation as players of a cooperative game, whose coalitions are mixtures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.analysis.compare.statistics import Estimate, bootstrap_means
+from runner.debugging.explanation import ENOUGH, Interaction, Mixture, Setting
+from runner.debugging.factors import MAX_ALL
+from runner.debugging.mixtures import Measured, Measurement, Mixtures
+from runner.debugging.shapley import minimal_set, shapley_interactions, shapley_values
+from runner.sweep.local import Workers
+
+_START_SECONDS: Final = 10.0
+"""About the time to start workers, load kernels in them, and record the two short runs of the first step."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What an explanation will train."""
+
+    settings: int
+    mixtures: int
+    """The mixtures that will be run, at least."""
+    most_mixtures: int
+    """The same, at most; delta debugging depends on what it finds."""
+    seeds: int
+    known: int
+    """Runs that were trained before; delta debugging need not use all of them."""
+    run_seconds: float
+    """The time that one run takes of a worker; 0 if all are known."""
+    workers: int
+
+    @property
+    def seconds(self) -> float:
+        """The estimated time of the whole, at least; 0 if all runs are known."""
+        return self._seconds(self.mixtures)
+
+    @property
+    def most_seconds(self) -> float:
+        """The same, at most."""
+        return self._seconds(self.most_mixtures)
+
+    def _seconds(self, mixtures: int) -> float:
+        left = mixtures * self.seeds - self.known
+        return _START_SECONDS + left * self.run_seconds / self.workers if left > 0 else 0.0
+
+
+def mixture_bounds(settings: int) -> tuple[int, int]:
+    """Return how many mixtures of some settings are run, at least and at most."""
+    if settings <= MAX_ALL:
+        return 2**settings, 2**settings
+    return 2 + math.ceil(math.log2(settings)), 2 + 3 * settings + settings**2 + 2**MAX_ALL
+
+
+class Game:
+    """The values of mixtures, measured when they are needed: settings are players, mixtures coalitions."""
+
+    def __init__(self, mixtures: Mixtures, pool: Workers[Measurement, Measured], metric: str) -> None:
+        self.mixing, self.metric = mixtures.mixing, metric
+        self._mixtures, self._pool = mixtures, pool
+        self._count = len(self.mixing.factors)
+
+    def plan(self) -> Plan:
+        """Return what will be trained."""
+        count, mixtures, seeds = self._count, self._mixtures, len(self._mixtures.seeds)
+        least, most = mixture_bounds(count)
+        known = mixtures.known(range(least)) if least == most else mixtures.in_file
+        return Plan(count, least, most, seeds, known, mixtures.seconds, max(1, self._pool.idle))
+
+    def players(self) -> list[int]:
+        """Return the numbers of the settings among which the difference is shared; measure their mixtures.
+
+        These are all of them, or those of a minimal set; none if there is no difference to look for, or if
+        too many are needed.
+        """
+        players = list(range(self._count))
+        if self._count > MAX_ALL:
+            self._mixtures.measure((0, self.mixing.everything), self._pool)
+            players = minimal_set(players, self._makes_enough) if self.difference.excludes_zero else []
+        if len(players) <= MAX_ALL:
+            self._mixtures.measure(coalitions(players), self._pool)
+        return players
+
+    def _makes_enough(self, players: Sequence[int]) -> bool:
+        number = sum(1 << i for i in players)
+        self._mixtures.measure([number], self._pool)
+        return self._part(number) >= ENOUGH
+
+    def _part(self, number: int) -> float:
+        """Return the part of the difference that a mixture makes."""
+        low, own, high = self.values((0, number, self.mixing.everything)).mean(axis=1).tolist()
+        return float((own - low) / (high - low)) if high != low else math.nan
+
+    def values(self, numbers: Sequence[int]) -> NDArray[np.float64]:
+        """Return the values of mixtures that were measured, [mixtures, seeds]."""
+        return self._mixtures.values(numbers, self.metric)
+
+    def mean(self, number: int) -> Estimate:
+        """Return the mean of a mixture over the seeds."""
+        return bootstrap_means(self.values([number]))[0]
+
+    @property
+    def difference(self) -> Estimate:
+        """B less A."""
+        low, high = self.values((0, self.mixing.everything))
+        return bootstrap_means((high - low)[np.newaxis])[0]
+
+    def ordered(self) -> list[int]:
+        """Return the numbers of the mixtures that were measured, by the number of settings of B."""
+        return sorted(self._mixtures.complete(), key=lambda number: (number.bit_count(), number))
+
+    def mixture(self, number: int) -> Mixture:
+        """Return a mixture that was measured."""
+        names = tuple(factor.name for factor in self.mixing.chosen(number))
+        return Mixture(names, self.mean(number), tuple(self.values([number])[0].tolist()))
+
+    def smallest(self, players: Sequence[int]) -> Mixture | None:
+        """Return the fewest settings that make `ENOUGH` of the difference, of several the most of it."""
+        if not players or not self.difference.excludes_zero:
+            return None
+        if self._count > MAX_ALL:
+            return self.mixture(sum(1 << i for i in players))
+        enough = [number for number in self.ordered() if self._part(number) >= ENOUGH]
+        return self.mixture(min(enough, key=lambda number: (number.bit_count(), -self._part(number))))
+
+
+def coalitions(players: Sequence[int]) -> list[int]:
+    """Return the mixtures of some settings: bit j of a position stands for the j-th of them."""
+    return [
+        sum(1 << i for j, i in enumerate(players) if position >> j & 1)
+        for position in range(2 ** len(players))
+    ]
+
+
+def settings_of(game: Game, players: Sequence[int]) -> tuple[Setting, ...]:
+    """Return the settings, those with a share first, the largest first."""
+    factors = game.mixing.factors
+    shares: dict[int, tuple[Estimate, Estimate, Estimate]] = {}
+    if players and len(players) <= MAX_ALL:
+        values = game.values(coalitions(players))
+        bits = [1 << j for j in range(len(players))]
+        own = shapley_values(values)
+        alone, last = values[bits] - values[0], values[-1] - values[[len(values) - 1 - bit for bit in bits]]
+        rows = zip(*map(bootstrap_means, (own, alone, last)), strict=True)
+        shares = dict(zip(players, rows, strict=True))
+    order = sorted(shares, key=lambda i: -abs(shares[i][0].value))
+    order += [i for i in range(len(factors)) if i not in shares]
+    return tuple(
+        Setting(factors[i].name, factors[i].a, factors[i].b, *shares.get(i, (None, None, None)))
+        for i in order
+    )
+
+
+def interactions_of(game: Game, players: Sequence[int]) -> tuple[Interaction, ...]:
+    """Return the interactions of settings in pairs, the largest first."""
+    if not 2 <= len(players) <= MAX_ALL:
+        return ()
+    names = [game.mixing.factors[i].name for i in players]
+    beyond = shapley_interactions(game.values(coalitions(players)))
+    estimates = bootstrap_means(np.array(list(beyond.values())))
+    found = [
+        Interaction((names[i], names[j]), estimate)
+        for (i, j), estimate in zip(beyond, estimates, strict=True)
+    ]
+    return tuple(sorted(found, key=lambda pair: -abs(pair.beyond.value)))
