@@ -45,6 +45,7 @@ def test_the_page_of_another_discount_shows_where_and_why_the_runs_part(world, p
     drawn = world != "corridor"
     assert ("Before, in both: " in page) == drawn
     assert ('aria-label="Largest difference of' in page) == drawn
+    assert 'aria-label="Q-values where training diverges"' in page
     assert "Difference of the Q-tables over training episodes" in page
 
 
