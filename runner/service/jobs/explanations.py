@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 from pydantic import BaseModel, Field
 
 from runner.client.jobs import LogEvent, SweepProgress
-from runner.config.sections import RunTable
+from runner.config.shipped import shipped
 from runner.debugging.explain import (
     DEFAULT_SEEDS,
     EPISODES,
@@ -22,7 +24,8 @@ from runner.debugging.explain import (
 )
 from runner.debugging.explanation import summary
 from runner.debugging.mixtures import Measured, Measurement
-from runner.errors import ConfigError
+from runner.errors import ConfigError, RunNotFound
+from runner.runs.resolve import find_run
 from runner.service.jobs.channel import REPORT_SECONDS, JobSpec, Outcome, PipeChannel
 from runner.service.jobs.checking import MAX_RUNS, CheckedJob, is_path
 from runner.service.jobs.sweeps import slotted_workers
@@ -53,18 +56,26 @@ def check_explanation(given: ExplainQuestion, recordings: Path) -> CheckedJob:
             raise ConfigError(
                 f"{name}: found the path {source!r}, expected a run here or a shipped configuration."
             )
+        _refuse_initial_path(source, recordings)
     question = _question(given, recordings)
-    for config in (question.mixing.a, question.mixing.b):
-        if isinstance(config.initial_q, RunTable) and is_path(config.initial_q.run):
-            raise ConfigError(
-                f"initial_q: found the path {config.initial_q.run!r}, expected that of a run here."
-            )
     check_metric(question)
     runs = question.mixtures[1] * given.seeds
     if runs > MAX_RUNS:
         raise ConfigError(f"seeds: makes {runs:,} runs, expected at most {MAX_RUNS:,} in a job.")
     sides = {"a": question.a.run_id or question.a.name, "b": question.b.run_id or question.b.name}
     return CheckedJob("explain", question.name, runs, 0, given.model_dump() | sides)
+
+
+def _refuse_initial_path(source: str, recordings: Path) -> None:
+    """Refuse a run whose configuration names a recording by its path, before that is read."""
+    known = shipped().get(source)
+    if known is not None and known.kind == "experiment":
+        return  # it is meant, not a run of this name
+    with contextlib.suppress(RunNotFound):  # reported later
+        start = find_run(source, recordings).file.config.get("initial_q")
+        run = start.get("run") if isinstance(start, Mapping) else None
+        if isinstance(run, str) and is_path(run):
+            raise ConfigError(f"initial_q: found the path {run!r}, expected the id of a run here.")
 
 
 def run_explain_job(spec: JobSpec, channel: PipeChannel) -> Outcome:

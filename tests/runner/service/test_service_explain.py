@@ -99,3 +99,14 @@ def test_a_job_waits_for_another_explanation_of_the_same_two_and_survives_a_rest
         with serving(recordings) as client:
             job = finished(client, number)
     assert (job["state"], job["error"]) == ("finished", "")
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_no_file_is_read_that_the_configuration_of_a_run_names(client, recordings, changed, tmp_path, exists):
+    run, other = find_run(changed, recordings), tmp_path / "other.mcap"
+    if exists:
+        other.write_text("no recording")
+    run.update(config=run.file.config | {"initial_q": {"run": str(other), "step": 0}})
+    answer = client.post(EXPLAIN, json={"a": "first", "b": changed})
+    assert answer.status_code == 422, answer.text
+    assert "found the path" in answer.json()["error"]["message"]
