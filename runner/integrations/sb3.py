@@ -181,7 +181,8 @@ class Recording(BaseCallback):  # type: ignore[misc]
     def _on_training_end(self) -> None:
         has_updated = self.model._n_updates != self._updates
         self._writer.write_rest(self.logger.name_to_value, has_updated)
-        self.logger.output_formats.remove(self._writer)
+        if self._writer in self.logger.output_formats:  # another callback may have set another logger
+            self.logger.output_formats.remove(self._writer)
         if self._checkpoint_every:
             self._checkpoint()
         if not self._stays_open:

@@ -14,6 +14,7 @@ from click.testing import CliRunner
 from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.env_util import make_atari_env, make_vec_env
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     SubprocVecEnv,
@@ -143,6 +144,17 @@ def test_the_logger_and_the_settings_are_recorded(recordings):
     assert config["learning_rate"] == {"first": 1e-3, "last": 0.0}
     assert config["clip_range"] == 0.2
     assert callback.run.facts["seed"] == 4
+
+
+def test_a_logger_that_is_set_meanwhile_costs_no_run(recordings):
+    class OtherLogger(BaseCallback):
+        def _on_step(self):
+            self.model.set_logger(configure(format_strings=[]))
+            return True
+
+    callback = Recording(recordings)
+    PPO("MlpPolicy", "CartPole-v1", **SMALL).learn(64, callback=[callback, OtherLogger()])
+    assert (callback.run.status, callback.run.summary.train_steps) == ("finished", 64)
 
 
 @pytest.mark.parametrize(
