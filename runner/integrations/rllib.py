@@ -76,9 +76,9 @@ class Recording:
         checkpoint_every: keep the weights as the checkpoint `module` after this many iterations, and at the
             end; 0 for none.
         options: the others of `runner.record`, except `join` and `shard`; and `frames_of`, as for
-            `runner.record_vector`. The run has the name of algorithm and environment, or of the trial of Ray
-            Tune, and the configuration's seed unless given, and the configuration with the settings of
-            `config`. `make` makes one of the environments.
+            `runner.record_vector`, unless environments have several agents. The run has the name of
+            algorithm and environment, or of the trial of Ray Tune, and the configuration's seed unless
+            given, and the configuration with the settings of `config`. `make` makes one of the environments.
 
     Raises:
         ConfigError: an argument cannot be used.
@@ -131,10 +131,20 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
     # --- in the process of the algorithm --------------------------------------------------------------
 
     def on_algorithm_init(self, *, algorithm: Algorithm, **_: object) -> None:
-        """Begin the run, and have all env runners join it."""
-        self._run = self._begin(algorithm)
+        """Begin the run, and have all env runners join it.
+
+        Raises:
+            RunnerError: one cannot record its environments.
+        """
+        self._run = run = self._begin(algorithm)
         for group in _groups(algorithm):
-            group.foreach_env_runner(self._joining(group is not algorithm.env_runner_group))
+            reasons = group.foreach_env_runner(self._joining(group is not algorithm.env_runner_group))
+            if reason := next(filter(None, reasons), ""):
+                self._run = None
+                for each in _groups(algorithm):
+                    each.foreach_env_runner(_leave)
+                run.end(reason)
+                raise RunnerError(reason)
         stop = algorithm.cleanup
 
         def cleanup() -> None:
@@ -179,20 +189,22 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
         )
         return _Run(Loop(described, options, maker, ROWS[described.kind]))
 
-    def _joining(self, is_evaluation: bool) -> Callable[[object], None]:
+    def _joining(self, is_evaluation: bool) -> Callable[[object], str]:
         """Return what has an env runner record its environments; it is sent to the process of each."""
         assert self._run is not None
         phase = "eval" if is_evaluation else "train"
-        return partial(_join, _Join(self._run.run, phase, self._recording.options))
+        return partial(_why_not_joined, _Join(self._run.run, phase, self._recording.options))
 
     def on_env_runners_recreated(
         self, *, env_runner_group: Any, env_runner_indices: list[int], is_evaluation: bool, **_: object
     ) -> None:
         """Have env runners join that take the place of others which failed."""
         if self._run is not None:
-            env_runner_group.foreach_env_runner(
+            reasons = env_runner_group.foreach_env_runner(
                 self._joining(is_evaluation), remote_worker_ids=env_runner_indices, local_env_runner=False
             )
+            if reason := next(filter(None, reasons), ""):
+                warn_user(f"run {self._run.run.run_id}: an env runner is not recorded any more: {reason}")
 
     def on_evaluate_start(self, *, algorithm: Algorithm, **_: object) -> None:
         """State in the evaluating env runners how many steps were trained on."""
@@ -287,6 +299,15 @@ def _game(env_runner: Any, env: object) -> MultiAgent:
         return MultiAgent(env, kind if isinstance(kind, str) else None)
     parameter = next(iter(inspect.signature(kind).parameters), "config")
     return MultiAgent(env, arguments={parameter: dict(env_runner.config.env_config)})
+
+
+def _why_not_joined(join: _Join, env_runner: object) -> str:
+    """Have an env runner record its environments; return why it cannot, because RLlib only logs an error."""
+    try:
+        _join(join, env_runner)
+    except Exception as error:
+        return truncated_message(error)
+    return ""
 
 
 def _join(join: _Join, env_runner: Any) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import runner
+from runner.errors import RunnerError
 from runner.execution.redo import verify_by_redoing
 from runner.recording.reader import open_recording
 from runner.runs.shards import shards_of
@@ -212,6 +213,17 @@ def test_agents_with_policies_of_their_own_and_a_shared_one(recordings, game):
     redone = verify_by_redoing(run.recording, trust=True)
     assert (redone.verdict, redone.left_out) == ("reproduced", 0)
     assert redone.steps == run.summary.train_steps + run.summary.eval_steps
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_what_an_env_runner_cannot_record_is_an_error_of_the_algorithm(recordings, number):
+    from runner.integrations.rllib import Recording
+
+    config = configured(Recording(recordings, frames_every=5)).env_runners(num_env_runners=number)
+    with pytest.raises(RunnerError, match="render_mode"):
+        config.build_algo()
+    (run,) = runner.list_runs(recordings)
+    assert run.status == "failed"
 
 
 def test_an_environment_class_of_several_agents_is_made_again_from_its_configuration(recordings):
