@@ -227,7 +227,7 @@ def _labelled(runs_of: Sequence[Sequence[RunSeries]], names: Sequence[str]) -> l
                     for values in same
                 )
             ]
-        values = ", ".join(f"{key}={own.get(key)}" for key in differing)
+        values = ", ".join(f"{key}={own[key]}" for key in differing if key in own)
         groups.append(_group(f"{name}, {values}" if values else name, runs))
     return groups
 

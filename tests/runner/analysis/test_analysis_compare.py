@@ -174,6 +174,12 @@ def test_runs_of_one_configuration_are_one_group_whatever_they_are_called():
     assert [group.label for group in groups] == ["a / b", "a"]
 
 
+def test_a_label_has_the_values_that_its_runs_have():
+    schedule = {"start": 0.9, "over": 50}
+    groups = groups_of([run(0, [1, 2], epsilon=0.1), run(1, [1, 2], epsilon=schedule)])
+    assert [group.label for group in groups] == ["a, epsilon=0.1", "a, epsilon.over=50, epsilon.start=0.9"]
+
+
 def test_a_run_done_twice_counts_once_and_is_reported():
     groups, notes = grouped([run(0, [1, 2], finished=False), run(0, [1, 2]), run(1, [1, 2])])
     assert [r.run_id for r in groups[0].runs] == ["a0", "a1"]
