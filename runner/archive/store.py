@@ -30,8 +30,9 @@ _PIECE: Final = 1 << 20
 class Store:
     """A folder or an object storage prefix that has one archive per run, named by the run's id.
 
-    `location`: a folder, or `s3://bucket/prefix`. Credentials, region and endpoint of object storage come
-    from the usual AWS variables and files.
+    Args:
+        location: a folder, or `s3://bucket/prefix`. Credentials, region and endpoint of object storage come
+            from the usual AWS variables and files.
     """
 
     def __init__(self, location: str) -> None:

@@ -95,7 +95,8 @@ class _LeafColumns:
 class SpaceColumns:
     """The columns of the values of a space.
 
-    `prefix`: the beginning of the columns' names; the field unless given.
+    Args:
+        prefix: the beginning of the columns' names; the field unless given.
     """
 
     def __init__(

@@ -42,7 +42,8 @@ class Segment(NamedTuple):
 class Learner:
     """Tables, cursors and tallies of one job; `train` and `evaluate` fill blocks of records.
 
-    `initial`: tables to start from instead of `config.initial_q`, as `held` returns them, for each learner.
+    Args:
+        initial: tables to start from instead of `config.initial_q`, as `held` returns them, for each learner.
     """
 
     def __init__(

@@ -20,7 +20,8 @@ from runner.recording.recorder import Recorder
 class BatchRows(VectorRows):
     """The steps of one phase that are not committed yet, put down many at once.
 
-    `mode`: how the environments reset themselves.
+    Args:
+        mode: how the environments reset themselves.
     """
 
     def __init__(

@@ -40,7 +40,8 @@ Put = Callable[[object], None]
 class Extras:
     """The extras of a loop that the recorder does not have yet; the caller holds the loop's lock.
 
-    `batch`: (N,) for N environments that step at once, whose values are arrays [N, ...]; else ().
+    Args:
+        batch: (N,) for N environments that step at once, whose values are arrays [N, ...]; else ().
     """
 
     def __init__(self, recorder: Recorder, batch: tuple[int, ...] = ()) -> None:

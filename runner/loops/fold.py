@@ -48,7 +48,8 @@ Report = Callable[[int, int], None]
 class Fold:
     """Writes the recordings of several processes into one.
 
-    `sources`: of its processes; that which began it comes first, unless it recorded nothing.
+    Args:
+        sources: of its processes; that which began it comes first, unless it recorded nothing.
     """
 
     def __init__(self, run: Run, sources: Sequence[Source], report: Report) -> None:

@@ -30,7 +30,8 @@ States = dict[int, ResetState]
 class GeneratorWatch:
     """The generator of one environment: read at the resets at which its state is recorded.
 
-    `sparse`: whether the states of emulators, which take kilobytes, are recorded less often.
+    Args:
+        sparse: whether the states of emulators, which take kilobytes, are recorded less often.
     """
 
     def __init__(self, env: object, sparse: bool = False) -> None:
@@ -79,7 +80,8 @@ class VectorWatch:
     Those of a `SyncVectorEnv` are read, or that of a vector environment of its own class. An `AsyncVectorEnv`
     is asked for the seeds of its generators once, after its first reset without seeds.
 
-    `first`: its first environment, or one made as that was; the vector itself if there is none.
+    Args:
+        first: its first environment, or one made as that was; the vector itself if there is none.
     """
 
     def __init__(

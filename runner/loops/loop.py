@@ -51,9 +51,10 @@ class _IgnoredRows:
 class Loop(Generic[R]):
     """A loop that is being recorded; safe to use from several threads.
 
-    `make_rows`: returns the rows of a phase for recorder, description, phase and what to call with the first
-    action.
-    `batch`: (N,) for N environments that step at once, else ().
+    Args:
+        make_rows: returns the rows of a phase for recorder, description, phase and what to call with the
+            first action.
+        batch: (N,) for N environments that step at once, else ().
     """
 
     should_stop = False

@@ -27,7 +27,8 @@ MAX_SEED: Final = 2**64 - 1
 class Rows:
     """The rows of one phase of one environment that are not committed yet, and the state of its episodes.
 
-    `first_action`: called with the first action of the phase before it is put down; may call `reshape`.
+    Args:
+        first_action: called with the first action of the phase before it is put down; may call `reshape`.
     """
 
     def __init__(

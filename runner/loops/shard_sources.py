@@ -42,10 +42,11 @@ _RESET: Final = ("reset", "step", "environment", "log_time")
 class Source:
     """What one process recorded.
 
-    `name`: of the shard; empty for the process that began the run.
-    `number`: its place among the processes of the run.
-    `environment`: the number of its first environment among those of the run.
-    `is_placed`: whether its process stated after how many training steps of the run it recorded.
+    Args:
+        name: of the shard; empty for the process that began the run.
+        number: its place among the processes of the run.
+        environment: the number of its first environment among those of the run.
+        is_placed: whether its process stated after how many training steps of the run it recorded.
     """
 
     def __init__(

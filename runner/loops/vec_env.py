@@ -19,7 +19,8 @@ class VecEnvVector(AnyVectorEnv):
     A `DummyVecEnv` rounds rewards to float32. As long as this object is open they are kept as they came, and
     rounded for `native`.
 
-    `base`: the `VecEnv`. Its methods are those that it has now: they may be replaced afterwards.
+    Args:
+        base: the `VecEnv`. Its methods are those that it has now: they may be replaced afterwards.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012

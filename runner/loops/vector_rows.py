@@ -35,8 +35,9 @@ class VectorRows:
 
     Not thread-safe: the caller holds the loop's lock.
 
-    `first_action`: called with the first action of the phase before it is recorded; may call `reshape`.
-    `next_step`: whether an environment whose episode is over ignores its next action and is reset.
+    Args:
+        first_action: called with the first action of the phase before it is recorded; may call `reshape`.
+        next_step: whether an environment whose episode is over ignores its next action and is reset.
     """
 
     off_table = 0

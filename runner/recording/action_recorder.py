@@ -17,7 +17,8 @@ from runner.recording.schema import RESET_ONLY, Topic
 class ActionRecorder:
     """Records the actions of the steps that a recorder gets and leaves out of the file.
 
-    `block_steps`: how many steps a message has, but for those that are flushed by time.
+    Args:
+        block_steps: how many steps a message has, but for those that are flushed by time.
     """
 
     def __init__(self, recorder: Recorder, environments: int, block_steps: int) -> None:

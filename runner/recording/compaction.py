@@ -50,8 +50,9 @@ class _Gathered:
 class _Compaction:
     """Writes the chunks of one recording into another.
 
-    `packing`: how chunks are packed, and the most steps whose actions share a message.
-    `steps`: the dtype of whole steps, by the topic of their actions.
+    Args:
+        packing: how chunks are packed, and the most steps whose actions share a message.
+        steps: the dtype of whole steps, by the topic of their actions.
     """
 
     def __init__(

@@ -121,8 +121,9 @@ def _values_dtype(description: dict[str, object], what: str) -> np.dtype[Any]:
 class Extras(Mapping[str, np.dtype[np.generic]]):
     """The extras of a phase: a mapping of the names to their dtypes, which include the shapes.
 
-    `parts`: each layout, and the chunks of the phase that have it.
-    `episode_span`: returns the numbers of an episode's steps.
+    Args:
+        parts: each layout, and the chunks of the phase that have it.
+        episode_span: returns the numbers of an episode's steps.
     """
 
     def __init__(

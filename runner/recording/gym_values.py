@@ -27,9 +27,10 @@ Put = Callable[[int, Value], None]
 class Leaf:
     """A part of a space, with the checks that its values pass before they are recorded.
 
-    `what`: `observation` or `action`. An action may have another shape with as many numbers, because only the
-    environment knows which shapes it accepts.
-    `on_rounded`: called with a text the first time that a value is rounded.
+    Args:
+        what: `observation` or `action`. An action may have another shape with as many numbers, because only
+            the environment knows which shapes it accepts.
+        on_rounded: called with a text the first time that a value is rounded.
     """
 
     def __init__(self, part: Part, what: str, on_rounded: OnRounded) -> None:

@@ -92,7 +92,8 @@ def aligned(
 class Blocks:
     """The blocks of a phase, each of whole steps of all environments.
 
-    `complete`: whether the recording was completed; else the blocks end at its last reset.
+    Args:
+        complete: whether the recording was completed; else the blocks end at its last reset.
     """
 
     def __init__(self, recording: Recording, phase: str, complete: bool, on_block: OnBlock) -> None:

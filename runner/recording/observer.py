@@ -31,7 +31,8 @@ _MAX_WAITING: Final = 1 << 18
 class Observer:
     """What is seen while one run is recorded.
 
-    `console`: returns a line of the output as it is to be recorded; None for no output.
+    Args:
+        console: returns a line of the output as it is to be recorded; None for no output.
     """
 
     def __init__(

@@ -59,11 +59,13 @@ class _Work:
 class Pipeline:
     """Takes whole message records in order; `close` waits until all is written.
 
-    `file`: the file that chunks are written to; None for the digest alone.
-    `beat`: called about once a second from the writer's thread, or when something is sent.
-    `threads`: False makes the sender do the work.
-    `before`: called once, before anything is written. With it, the pipeline holds up to `MAX_HELD` pieces of
-    work until `release`; only then are threads started, so a recording that is closed earlier needs none.
+    Args:
+        file: the file that chunks are written to; None for the digest alone.
+        beat: called about once a second from the writer's thread, or when something is sent.
+        threads: False makes the sender do the work.
+        before: called once, before anything is written. With it, the pipeline holds up to `MAX_HELD` pieces
+            of work until `release`; only then are threads started, so a recording that is closed earlier
+            needs none.
     """
 
     def __init__(

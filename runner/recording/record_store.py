@@ -30,7 +30,8 @@ _SMALL: Final = 8 << 20
 class RecordStore:
     """Reads records by their places.
 
-    `stream`: the file; closed with the store.
+    Args:
+        stream: the file; closed with the store.
     """
 
     def __init__(self, stream: BinaryIO, path: str) -> None:

@@ -74,20 +74,21 @@ class _Lane:
 class Recorder:
     """Records one run; at its end call `drain`, or `abandon`.
 
-    `file`: the recording to write; None records nothing but the digest.
-    `record_steps`: False keeps the steps' digest but not the steps.
-    `reference`: what the recording already holds.
-    `beat`: called about once a second while the recorder is in use, by the thread that writes.
-    `sizes`: the fixed-width topics of the recording; those of a job by default.
-    `threads`: False packs and writes in the thread that records.
-    `watch`: called with the records of a block as they are committed; the block is used again.
-    `before`: called once, before the first message is written. With it, threads are started and messages
-    written only when some have gathered, or by `release`, so that a short recording costs little.
-    `clock`: whether to record the time that passes.
-    `system`: whether to record what the process uses of its machine; only with the clock.
-    `console`: returns a line of the process's output as it is to be recorded, without secrets; None records
-    no output. Only with the clock.
-    `packed`: the chunks of another recording, used again for the same messages.
+    Args:
+        file: the recording to write; None records nothing but the digest.
+        record_steps: False keeps the steps' digest but not the steps.
+        reference: what the recording already holds.
+        beat: called about once a second while the recorder is in use, by the thread that writes.
+        sizes: the fixed-width topics of the recording; those of a job by default.
+        threads: False packs and writes in the thread that records.
+        watch: called with the records of a block as they are committed; the block is used again.
+        before: called once, before the first message is written. With it, threads are started and messages
+            written only when some have gathered, or by `release`, so that a short recording costs little.
+        clock: whether to record the time that passes.
+        system: whether to record what the process uses of its machine; only with the clock.
+        console: returns a line of the process's output as it is to be recorded, without secrets; None records
+            no output. Only with the clock.
+        packed: the chunks of another recording, used again for the same messages.
     """
 
     def __init__(

@@ -24,9 +24,10 @@ if TYPE_CHECKING:
 class Reference:
     """The messages of a recording, topic by topic, each compared once and in order.
 
-    `recording`: the recording; None for a new run.
-    `complete`: whether a message that the recording does not hold is a difference, not new.
-    `without_steps`: whether the recording leaves its steps out.
+    Args:
+        recording: the recording; None for a new run.
+        complete: whether a message that the recording does not hold is a difference, not new.
+        without_steps: whether the recording leaves its steps out.
     """
 
     def __init__(

@@ -122,9 +122,10 @@ class TopicChunks:
 
     Messages are numbered as recorded; where a repair lost some, the numbers continue after the gap.
 
-    `places`: which chunks of the file hold it.
-    `dtype`: of a message record; None if messages vary in size.
-    `lost`: ranges (first, stop) of the numbers of messages that a repair could not save.
+    Args:
+        places: which chunks of the file hold it.
+        dtype: of a message record; None if messages vary in size.
+        lost: ranges (first, stop) of the numbers of messages that a repair could not save.
     """
 
     def __init__(

@@ -34,7 +34,8 @@ MAX_CACHE_BYTES: Final = 2 << 30
 class Checkpoints:
     """The checkpoints of one recording.
 
-    `recording`: the run; unless it is finished, there are no checkpoints, as it may still change.
+    Args:
+        recording: the run; unless it is finished, there are no checkpoints, as it may still change.
     """
 
     def __init__(self, recording: Recording) -> None:

@@ -45,7 +45,8 @@ def parts_of(whole: Part, n: int) -> Iterator[Part]:
 class Comparison:
     """Compares what came of steps with a recording.
 
-    `tolerance`: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
+    Args:
+        tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
     """
 
     def __init__(self, recording: Recording, tolerance: float) -> None:

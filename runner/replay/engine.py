@@ -41,9 +41,10 @@ _Key = tuple[str, int]
 class Replay:
     """A replay of a recording, from its beginning or from a reset; runs foreign code in this process.
 
-    `trust`: whether what the recording names may be imported, see `runner.replay.specifications`.
-    `tolerance`: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
-    `make`: returns the environment, instead of making it as the recording describes.
+    Args:
+        trust: whether what the recording names may be imported, see `runner.replay.specifications`.
+        tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
+        make: returns the environment, instead of making it as the recording describes.
     """
 
     def __init__(

@@ -33,7 +33,8 @@ class Turns:
 
     The steps by which PettingZoo removes an agent that is terminated or truncated are not steps of it.
 
-    `removes`: whether agents that are over are removed after each step; else the caller does it.
+    Args:
+        removes: whether agents that are over are removed after each step; else the caller does it.
     """
 
     def __init__(self, env: Any, removes: bool = True) -> None:

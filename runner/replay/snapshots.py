@@ -15,7 +15,8 @@ from runner.replay.step_replay import StepReplay
 class DerivedTables:
     """The tables of a run as far as its steps determine them, updated by the steps as they come.
 
-    `replay`: at the run's first step.
+    Args:
+        replay: at the run's first step.
     """
 
     def __init__(self, replay: StepReplay) -> None:
@@ -62,8 +63,9 @@ S = TypeVar("S")
 class SnapshotVisitor(Generic[S]):
     """Calls a function with each snapshot of a run, after the training steps before it were applied.
 
-    `tables`: moved forward by the steps.
-    `snapshots`: each with the number of training steps before it.
+    Args:
+        tables: moved forward by the steps.
+        snapshots: each with the number of training steps before it.
     """
 
     def __init__(

@@ -53,7 +53,8 @@ class Trace(NamedTuple):
 class StepReplay:
     """The tables of a run's learners, moved forward by its training steps in order.
 
-    `config`: the run's resolved configuration, as its recording holds it.
+    Args:
+        config: the run's resolved configuration, as its recording holds it.
     """
 
     def __init__(self, config: Mapping[str, object], mdp: Mdp, seed: int, where: str) -> None:

@@ -26,9 +26,10 @@ _Numbered = tuple[int, RecordedReset]
 class VectorStepper(Stepper):
     """All environments of a vector; rows are those of all of them, in the order of the recording.
 
-    `autoreset`: `NextStep`, `SameStep` or `Disabled`; with `SameStep`, the picture after the last step of an
-    episode shows the beginning of the next one.
-    `drawn`: the environment that is drawn.
+    Args:
+        autoreset: `NextStep`, `SameStep` or `Disabled`; with `SameStep`, the picture after the last step of
+            an episode shows the beginning of the next one.
+        drawn: the environment that is drawn.
     """
 
     def __init__(self, env: Any, recording: Recording, autoreset: str, drawn: int = 0) -> None:

@@ -103,7 +103,8 @@ class RecordedCode:
 class CodeCollector:
     """Reads the code in a thread, and writes it into the recording as soon as it is known.
 
-    `recordings`: the folder of runs, in which nothing is code.
+    Args:
+        recordings: the folder of runs, in which nothing is code.
     """
 
     def __init__(self, recordings: Path, is_wanted: bool = True) -> None:

@@ -81,8 +81,9 @@ def process_context(preload: Sequence[str] = ()) -> Any:
 class ChildProcess:
     """A process that calls functions, one after the other.
 
-    `memory_bytes`: how much its calls may allocate; not limited on Windows.
-    `on_progress`: called with what functions pass to `report_progress`.
+    Args:
+        memory_bytes: how much its calls may allocate; not limited on Windows.
+        on_progress: called with what functions pass to `report_progress`.
 
     Raises:
         OSError: the system cannot start another process.

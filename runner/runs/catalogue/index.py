@@ -56,9 +56,8 @@ class Index:
     ) -> Iterator[IndexRow]:
         """Yield the rows that match a filter, the newest first.
 
-        `order`: expressions to sort by before the age.
-
         Args:
+            order: expressions to sort by before the age.
             columns: the stored columns that are needed; all by default.
         """
         self._check_settings(chosen)
