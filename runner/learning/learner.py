@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -213,16 +214,18 @@ class Learner:
         """Return the summed rewards of the last steps, ascending, and how often each came."""
         window = self._tally.recent_outcomes[: min(self.step, len(self._tally.recent_outcomes))]
         by_class = np.bincount(window, minlength=len(self.model.rewards))
-        summed = self._team_rewards()
-        rewards, where = np.unique(summed, return_inverse=True)
+        rewards, where = self._distinct_rewards
         counts = np.bincount(where, weights=by_class, minlength=len(rewards)).astype(np.int64)
         seen = counts > 0
         return rewards[seen].tolist(), counts[seen].tolist()
 
-    def _team_rewards(self) -> NDArray[np.float64]:
-        """Return the summed reward of each outcome class, [C]; a shared reward counts once."""
+    @cached_property
+    def _distinct_rewards(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """The summed rewards, ascending, and for each outcome class which it is; a shared one counts once."""
         shared = self.mdp.rewards.shape[-1] == 1
-        return self.model.rewards[:, 0] if shared else self.model.rewards.sum(axis=1)
+        summed = self.model.rewards[:, 0] if shared else self.model.rewards.sum(axis=1)
+        rewards, where = np.unique(summed, return_inverse=True)
+        return rewards, where
 
     def _mark_success(self, episodes: NDArray[np.void]) -> None:
         if self._success.any():

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import struct
 import threading
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
@@ -17,6 +16,7 @@ from typing import Final
 import lz4.frame
 import numpy as np
 import zstandard
+from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
@@ -76,7 +76,7 @@ def encode_chunk(
     """
     name = "" if packing.compression == "none" else packing.compression
     width = len(records) // len(log_times) if topic.message is TRANSITION else 0
-    start, end, size, crc = int(log_times[0]), int(log_times[-1]), len(records), zlib.crc32(records)
+    start, end, size, crc = int(log_times[0]), int(log_times[-1]), len(records), crc32(records)
     data = (packed and packed(name, records)) or _compress(records, packing, width)
     if topic.message is ACTIONS and len(data) * _MOSTLY_ZEROS < len(records):  # quick at any level
         data = _compress(records, replace(packing, level=MAX_LEVEL), width)
@@ -193,7 +193,7 @@ def unpack_chunk(body: bytes | memoryview, where: str) -> tuple[ChunkHead, bytes
     if head.uncompressed_size > _PLAIN_BYTES:
         _check_message_count(view, head, where)
     records = decompress(view[head.data_at :], head.compression, head.uncompressed_size, where)
-    if zlib.crc32(records) != head.crc:
+    if crc32(records) != head.crc:
         raise RecordingError(f"{where}: its content does not match its checksum")
     return head, records
 

@@ -7,13 +7,13 @@ in memory is bounded whatever the file declares: 34 bytes a chunk, and few names
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import BinaryIO, Final, NamedTuple, TypeVar
 
 import numpy as np
+from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -157,7 +157,7 @@ def checksum(stream: BinaryIO, start: int, end: int) -> int:
     """Return the checksum of a part of the file, which need not fit into memory."""
     crc, at = 0, stream.seek(start)
     while at < end and (piece := stream.read(min(_PIECE, end - at))):
-        crc = zlib.crc32(piece, crc)
+        crc = crc32(piece, crc)
         at += len(piece)
     return crc
 
@@ -196,7 +196,7 @@ def _from_summary(stream: BinaryIO, footer: Footer, size: int) -> Index:
     if not len(MCAP0_MAGIC) < start <= footer.summary_offset_start <= end:
         raise RecordingError(f"the footer points to a summary at {start}, outside the file; try `repair`.")
     fields = FOOTER_HEAD.pack(Opcode.FOOTER, FOOTER_BODY_BYTES, start, footer.summary_offset_start)
-    if zlib.crc32(fields, checksum(stream, start, end)) != footer.summary_crc:
+    if crc32(fields, checksum(stream, start, end)) != footer.summary_crc:
         raise RecordingError(f"the summary at {start} does not match its checksum; try `repair`.")
     index = Index(finished=True, end=start)
     for opcode, offset, body in _records(stream, start, end):

@@ -10,7 +10,7 @@ import queue
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from typing import Final
 
 import numpy as np
@@ -179,8 +179,10 @@ class Recorder:
         free = lane.open.records[lane.open.filled :]
         limit = self._reference.remaining(topic)
         if self._packed is not None:  # end where a packed chunk does
-            lane.span = self._packed.span(topic, self.counts[topic.name])
-            limit = lane.span.stop - self.counts[topic.name] if lane.span else 0
+            count = self.counts[topic.name]
+            if lane.span is None or lane.span.stop <= count:
+                lane.span = self._packed.span(topic, count)
+            limit = lane.span.stop - count if lane.span else 0
         return free[:limit] if limit else free
 
     def fill(self, topic: Topic, positions: NDArray[np.uint64]) -> Iterator[tuple[NDArray[np.void], slice]]:
@@ -365,7 +367,6 @@ class Recorder:
         if block is None:
             return
         filled = block.records[: block.filled]
-        offsets = np.arange(block.filled, dtype=np.uint64) * np.uint64(filled.itemsize)
         packed, span, count = None, lane.span, self.counts[lane.topic.name]
         if self._packed and span and span[:2] == (count - block.filled, count):
             packed = partial(self._packed.data, span.entry)
@@ -374,11 +375,19 @@ class Recorder:
             lane.topic,
             filled.view(np.uint8).data.cast("B"),
             filled["log_time"],
-            offsets,
+            _offsets(block.filled, filled.itemsize),
             write=write and lane.write,
             done=partial(lane.free.put, block) if is_whole else lambda: None,
             packed=packed,
         )
+
+
+@lru_cache(8)
+def _offsets(count: int, size: int) -> NDArray[np.uint64]:
+    """Return where each of the records of one size begins in a block; most blocks are whole."""
+    offsets = np.arange(count, dtype=np.uint64) * np.uint64(size)
+    offsets.flags.writeable = False
+    return offsets
 
 
 def capacity_of(topic: Topic, sizes: Sizes, chunk_steps: int) -> int:

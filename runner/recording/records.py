@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import struct
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import BinaryIO, Final, NamedTuple
 
 import numpy as np
+from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -238,7 +238,7 @@ def attachment_of(body: bytes, offset: int) -> tuple[str, str, bytes]:
     name, media_type = stream.read_prefixed_string(), stream.read_prefixed_string()
     size = stream.read8()
     data = body[stream.count : -4]
-    if len(data) != size or times != (0, 0) or zlib.crc32(body[:-4]) != int.from_bytes(body[-4:], "little"):
+    if len(data) != size or times != (0, 0) or crc32(body[:-4]) != int.from_bytes(body[-4:], "little"):
         raise RecordingError(f"attachment at {offset}: its content does not match its checksum")
     return name, media_type, data
 

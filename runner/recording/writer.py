@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import os
 import struct
-import zlib
 from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Literal, Self
 
+from isal.isal_zlib import crc32
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -205,7 +205,7 @@ class RecordingFile:
         summary, offsets = self._summary(summary_start)
         offsets_start = summary_start + len(summary)
         footer = FOOTER_HEAD.pack(Opcode.FOOTER, FOOTER_BODY_BYTES, summary_start, offsets_start)
-        crc = zlib.crc32(footer, zlib.crc32(summary + offsets))
+        crc = crc32(footer, crc32(summary + offsets))
         return b"".join((data_end, summary, offsets, footer, struct.pack("<I", crc), MCAP0_MAGIC))
 
     def close(self) -> None:
@@ -224,7 +224,7 @@ class RecordingFile:
         view = memoryview(data)
         while view:
             view = view[self._stream.write(view) :]
-        self._crc = zlib.crc32(data, self._crc)
+        self._crc = crc32(data, self._crc)
         self._offset += len(data)
 
     def _summary(self, start: int) -> tuple[bytes, bytes]:
