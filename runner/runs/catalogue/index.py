@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, TypeVar
 
-from peewee import DatabaseError, OperationalError, SqliteDatabase, Tuple, Value, chunked, fn
+from peewee import DatabaseError, OperationalError, SqliteDatabase, chunked, fn
 
 from runner.errors import RunnerError, nearest
 from runner.runs.branches import BranchNode, Origin, parse_origin
@@ -96,22 +96,6 @@ class Index:
             places, total = places[offset : offset + limit], len(places)
         return self._at(places, columns), total
 
-    def largest(
-        self, chosen: Filter, size: Expression, limit: int | None, columns: Sequence[str]
-    ) -> list[IndexRow]:
-        """Return the rows with the largest `size`, an expression, that match a filter.
-
-        Args:
-            size: what to sort by, descending.
-        """
-        self._check_settings(chosen)
-        if limit is None:
-            query = self._of(chosen, *_stored(columns)).order_by(size.desc(), Row.id)
-            return list(query.dicts().bind(self._database))
-        # Sorting only the places needs no look at whole rows, which are ten times as large.
-        places = self._of(chosen, Row.root, Row.entry).order_by(size.desc(), Row.id).limit(limit)
-        return self._at(list(self._tuples(places)), columns)
-
     def _at(self, places: Sequence[SqlRow], columns: Sequence[str] | None) -> list[IndexRow]:
         """Return the rows of folders, given by root and entry, in their order."""
         found: dict[tuple[str, str], IndexRow] = {}
@@ -123,38 +107,16 @@ class Index:
                 found |= {(root, row["entry"]): row for row in some.dicts().bind(self._database)}
         return [found[place] for place in places]
 
-    def sums(self, chosen: Filter, columns: Sequence[Expression]) -> list[int]:
-        """Return aggregates over the rows that match a filter; 0 where there is nothing to add up."""
-        self._check_settings(chosen)
-        (sums,) = self._tuples(self._of(chosen, *columns))
-        return [number or 0 for number in sums]
-
-    def _recorded_twice(self, digests: Sequence[str] | None = None) -> Expression:
-        """Return the query for digests that several rows have; mostly few, found in an index of SQLite."""
-        recorded = Row.select(Row.digest).where(Row.digest.is_null(False) & Row.root.in_(self.roots))
-        if digests is not None and len(digests) <= _MAX_VALUES:
-            recorded = recorded.where(Row.digest.in_(digests))
-        return recorded.group_by(Row.digest).having(fn.COUNT(Row.entry) > 1)
-
-    def is_copy(self) -> object:
-        """Return the condition that another run, the one in `originals`, recorded a row's content first."""
-        first = Row.alias()
-        age, of_first = ((each.created, each.id, each.root, each.entry) for each in (Row, first))
-        earlier = first.select(Value(1)).where(
-            (first.digest == Row.digest)
-            & first.root.in_(self.roots)
-            & first.id.is_null(False)
-            & (Tuple(*of_first) < Tuple(*age))
-        )
-        return Row.digest.in_(self._recorded_twice()) & fn.EXISTS(earlier)
-
     def originals(self, digests: Sequence[str] | None = None) -> dict[str, tuple[str, str, str]]:
         """Return root, entry and id of the first run with each content that was recorded twice or more.
 
         Args:
             digests: the contents; all by default, or if they are very many.
         """
-        several = self._recorded_twice(digests)
+        recorded = Row.select(Row.digest).where(Row.digest.is_null(False) & Row.root.in_(self.roots))
+        if digests is not None and len(digests) <= _MAX_VALUES:
+            recorded = recorded.where(Row.digest.in_(digests))
+        several = recorded.group_by(Row.digest).having(fn.COUNT(Row.entry) > 1)
         if not list(self._tuples(several.limit(1))):
             return {}
         first = self._of(Filter(Row.digest.in_(several)), Row.digest, Row.root, Row.entry, Row.id)

@@ -28,11 +28,6 @@ _NAME: Final = 200
 """The most characters of a logged name."""
 _TEXT: Final = 4000
 """The most characters of a text, and the most values of a configuration."""
-_SUMMED: Final = (
-    *("root", "used_recording", "used_other", "used_left_over", "used_freed"),
-    *("status", "tags", "digest", "created", "id"),
-)
-"""The columns for sums of disk usage: an SQLite index over them saves reading all rows."""
 
 SqlRow = tuple[Any, ...]
 """The values of a row that SQLite returns."""
@@ -81,11 +76,6 @@ class Row(Model):
     parent: TextField
     words: TextField
     settings: TextField
-    used_recording = BigIntegerField(null=True)
-    """Disk usage of its folder, in bytes; null until it is measured."""
-    used_other = BigIntegerField(null=True)
-    used_left_over = BigIntegerField(null=True)
-    used_freed = BigIntegerField(null=True)
 
     class Meta:
         """The options of the table."""
@@ -98,7 +88,6 @@ class Row(Model):
             (("digest",), False),
             (("parent",), False),
             (("root", "created", "id", "name", "seed"), False),
-            (_SUMMED, False),
         )
 
 

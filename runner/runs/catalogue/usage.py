@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import heapq
 import os
 import re
 import stat
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
-from typing import Final, NamedTuple
-
-from peewee import Case, DatabaseError, Value, chunked, fn
+from typing import Final
 
 from runner.recording.labels import KEEP, LABELS_FILE, LOCK_FILE
 from runner.runs.catalogue.columns import IndexRow
-from runner.runs.catalogue.database import open_index
 from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import Index
-from runner.runs.catalogue.rows import Expression, Row
 from runner.runs.locking import RUN_LOCK
 from runner.runs.run import RECORDING_FILE, RUN_FILE, UNLISTED
 from runner.runs.store import Store
@@ -36,6 +32,8 @@ _LEFT_OVER: Final = re.compile(
     r"recording\.(resuming|repairing|rerecording|restoring)|recording\.damaged-\d+\.mcap"
     r"|\.[0-9a-f]{8}\.(run|labels)\.json|(run|labels)\.[0-9a-f]{8}\.tmp"
 )
+_COLUMNS: Final = ("root", "entry", "id", "name", "status", "tags", "digest")
+"""The columns of the index that are needed of a run."""
 _KEY: Final = re.compile(r"-[0-9a-f]+(\.\w+)+$")
 """The end of a cached file's name, after the ids."""
 
@@ -55,7 +53,7 @@ class Contents:
     """Names that no run has: the user's own files, folders, links."""
 
 
-def contents_of(folder: Path) -> Contents:
+def contents_of(folder: str | Path) -> Contents:
     """Return what is in a run's folder.
 
     Raises:
@@ -114,34 +112,19 @@ class Usage:
     """The disk usage of a run, in bytes."""
 
     row: IndexRow
-    """The run's row in the index."""
-    contents: Contents
+    """The run's row in the index, with `same_as`."""
+    recording: int
+    other: int
+    """The other files in its folder."""
     checkpoints: int
     """The contents of its checkpoints; what several runs share counts for one of them."""
     exports: int
     restored: int
 
     @property
-    def recording(self) -> int:
-        """Bytes of its recording."""
-        return self.contents.recording
-
-    @property
-    def other(self) -> int:
-        """Bytes of the other files in its folder."""
-        return self.contents.other
-
-    @property
     def total(self) -> int:
         """All bytes."""
         return self.recording + self.other + self.checkpoints + self.exports + self.restored
-
-
-COLUMNS_OF_USAGE: Final = (
-    *("root", "entry", "id", "name", "status", "tags", "digest", "fingerprint", "mark", "stable"),
-    *("used_recording", "used_other", "used_left_over", "used_freed"),
-)
-"""The columns of the index that a `Usage` needs."""
 
 
 @dataclass
@@ -151,15 +134,15 @@ class Sums:
     runs: int = 0
     recording: int = 0
     other: int = 0
+    checkpoints: int = 0
+    exports: int = 0
+    restored: int = 0
     same_content: int = 0
     """Freed by removing runs whose content another run recorded first; not counting protected runs."""
     unfinished: int = 0
     """Freed by removing interrupted and failed runs; not counting protected runs."""
     left_over: int = 0
     """Left by repairs and interrupted commands; not counting protected runs."""
-    checkpoints: int = 0
-    exports: int = 0
-    restored: int = 0
 
     def by_kind(self) -> dict[str, int]:
         """Return the bytes by kind, and their total."""
@@ -181,12 +164,12 @@ class Sums:
             "half_removed": sum(contents.recording + contents.other for contents in interrupted),
         }
 
-    def add(self, usage: Usage) -> None:
-        """Add a run whose folder was measured just now, without its cached files."""
-        row, contents = usage.row, usage.contents
+    def add(self, usage: Usage, contents: Contents) -> None:
+        """Add a run."""
+        row = usage.row
         self.runs += 1
-        self.recording += contents.recording
-        self.other += contents.other
+        for kind in KINDS:
+            setattr(self, kind, getattr(self, kind) + getattr(usage, kind))
         if KEEP in row["tags"].split() or row["status"] == "running":
             return
         self.left_over += contents.left_over
@@ -195,114 +178,37 @@ class Sums:
 
 
 def usage_of(
-    read: Callable[[Callable[[Index], _Stored]], _Stored], chosen: Filter, limit: int | None
+    read: Callable[[Callable[[Index], list[IndexRow]]], list[IndexRow]], chosen: Filter, limit: int | None
 ) -> tuple[list[Usage], Sums]:
     """Return the runs that use most of the disk, the largest first, and the sums over all runs.
 
-    SQLite adds up and sorts what the index has. Folders that are new or changed are measured here, after the
-    index was read: that may take long, and must not keep others from writing to it.
+    The folders are measured after the index was read: that may take long, and must not keep others from
+    writing to it.
 
     Args:
         read: calls some work with the index and returns its result, as `look` does.
     """
     exports, restored = cached(EXPORTS) + cached(TABLES), cached(RESTORED)
-    contents_in = lru_cache(lambda root: Store(Path(root)).sizes())
+    rows = read(lambda index: index.with_same_as(index.select(chosen, columns=_COLUMNS)))
+    checkpoints = {root: Store(Path(root)).sizes() for root in {row["root"] for row in rows}}
+    sums = Sums()
 
-    def read_index(index: Index) -> _Stored:
-        with_more = {*exports, *restored}.union(*map(contents_in, index.roots))
-        return _stored(index, chosen, with_more, limit)
+    def measured() -> Iterator[Usage]:
+        for row in rows:
+            root, entry, run_id = row["root"], row["entry"], row["id"]
+            try:
+                contents = contents_of(f"{root}{os.sep}{entry}")
+            except OSError:
+                contents = Contents()  # removed just now
+            kept = checkpoints[root].get(entry, 0)
+            usage = Usage(row, contents.recording, contents.other, kept, exports[run_id], restored[run_id])
+            sums.add(usage, contents)
+            yield usage
 
-    stored = read(read_index)
-
-    def usage(row: IndexRow, contents: Contents) -> Usage:
-        kept = contents_in(row["root"]).get(row["entry"], 0)
-        return Usage(row, contents, kept, exports[row["id"]], restored[row["id"]])
-
-    found = {
-        (row["root"], row["entry"]): usage(row, Contents(*(row[name] for name in COLUMNS_OF_USAGE[-4:])))
-        for row in stored.measured
-    }
-    every, sums, measured = list(found.values()), stored.sums, []
-    for row in stored.unmeasured:
-        try:
-            contents = contents_of(Path(row["root"], row["entry"]))
-        except OSError:
-            contents = Contents()  # removed just now
-        if row["stable"] and row["status"] != "running" and not contents.foreign:
-            measured.append((row, contents))
-        every.append(usage(row, contents))
-        sums.add(every[-1])
-    if measured:
-        _store(measured)
-    sums.checkpoints = sum(each.checkpoints for each in every)
-    sums.exports = sum(each.exports for each in every)
-    sums.restored = sum(each.restored for each in every)
-    every.sort(key=lambda usage: (-usage.total, usage.row["id"]))
-    return every[:limit], sums
-
-
-class _Stored(NamedTuple):
-    """What the index has of the runs' usage."""
-
-    sums: Sums
-    """Over the measured runs; without cached files."""
-    measured: list[IndexRow]
-    """Of the measured runs: the largest, and all that have cached files."""
-    unmeasured: list[IndexRow]
-    """The runs whose folders have to be measured."""
-
-
-def _stored(index: Index, chosen: Filter, with_cache: set[str], limit: int | None) -> _Stored:
-    is_measured = Row.used_recording.is_null(False)
-    sums = Sums(*index.sums(chosen.also(is_measured), _summed(index)))
-    own = Row.used_recording + Row.used_other
-    measured = index.largest(chosen.also(is_measured), own, limit, COLUMNS_OF_USAGE)
-    if limit is not None:  # a run that is small by itself may have large files in the cache
-        for ids in chunked(sorted(with_cache), 500):
-            measured += index.select(chosen.also(is_measured & Row.id.in_(ids)), columns=COLUMNS_OF_USAGE)
-    unmeasured = index.select(chosen.also(Row.used_recording.is_null()), columns=COLUMNS_OF_USAGE)
-    index.with_same_as([*measured, *unmeasured])
-    return _Stored(sums, measured, unmeasured)
-
-
-def _summed(index: Index) -> list[object]:
-    """Return the sums for the fields of `Sums`, in their order, without the last two."""
-    line = "\n"
-    protected = fn.INSTR(Value(line).concat(Row.tags).concat(line), f"{line}{KEEP}{line}") > 0
-    free = ~protected & (Row.status != "running")
-
-    def total(condition: Expression, column: Expression) -> Expression:
-        return fn.SUM(Case(None, [(condition, column)], 0))
-
-    return [
-        fn.COUNT(Row.entry),
-        fn.SUM(Row.used_recording),
-        fn.SUM(Row.used_other),
-        total(free & index.is_copy(), Row.used_freed),
-        total(free & Row.status.in_(("interrupted", "failed")), Row.used_freed),
-        total(free, Row.used_left_over),
-    ]
-
-
-def _store(measured: Sequence[tuple[IndexRow, Contents]]) -> None:
-    """Store what was measured in the index, if it can be written; not of folders that changed since."""
-    statement = (
-        f"UPDATE {Row._meta.table_name} SET used_recording=?, used_other=?, used_left_over=?, used_freed=? "
-        "WHERE root=? AND entry=? AND mark=? AND fingerprint=?"
+    largest = heapq.nsmallest(
+        len(rows) if limit is None else limit, measured(), key=lambda usage: (-usage.total, usage.row["id"])
     )
-    values = [
-        (
-            *(contents.recording, contents.other, contents.left_over, contents.freed),
-            *(row["root"], row["entry"], row["mark"], row["fingerprint"]),
-        )
-        for row, contents in measured
-    ]
-    with (
-        contextlib.suppress(DatabaseError, OSError),
-        contextlib.closing(open_index(lambda _: None)) as database,
-        database.atomic("IMMEDIATE"),
-    ):
-        database.connection().executemany(statement, values)  # type: ignore[no-untyped-call]
+    return largest, sums
 
 
 def strays(root: Path) -> list[Path]:
