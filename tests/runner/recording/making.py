@@ -7,9 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
 from runner.execution.session import run_job
+from runner.recording import schema
+from runner.recording.reader import open_recording
 from runner.recording.rewriting import rewrite
 from runner.runs.run import Run, create_run
 
@@ -66,3 +71,16 @@ def make_run(folder: Path, *parts: dict[str, Any], seed: int = 0, **values: Any)
     """Return a finished run of an experiment."""
     config = experiment(*parts, **values)
     return run_job(Job(config, seed), create_run(folder, config, seed))
+
+
+def training(run: Run, start: int = 0, stop: int | None = None) -> NDArray[np.void]:
+    """Return recorded training steps of a run."""
+    with open_recording(run.recording) as recording:
+        blocks = recording.blocks(schema.TRAIN_STEP, start, stop)
+        return np.concatenate([np.empty(0, recording.dtypes[schema.TRAIN_STEP]), *blocks])
+
+
+def middle_of(run: Run, share: float = 0.5) -> int:
+    """Return a training step of a run, within an episode."""
+    steps = training(run)
+    return int(next(step["step"] for step in steps[int(len(steps) * share) :] if step["t"] > 2))

@@ -10,36 +10,21 @@ import sqlite3
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pytest
 
 import runner
-from runner.config import from_mapping
 from runner.errors import RunNotFound
-from runner.recording.labels import LABELS_FILE, Labels, change_labels, read_labels
+from runner.recording.labels import Labels, change_labels, read_labels
 from runner.runs.catalogue import folders
 from runner.runs.catalogue.database import index_path, open_index
-from runner.runs.catalogue.filters import Filter, parse
 from runner.runs.catalogue.folders import Folders
 from runner.runs.catalogue.index import look
 from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
 from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run
-
-CONFIG = from_mapping({"name": "some", "episodes": 5})
-ALL = Filter(None)
-
-
-@pytest.fixture(autouse=True)
-def _cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-
-
-@pytest.fixture
-def folder(tmp_path):
-    return tmp_path / "recordings"
+from tests.runner.runs.listed import ALL, CONFIG, aged, ids, rows
 
 
 @pytest.fixture(scope="module")
@@ -48,23 +33,6 @@ def recorded(tmp_path_factory):
     made = tmp_path_factory.mktemp("one")
     (made / "tiny.yaml").write_text("name: tiny\nepisodes: 4\nevaluation: {every: 2, trials: 2}\nseed: 1\n")
     return runner.run(made / "tiny.yaml", recordings=made / "recordings").folder
-
-
-def rows(*folders, text=""):
-    messages = []
-    found = look(folders, lambda index: index.select(parse(text)), messages.append)
-    return found, messages
-
-
-def ids(folder, text=""):
-    return [row["id"] for row in rows(folder, text=text)[0]]
-
-
-def aged(folder):
-    """Make everything in a folder look as if it had last changed an hour ago, and read it so."""
-    for path in folder.rglob("*"):
-        os.utime(path, (time.time() - 3600,) * 2)
-    ids(folder)
 
 
 def test_the_index_agrees_with_the_folder(folder, recorded):
@@ -147,44 +115,6 @@ def test_a_run_is_found_in_the_recording_alone_and_keeps_its_labels(folder, reco
     assert json.loads(whole["settings"]) == json.loads(alone["settings"])
 
 
-@pytest.mark.parametrize(
-    "damage", ["deleted", "text", "truncated", "zeros inside", "foreign", "another version"]
-)
-def test_a_lost_or_damaged_index_is_rebuilt(folder, damage):
-    made = [create_run(folder, CONFIG, seed).run_id for seed in range(40)]
-    ids(folder)
-    path = index_path()
-    match damage:
-        case "deleted":
-            path.unlink()
-        case "text":
-            path.write_text("no database" * 1000)
-        case "truncated":
-            path.write_bytes(path.read_bytes()[:5000])
-        case "zeros inside":
-            path.write_bytes(path.read_bytes()[:4096] + bytes(path.stat().st_size - 4096))
-        case "foreign":
-            path.unlink()
-            with sqlite3.connect(path) as other:
-                other.execute("CREATE TABLE runs (a)")
-        case "another version":
-            with sqlite3.connect(path) as other:
-                other.execute("PRAGMA user_version = 99")
-    found, messages = rows(folder)
-    assert {row["id"] for row in found} == set(made)
-    assert (not messages) == (damage == "deleted")
-    assert rows(folder)[1] == []
-
-
-def test_without_a_place_for_the_index_the_folders_are_read(folder, tmp_path, monkeypatch):
-    run = create_run(folder, CONFIG, 1)
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    found, messages = rows(folder)
-    assert [row["id"] for row in found] == [run.run_id]
-    assert "cannot be used" in messages[0]
-
-
 def test_the_index_is_never_needed(folder):
     runs = [create_run(folder, CONFIG, seed) for seed in range(3)]
     change_labels(runs[1].folder, lambda _: Labels("patient", ("keep",), "why"))
@@ -203,93 +133,6 @@ def test_several_folders_and_the_same_content_in_them(folder, recorded, tmp_path
     (original,) = look(both, lambda index: index.originals()).values()
     assert original[2] == rows(folder)[0][0]["id"]
     assert look([folder], lambda index: index.originals()) == {}
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"",
-        b"{}",
-        b"[" * 100_000,
-        b'{"run_id": "../a", "name": "a", "seed": 1, "status": "x", "created": "2026-01-01"}',
-        b" " * (9 << 20),
-    ],
-)
-def test_what_is_no_run_is_left_out(folder, content):
-    run = create_run(folder, CONFIG, 1)
-    (folder / "hostile").mkdir()
-    (folder / "hostile" / RUN_FILE).write_bytes(content)
-    assert ids(folder) == [run.run_id]
-    assert [each.run_id for each in list_runs(folder)] == [run.run_id]
-    assert look([folder], lambda index: len(index.problems())) == 1
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        b'{"run_id": "a", "name": "a", "seed": -1, "status": "x", "created": "2026-01-01"}',
-        b'{"run_id": "a", "name": "a", "seed": 1, "status": "x", "created": "0001-01-01T00:00:00+14:00"}',
-        b'{"run_id": "a"}',
-    ],
-)
-def test_a_run_of_which_little_is_known_is_listed_as_damaged(folder, content):
-    (folder / "a").mkdir(parents=True)
-    (folder / "a" / RUN_FILE).write_bytes(content)
-    assert [(row["id"], row["status"]) for row in rows(folder)[0]] == [("a", "damaged")]
-    assert look([folder], lambda index: len(index.problems())) == 1
-
-
-def test_odd_values_do_no_harm(folder):
-    odd = {
-        "run_id": "odd",
-        "name": "\x1b[31mred\ud800\x00" + "n" * 100_000,
-        "seed": 2**64 - 1,
-        "status": "\x07",
-        "created": "2026-01-01T00:00:00.123456+01:00",
-        "recording": "../../etc/passwd",
-        "config": {
-            "name": 3,
-            "episodes": 10**400,
-            "deep": {"a": [{"b": float("inf")}]},
-            "k\ud800'\"": 1,
-            "env": [],
-        },
-        "summary": {
-            "episodes": "many",
-            "train_steps": True,
-            "last_evaluation": {"success_percent": float("nan")},
-        },
-    }
-    (folder / "odd").mkdir(parents=True)
-    (folder / "odd" / RUN_FILE).write_text(json.dumps(odd))
-    (row,) = rows(folder)[0]
-    assert (row["id"], row["seed"], row["episodes"], row["success_percent"]) == ("odd", 2**64 - 1, None, None)
-    assert len(row["name"]) <= 4000
-    assert list_runs(folder)[0].recording.parent == folder / "odd"
-    assert ids(folder, "seed:18446744073709551615") == ["odd"]
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        "",
-        "[]",
-        '{"tags": "keep", "name": 3, "note": []}',
-        '{"tags": [1, "a b", "\\u001b"], "name": "a\\nb"}',
-        " " * (2 << 20),
-    ],
-)
-def test_hostile_labels_are_ignored(folder, content):
-    run = create_run(folder, CONFIG, 1)
-    (run.folder / LABELS_FILE).write_text(content)
-    assert read_labels(run.folder) == Labels()
-    assert ids(folder, "name:some NOT tag:*") == [run.run_id]
-
-
-def test_a_pipe_in_place_of_a_file_does_not_block(folder):
-    (folder / "pipe").mkdir(parents=True)
-    os.mkfifo(folder / "pipe" / RUN_FILE)
-    assert ids(folder) == []
 
 
 def test_runs_may_vanish_and_come_while_listing(folder):

@@ -2,28 +2,12 @@
 
 from __future__ import annotations
 
-import pytest
-
-from runner.config import from_mapping
 from runner.recording.labels import Labels, change_labels
 from runner.runs.catalogue import usage as usages
-from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import look
 from runner.runs.run import create_run
 from runner.util.files import EXPORTS, RESTORED
-
-CONFIG = from_mapping({"name": "some", "episodes": 5})
-ALL = Filter(None)
-
-
-@pytest.fixture(autouse=True)
-def _cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-
-
-@pytest.fixture
-def folder(tmp_path):
-    return tmp_path / "recordings"
+from tests.runner.runs.listed import ALL, CONFIG
 
 
 def test_a_change_in_the_folder_of_a_run_is_measured(folder):

@@ -11,7 +11,7 @@ import sys
 
 import numpy as np
 import pytest
-from submitted import ICY
+from checked_pages import ACCEPT_HTML, page_of
 
 import runner
 from runner.environments.naming import deeds_in_words, states_in_words
@@ -20,25 +20,8 @@ from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import reader
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
-from tests.runner.export.outline import Outline
 from tests.runner.loops.making import make, play
 from tests.waiting import until
-
-ACCEPT_HTML = {"Accept": "text/html"}
-
-
-def page_of(client, address, status=200):
-    answer = client.get(address, headers=ACCEPT_HTML)
-    assert answer.status_code == status, (address, answer.text)
-    assert answer.headers["content-type"].startswith("text/html")
-    outline = Outline()
-    outline.feed(answer.text)
-    assert outline.open == []
-    assert len(outline.ids) == len(set(outline.ids))
-    assert not re.search(r"<style|\sstyle=|\son\w+=|<script(?![^>]*\ssrc=)|javascript:", answer.text)
-    own = ("/", "#", "?", "data:image/")
-    assert [other for other in outline.addresses if not other.startswith(own)] == [], address
-    return answer.text
 
 
 def test_the_first_page_is_the_runs(client):
@@ -68,18 +51,6 @@ def test_the_page_notes_when_not_all_evaluations_are_shown(client, monkeypatch):
     page = page_of(client, "/runs/first/evaluations")
     assert "The last 2 of 7;" in page
     assert re.findall(r'replay/eval/(\d+)/0"', page) == ["50", "60"]
-
-
-def test_the_form_describes_the_keys(client):
-    config, sweep = page_of(client, "/submit"), page_of(client, "/submit?sweep=true")
-    assert "<code>epsilon</code>" in config
-    assert "<code>strategy</code>" not in config
-    assert re.search("<dd>[^<]*`", config) is None, "code is set as code"
-    assert (
-        sweep.index("<code>strategy</code>")
-        < sweep.index("Keys of its base")
-        < sweep.index("<code>epsilon</code>")
-    )
 
 
 def test_a_search_keeps_the_columns_and_their_order(client):
@@ -262,46 +233,6 @@ def test_the_time_and_the_machine_are_shown(client, recordings):
     assert "<figure" in client.get("/runs/first/system/part?status=finished").text
 
 
-def test_labels_are_changed_by_a_form(client):
-    fields = {"name": "renamed", "tags": "keep good", "note": "<b>bold</b>\r\nand more"}
-    assert client.post("/runs/first/labels", data=fields, follow_redirects=False).status_code == 303
-    page = page_of(client, "/runs/renamed")
-    assert "&lt;b&gt;bold&lt;/b&gt;\nand more" in page
-    assert "filter=tag:keep" in page
-    assert client.get("/api/v1/runs/renamed").json()["tags"] == ["good", "keep"]
-    answer = client.post("/runs/renamed/labels", data=fields | {"tags": "$$"}, headers=ACCEPT_HTML)
-    assert answer.status_code == 400
-    assert "expected 1 to 64 letters" in answer.text
-
-
-def test_mistakes_are_shown_at_their_lines(client):
-    text = "name: mistaken\nepisodes: many\nepisode: 3\n"
-    answer = client.post("/submit", data={"text": text, "action": "submit"}, headers=ACCEPT_HTML)
-    assert answer.status_code == 422
-    assert 'data-line="2"' in answer.text
-    assert "<pre>episodes: many</pre>" in answer.text
-    assert 'data-line="3"' in answer.text
-    assert "episodes: many\nepisode: 3" in answer.text
-    assert client.get("/api/v1/jobs").json()["total"] == 0
-
-
-def test_a_form_of_another_site_is_refused(client):
-    for address in ("/submit", "/runs/first/labels", "/queue/1/cancel"):
-        answer = client.post(address, data={"text": "name: x"}, headers={"Origin": "http://evil.example"})
-        assert answer.status_code == 403
-
-
-def test_a_job_is_shown_and_cancelled(client):
-    text = "name: shown\nmode: cooperative\nepisodes: 1000000\nrecording: {steps: none}\n"
-    answer = client.post("/submit", data={"text": text}, headers=ACCEPT_HTML, follow_redirects=False)
-    assert answer.headers["location"] == "/queue/1"
-    assert "episodes: 1000000" in page_of(client, "/queue/1")
-    assert 'class="status' in page_of(client, "/queue")
-    assert client.post("/queue/1/cancel", follow_redirects=False).status_code == 303
-    assert "cancelled" in page_of(client, "/queue/1")
-    assert client.post("/queue/1/cancel", headers=ACCEPT_HTML).status_code == 409
-
-
 def test_the_status_of_a_run_is_updated_while_it_runs_only(client, recordings):
     assert client.get("/runs/first/status").status_code == 204
     file = find_run("first", recordings).folder / "run.json"
@@ -392,17 +323,3 @@ def test_pages_link_a_run_with_its_branches(client, recordings):
 
 def test_some_of_the_runs_are_counted_in_the_plural(client):
     assert "1 of 2 runs" in page_of(client, "/runs?filter=name:first")
-
-
-def test_the_page_of_a_finished_job_links_to_its_run_and_requests_no_events(client):
-    number = client.post("/api/v1/jobs", content=json.dumps(ICY | {"seeds": [0]})).json()["number"]
-    job = until(lambda job: job["state"] == "finished", lambda: client.get(f"/api/v1/jobs/{number}").json())
-    page = page_of(client, f"/queue/{number}")
-    run_id = job["begun"][0]["run_id"]
-    assert f'href="/runs/{run_id}">The run</a>' in page
-    assert f'run <a href="/runs/{run_id}">{run_id}</a> started' in page
-    assert "started</small>" not in page
-    assert "data-active" not in page
-    assert re.search(r"ago, finished <time[^>]* data-age>[^<]+</time> ago, took [\d.]+ s<", page)
-    place = re.search(r'data-place="(\d+)"', page)[1]
-    assert client.get(f"/api/v1/jobs/{number}/events?after={place}").status_code == 204
