@@ -9,17 +9,16 @@ from __future__ import annotations
 import contextlib
 import errno
 import importlib
-import inspect
 import json
 import os
-import re
 import sys
 from collections.abc import Sequence
 from typing import Any, Final
 
 import click
 
-from runner.errors import ConfigError, ConfigProblem, ExitCode, RunnerError, StorageError, nearest
+from runner.cli.command import Group
+from runner.errors import ConfigError, ConfigProblem, ExitCode, RunnerError, StorageError
 from runner.util.version import __version__
 
 COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
@@ -149,42 +148,6 @@ def error_as_json(message: str, exit_code: int, problems: Sequence[ConfigProblem
     """Return an error as a line of JSON, in the form of the service's API, with further keys."""
     located = [problem._asdict() for problem in problems]
     return json.dumps({"error": {"message": message, "exit_code": exit_code, **more, "problems": located}})
-
-
-def _with_examples(text: str | None) -> str | None:
-    """Return a help text with Click's mark for preformatted text before its examples and other lists."""
-    return text and re.sub(r"\n\n(?=[A-Z][a-z ]*:\n)", "\n\n\b\n", inspect.cleandoc(text))
-
-
-class Command(click.Command):
-    """A command whose help keeps the lines of its examples."""
-
-    def __init__(self, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **options)
-        self.help = _with_examples(self.help)
-
-
-class Group(click.Group):
-    """A group of such commands, which suggests the nearest name for an unknown one."""
-
-    command_class = Command
-
-    def __init__(self, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **options)
-        self.help = _with_examples(self.help)
-
-    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
-        """Return the names in the order of definition."""
-        return list(self.commands)
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find a command, or suggest one."""
-        known = self.list_commands(ctx)
-        if args[0] not in known and not args[0].startswith("-") and not ctx.resilient_parsing:
-            ctx.fail(f"there is no command {args[0]!r}.{nearest(args[0], known)}")
-        return super().resolve_command(ctx, args)
 
 
 class LazyGroup(Group):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from runner.cli.command import argument, option, record
+from runner.cli.output import print_written
 from runner.cli.parameter_types import (
     AXIS,
     COUNT,
@@ -21,27 +23,26 @@ from runner.cli.parameter_types import (
     TARGET,
     TRIAL,
     ConfigName,
+    Ranges,
     RunName,
 )
 
 if TYPE_CHECKING:
-    pass
-
-EXPORTS: Final = Path("exports")
-"""Where commands write files by default; Git ignores it in a clone."""
-
-Decorator = Callable[[Callable[..., Any]], Any]
+    from runner.export.episodes import EpisodePlace
+    from runner.export.plots.metrics import CurveStyle
+    from runner.export.rerun.selection import Request
+    from runner.recording.reader import Recording
 
 # --- arguments --------------------------------------------------------------------------------------------
 
-run_argument: Final = click.argument("run_name", metavar="RUN", type=RunName())
-runs_argument: Final = click.argument("run_names", metavar="RUN...", nargs=-1, required=True, type=RunName())
-config_argument: Final = click.argument("config", metavar="CONFIG", type=ConfigName())
-filter_argument: Final = click.argument("words", metavar="[FILTER]...", nargs=-1, type=FILTER_WORD)
+run_argument: Final = argument(metavar="RUN", type=RunName())
+runs_argument: Final = argument(metavar="RUN...", nargs=-1, required=True, type=RunName())
+config_argument: Final = argument(metavar="CONFIG", type=ConfigName())
+filter_argument: Final = argument(metavar="[FILTER]...", nargs=-1, type=FILTER_WORD)
 
 # --- options ----------------------------------------------------------------------------------------------
 
-recordings_option: Final = click.option(
+recordings_option: Final = option(
     "--recordings",
     type=DIRECTORY,
     metavar="DIR",
@@ -55,7 +56,7 @@ def _folders(_ctx: click.Context, _param: click.Parameter, value: tuple[Path, ..
     return value or (recordings_folder(),)
 
 
-folders_option: Final = click.option(
+folders_option: Final = option(
     "--recordings",
     type=DIRECTORY,
     metavar="DIR",
@@ -63,21 +64,20 @@ folders_option: Final = click.option(
     callback=_folders,
     help="A folder of runs; may be repeated.  [default: $DUALTAXI_RECORDINGS, or ./recordings]",
 )
-set_option: Final = click.option(
+set_option: Final = option(
     "--set",
-    "overrides",
     multiple=True,
     type=SETTING,
     metavar="KEY=VALUE",
     help="Override a value of the configuration, such as evaluation.trials=50; may be repeated.",
 )
-json_option: Final = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-markdown_option: Final = click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown.")
-html_option: Final = click.option(
+json_option: Final = option("--json", is_flag=True, help="Print JSON.")
+markdown_option: Final = option("--markdown", is_flag=True, help="Print Markdown.")
+html_option: Final = option(
     "--html", type=click.Path(path_type=Path), metavar="FILE", help="Write an HTML page instead."
 )
-force_option: Final = click.option("--force", is_flag=True, help="Replace existing output.")
-accept_changes_option: Final = click.option(
+force_option: Final = option("--force", is_flag=True, help="Replace existing output.")
+accept_changes_option: Final = option(
     "--accept-changes",
     is_flag=True,
     help="Resume although code, environment, file or numerical libraries have changed.",
@@ -91,19 +91,19 @@ def _trusted(_context: click.Context, _option: click.Parameter, value: bool) -> 
     return value
 
 
-trust_option: Final = click.option(
+trust_option: Final = option(
     "--trust",
     is_flag=True,
     callback=_trusted,
     help="Import what the recording names, also from the current folder: run code that you trust only.",
 )
-checkpoint_option: Final = click.option(
+checkpoint_option: Final = option(
     "--checkpoint", metavar="[NAME]@STEP", help="The last checkpoint at or before this step, of this name."
 )
-policy_option: Final = click.option(
+policy_option: Final = option(
     "--policy", metavar="MODULE:FUNCTION", help="Your function that makes a policy of a checkpoint."
 )
-axis_option: Final = click.option(
+axis_option: Final = option(
     "--axis",
     type=AXIS,
     default="episodes",
@@ -113,88 +113,126 @@ axis_option: Final = click.option(
 )
 
 
-def curve_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options on how curves are drawn: axis, lines, smooth, log_x and log_y."""
-    for option in (
-        click.option("--log-y", is_flag=True, help="Logarithmic vertical axes."),
-        click.option("--log-x", is_flag=True, help="A logarithmic horizontal axis."),
-        click.option(
-            "--smooth",
-            type=click.FloatRange(0, 100),
-            default=0.0,
-            metavar="PERCENT",
-            help="Draw exponential means with this memory, in percent of the axis; values faintly behind.",
-        ),
-        click.option("--lines", is_flag=True, help="Draw each run as a thin line too."),
-        axis_option,
-    ):
-        command = option(command)
-    return command
+@record
+def curve_options(
+    lines: bool = option("--lines", is_flag=True, help="Draw each run as a thin line too."),
+    smooth: float = option(
+        "--smooth",
+        type=click.FloatRange(0, 100),
+        default=0.0,
+        metavar="PERCENT",
+        help="Draw exponential means with this memory, in percent of the axis; values faintly behind.",
+    ),
+    log_x: bool = option("--log-x", is_flag=True, help="A logarithmic horizontal axis."),
+    log_y: bool = option("--log-y", is_flag=True, help="Logarithmic vertical axes."),
+) -> CurveStyle:
+    """Return how curves are drawn."""
+    from runner.export.plots.metrics import CurveStyle
+
+    return CurveStyle(lines, smooth, log_x, log_y)
 
 
-normalise_option: Final = click.option(
+normalise_option: Final = option(
     "--normalise",
     metavar="FILE|minmax",
     help="Compare over environments, by a table of random and expert scores, or the worst and best values.",
 )
-all_option: Final = click.option(
-    "--all", "everything", is_flag=True, help="Include everything, not only a selection."
-)
-episode_option: Final = click.option(
+all_option: Final = option("--all", is_flag=True, help="Include everything, not only a selection.")
+episode_option: Final = option(
     "--episode", type=INDEX, metavar="N", help="A training episode, counted from 0."
 )
-episodes_option: Final = click.option(
+episodes_option: Final = option(
     "--episodes", type=RANGES, metavar="RANGES", help="Episodes, such as 0:20,49980:50000."
 )
-trial_option: Final = click.option(
+trial_option: Final = option(
     "--eval",
-    "trial",
     type=TRIAL,
     metavar="N:TRIAL",
     help="A trial, counted from 0, of the evaluation after N training episodes.",
 )
-best_option: Final = click.option("--best", is_flag=True, help="The episode of the highest return.")
-worst_option: Final = click.option("--worst", is_flag=True, help="The episode of the lowest return.")
 
 
-def require_one_choice(**choices: object) -> None:
-    """Refuse options that exclude each other, given by name; None and False are not given.
+@dataclass(frozen=True)
+class EpisodeChoice:
+    """The episode that options name."""
 
-    Raises:
-        UsageError: there is more than one.
-    """
-    given = [f"--{name}" for name, value in choices.items() if value is not None and value is not False]
-    if len(given) > 1:
-        raise click.UsageError(f"{' and '.join(given[:2])} exclude each other: choose one.")
+    episode: int | None = episode_option
+    trial: tuple[int, int] | None = trial_option
+    best: bool = option("--best", is_flag=True, help="The episode of the highest return.")
+    worst: bool = option("--worst", is_flag=True, help="The episode of the lowest return.")
+
+    def require_one(self, **others: object) -> None:
+        """Refuse options that exclude each other, `others` by name too; None and False are not given.
+
+        Raises:
+            UsageError: there is more than one.
+        """
+        choices = {"episode": self.episode, "eval": self.trial, "best": self.best, "worst": self.worst}
+        given = [f"--{name}" for name, value in (choices | others).items() if value not in (None, False)]
+        if len(given) > 1:
+            raise click.UsageError(f"{' and '.join(given[:2])} exclude each other: choose one.")
+
+    def find(self, recording: Recording) -> EpisodePlace:
+        """Return where the episode stands; without options, a typical one."""
+        from runner.export.episodes import chosen_episode, extreme_episode
+
+        if self.best or self.worst:
+            return extreme_episode(recording, self.best)
+        return chosen_episode(recording, self.episode, self.trial)
 
 
-def output_option(default: Path | str, metavar: str = "FILE") -> Decorator:
-    """Return the option -o, with a default path, or a text that describes the default."""
+choice_options: Final = record(EpisodeChoice)
+
+
+def output_option(default: str, metavar: str = "FILE") -> Any:
+    """Return the option -o, with a text that describes the default."""
     kind = "file" if metavar.startswith("FILE") else "folder"
-    return click.option(
+    return option(
         "-o",
         "--output",
         type=click.Path(path_type=Path),
-        default=default if isinstance(default, Path) else None,
         metavar=metavar,
         help=f"The {kind} to write.  [default: {default}]",
     )
 
 
-def writing_options(default: Path | str, metavar: str = "FILE") -> Decorator:
-    """Return the options of a command that writes files made from runs; arguments as for `output_option`."""
+@dataclass(frozen=True)
+class Writing:
+    """Where a command writes files made from runs, and how it reports them."""
 
-    def add(command: Callable[..., Any]) -> Callable[..., Any]:
-        for option in (json_option, recordings_option, force_option, output_option(default, metavar)):
-            command = option(command)
-        return command
+    output: Path | None
+    default: str
+    """The path without --output, in which NAME-RUN stands for the run."""
+    force: bool
+    recordings: Path | None
+    as_json: bool
 
-    return add
+    def path(self, file_stem: str = "") -> Path:
+        """Return the path to write; `file_stem` is that of the run."""
+        return self.output or Path(self.default.replace("NAME-RUN", file_stem))
+
+    def report(self, text: str, *paths: Path, **more: object) -> None:
+        """Print what was written, see `print_written`."""
+        print_written(text, self.as_json, *paths, **more)
 
 
-def limit_option(default: int | str) -> Decorator:
+def writing_options(default: str, metavar: str = "FILE") -> Any:
+    """Return the options of a command that writes files made from runs, by default at the path `default`."""
+
+    def writing(
+        output: Path | None = output_option(default, metavar),
+        force: bool = force_option,
+        recordings: Path | None = recordings_option,
+        as_json: bool = json_option,
+    ) -> Writing:
+        return Writing(output, default, force, recordings, as_json)
+
+    return record(writing)
+
+
+def limit_option(default: int | str) -> Any:
     """Return the option --limit, with a default number of rows, or a text that describes the default."""
-    return click.option(
+    return option(
         "--limit",
         type=INDEX,
         default=default if isinstance(default, int) else None,
@@ -203,9 +241,9 @@ def limit_option(default: int | str) -> Decorator:
     )
 
 
-def workers_option(default: int | str) -> Decorator:
+def workers_option(default: int | str) -> Any:
     """Return the option --workers, with a default number, or a text that describes the default."""
-    return click.option(
+    return option(
         "--workers",
         type=click.IntRange(1, 1024),
         default=default if isinstance(default, int) else None,
@@ -214,7 +252,7 @@ def workers_option(default: int | str) -> Decorator:
     )
 
 
-ray_option: Final = click.option(
+ray_option: Final = option(
     "--ray",
     is_flag=False,
     flag_value="",
@@ -223,11 +261,10 @@ ray_option: Final = click.option(
 )
 
 
-def target_option(multiple: bool) -> Decorator:
+def target_option(multiple: bool) -> Any:
     """Return the option --target: a level of a metric; runs are compared when they first reach it."""
-    return click.option(
+    return option(
         "--target",
-        "targets" if multiple else "target",
         multiple=multiple,
         metavar="METRIC=LEVEL",
         type=TARGET,
@@ -236,24 +273,25 @@ def target_option(multiple: bool) -> Decorator:
     )
 
 
-def selection_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options that select the steps to export."""
-    for option in (
-        trust_option,
-        click.option(
-            "--frames",
-            is_flag=True,
-            help="Draw pictures of a loop's selected episodes, by its environment, which is made again.",
-        ),
-        all_option,
-        click.option("--every", type=COUNT, metavar="N", help="Every Nth training episode."),
-        click.option(
-            "--evaluations",
-            type=NUMBERS,
-            metavar="N[,N]",
-            help="The trials of the evaluations after N training episodes.",
-        ),
-        episodes_option,
-    ):
-        command = option(command)
-    return command
+@record
+def selection_options(
+    episodes: Ranges | None = episodes_option,
+    evaluations: tuple[int, ...] | None = option(
+        "--evaluations",
+        type=NUMBERS,
+        metavar="N[,N]",
+        help="The trials of the evaluations after N training episodes.",
+    ),
+    every: int | None = option("--every", type=COUNT, metavar="N", help="Every Nth training episode."),
+    everything: bool = all_option,
+    frames: bool = option(
+        "--frames",
+        is_flag=True,
+        help="Draw pictures of a loop's selected episodes, by its environment, which is made again.",
+    ),
+    trust: bool = trust_option,
+) -> Request:
+    """Return the steps to export."""
+    from runner.export.rerun.selection import Request
+
+    return Request(episodes or (), evaluations or (), every or 0, everything, frames=frames, trust=trust)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.archive.places import default_target
-from runner.cli import Command
+from runner.cli.command import Command, argument, option
 from runner.cli.options import json_option, recordings_option, runs_argument
 from runner.cli.output import draw, facts, print_json, say
 from runner.cli.parameter_types import RunName
@@ -23,25 +23,21 @@ if TYPE_CHECKING:
 
 
 @click.command("archive", cls=Command)
-@runs_argument
-@click.option(
-    "--to",
-    metavar="DIR|URL",
-    help="A folder, or s3://BUCKET/PREFIX.  [default: $DUALTAXI_ARCHIVE, or `archive` next to them]",
-)
-@click.option(
-    "--remove", is_flag=True, help="Remove each recording once its archive has been read back and compared."
-)
-@click.option("--dry-run", is_flag=True, help="Report the sizes, but write and change nothing.")
-@recordings_option
-@json_option
 def archive_command(
-    run_names: tuple[str, ...],
-    to: str | None,
-    remove: bool,
-    dry_run: bool,
-    recordings: Path | None,
-    as_json: bool,
+    run_names: tuple[str, ...] = runs_argument,
+    to: str | None = option(
+        "--to",
+        metavar="DIR|URL",
+        help="A folder, or s3://BUCKET/PREFIX.  [default: $DUALTAXI_ARCHIVE, or `archive` next to them]",
+    ),
+    remove: bool = option(
+        "--remove",
+        is_flag=True,
+        help="Remove each recording once its archive has been read back and compared.",
+    ),
+    dry_run: bool = option("--dry-run", is_flag=True, help="Report the sizes, but write and change nothing."),
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
 ) -> None:
     """Archive runs losslessly as Parquet, which DuckDB, pandas and Polars read (docs/archive.md).
 
@@ -104,10 +100,11 @@ def _print_archived(archived: Archived, dry_run: bool, as_json: bool) -> None:
 
 
 @click.command("restore", cls=Command)
-@click.argument("run_name", metavar="RUN|ARCHIVE", type=RunName())
-@recordings_option
-@json_option
-def restore_command(run_name: str, recordings: Path | None, as_json: bool) -> None:
+def restore_command(
+    run_name: str = argument(metavar="RUN|ARCHIVE", type=RunName()),
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
+) -> None:
     """Restore the recording of an archived run, with the same content digest.
 
     ARCHIVE is the folder or URL of one run's archive: it becomes a run of the recordings folder again, even
@@ -136,11 +133,12 @@ def restore_command(run_name: str, recordings: Path | None, as_json: bool) -> No
 
 
 @click.command("import", cls=Command)
-@click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
-@click.option("--as-new", is_flag=True, help="Give the run a new id.")
-@recordings_option
-@json_option
-def import_command(file: Path, as_new: bool, recordings: Path | None, as_json: bool) -> None:
+def import_command(
+    file: Path = argument(metavar="FILE", type=click.Path(path_type=Path)),
+    as_new: bool = option("--as-new", is_flag=True, help="Give the run a new id."),
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
+) -> None:
     """Import FILE, a recording from elsewhere, into the folder of runs.
 
     FILE was written by `dualtaxi export mcap`, or is any recording. Every byte is checked before the run

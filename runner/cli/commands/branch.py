@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import signal
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 from click.core import ParameterSource
 
 from runner.analysis.sections import Grid
-from runner.cli import Command
+from runner.cli.command import Command, option
 from runner.cli.options import json_option, recordings_option, run_argument, set_option, trust_option
 from runner.cli.output import draw, facts, grid_table, print_json, say
 from runner.cli.parameter_types import COUNT, INDEX, PLACE
@@ -28,56 +29,47 @@ if TYPE_CHECKING:
 
 
 @click.command("branch", cls=Command)
-@run_argument
-@click.option(
-    "--at",
-    type=PLACE,
-    metavar="STEP",
-    help="The step: EPISODE:T, or a training step's number; eval:N:TRIAL:T of an evaluation.",
-)
-@click.option(
-    "--action",
-    "actions",
-    multiple=True,
-    metavar="VALUE",
-    help="The action: a number, a name or all; of one agent of several AGENT=VALUE, may be repeated.  "
-    "[default: as recorded; of a trial of an evaluation all]",
-)
-@set_option
-@click.option(
-    "--episodes", type=COUNT, metavar="N", help="Training episodes in all.  [default: as many as RUN]"
-)
-@click.option(
-    "--policy",
-    default="recorded",
-    show_default=True,
-    metavar="recorded|random|constant|MODULE:FUNCTION",
-    help="Of a loop: what acts after the step.",
-)
-@click.option(
-    "--seed", type=INDEX, default=0, show_default=True, help="Of a loop: seed of the random policy."
-)
-@click.option("--name", help="Name of the new run.  [default: RUN.branch]")
-@click.option(
-    "--max-steps",
-    type=COUNT,
-    default=100_000,
-    show_default=True,
-    metavar="N",
-    help="Of a loop: stop after N steps.",
-)
-@trust_option
-@recordings_option
-@json_option
-@click.pass_context
 def branch_command(
-    ctx: click.Context,
-    /,
-    run_name: str,
-    at: int | StepRef | None,
-    actions: tuple[str, ...],
-    as_json: bool,
-    **options: Any,
+    run_name: str = run_argument,
+    at: int | StepRef | None = option(
+        "--at",
+        type=PLACE,
+        metavar="STEP",
+        help="The step: EPISODE:T, or a training step's number; eval:N:TRIAL:T of an evaluation.",
+    ),
+    actions: tuple[str, ...] = option(
+        "--action",
+        multiple=True,
+        metavar="VALUE",
+        help="The action: a number, a name or all; of one agent of several AGENT=VALUE, may be repeated.  "
+        "[default: as recorded; of a trial of an evaluation all]",
+    ),
+    overrides: tuple[str, ...] = set_option,
+    episodes: int | None = option(
+        "--episodes", type=COUNT, metavar="N", help="Training episodes in all.  [default: as many as RUN]"
+    ),
+    policy: str = option(
+        "--policy",
+        default="recorded",
+        show_default=True,
+        metavar="recorded|random|constant|MODULE:FUNCTION",
+        help="Of a loop: what acts after the step.",
+    ),
+    seed: int = option(
+        "--seed", type=INDEX, default=0, show_default=True, help="Of a loop: seed of the random policy."
+    ),
+    name: str | None = option("--name", help="Name of the new run.  [default: RUN.branch]"),
+    max_steps: int = option(
+        "--max-steps",
+        type=COUNT,
+        default=100_000,
+        show_default=True,
+        metavar="N",
+        help="Of a loop: stop after N steps.",
+    ),
+    trust: bool = trust_option,
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
 ) -> None:
     """Change one step of RUN, and record what follows as a run of its own, with the same luck.
 
@@ -104,7 +96,7 @@ def branch_command(
       dualtaxi branch lander --at 4:100 --action 0.5,-0.2 --policy agent:act
       dualtaxi branch spread --at 0:10 --action agent_0=1 --action agent_2=4
     """
-    run = find_recorded(run_name, options["recordings"])
+    run = find_recorded(run_name, recordings)
     if at is None:
         raise click.UsageError("expected --at EPISODE:T, the step to branch at")
     if not run.can_train_again and "all" in actions:
@@ -117,33 +109,48 @@ def branch_command(
         from runner.analysis.step_reference import reference_to, training_step
         from runner.recording.reader import open_recording
 
-        _refuse_what_training_takes(ctx)
+        _refuse_what_training_takes()
         if isinstance(at, int):
             with open_recording(run.recording) as recording:
                 at = reference_to(recording, training_step(recording, at))
         _print_what_if(run, at, actions, as_json)
         return
-    from runner.api import interruptible
+    from runner.api import Interrupt, interruptible
     from runner.debugging.branch import branch
     from runner.execution.branching import TrainingBranch
 
-    action = _action(actions, run)
+    action, stop = _action(actions, run), Interrupt()
     with contextlib.ExitStack() as stack:
         report = stack.enter_context(steps_line("training" if run.can_train_again else "branching"))
         if run.can_train_again:
             stack.enter_context(compilation_notice())
-            options["stop"] = stack.enter_context(interruptible(second=signal.SIG_DFL))
-        found = branch(run, at=at, action=action, report=report, **options)
+            stop = stack.enter_context(interruptible(second=signal.SIG_DFL))
+        found = branch(
+            run,
+            at=at,
+            action=action,
+            overrides=overrides,
+            episodes=episodes,
+            policy=policy,
+            seed=seed,
+            name=name,
+            recordings=recordings,
+            max_steps=max_steps,
+            trust=trust,
+            report=report,
+            stop=stop,
+        )
     if isinstance(found, TrainingBranch):
-        _print_training(ctx, run, found, as_json)
+        _print_training(run, found, as_json)
     else:
         _print_episode(run, found, as_json)
 
 
-def _refuse_what_training_takes(ctx: click.Context) -> None:
+def _refuse_what_training_takes() -> None:
     """Refuse the options of a new run where nothing is trained or recorded."""
     names = ("overrides", "episodes", "policy", "seed", "name", "max_steps")
-    given = [name for name in names if ctx.get_parameter_source(name) is not ParameterSource.DEFAULT]
+    source_of = click.get_current_context().get_parameter_source
+    given = [name for name in names if source_of(name) is not ParameterSource.DEFAULT]
     if given:
         options = ["--set" if name == "overrides" else f"--{name.replace('_', '-')}" for name in given]
         raise click.UsageError(
@@ -163,7 +170,7 @@ def _action(actions: tuple[str, ...], run: Run) -> object:
     return actions[0] if actions else None
 
 
-def _print_training(ctx: click.Context, parent: Run, branch: TrainingBranch, as_json: bool) -> None:
+def _print_training(parent: Run, branch: TrainingBranch, as_json: bool) -> None:
     run = branch.run
     if as_json:
         print_json(run_as_json(run) | {"origin": asdict(branch.origin), "at": str(branch.at)})
@@ -183,7 +190,7 @@ def _print_training(ctx: click.Context, parent: Run, branch: TrainingBranch, as_
         draw(facts(rows | {"next": command_for(parent, "diff", run.run_id)}))
     if run.status == "interrupted":
         say(f"Interrupted: what was recorded is kept; `{command_for(run, 'resume')}` trains the rest.")
-        ctx.exit(ExitCode.INTERRUPTED)
+        raise click.exceptions.Exit(ExitCode.INTERRUPTED)
 
 
 def _print_episode(parent: Run, branch: Branch, as_json: bool) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import click
 
-from runner.cli import Command, Group
+from runner.cli.command import Command, Group, option
 from runner.cli.options import (
     filter_argument,
     folders_option,
@@ -33,23 +33,20 @@ if TYPE_CHECKING:
 
 
 @click.command("label", cls=Command)
-@run_argument
-@click.option("--name", metavar="NAME", help="Rename the run; an empty NAME restores the original name.")
-@click.option(
-    "--note", metavar="TEXT", help="Replace the note; - reads it from stdin, an empty one removes it."
-)
-@click.option("--tag", "tags", multiple=True, metavar="TAG", help="Add a tag; may be repeated.")
-@click.option("--untag", "untags", multiple=True, metavar="TAG", help="Remove a tag; may be repeated.")
-@recordings_option
-@json_option
 def label_command(
-    run_name: str,
-    name: str | None,
-    note: str | None,
-    tags: tuple[str, ...],
-    untags: tuple[str, ...],
-    recordings: Path | None,
-    as_json: bool,
+    run_name: str = run_argument,
+    name: str | None = option(
+        "--name", metavar="NAME", help="Rename the run; an empty NAME restores the original name."
+    ),
+    note: str | None = option(
+        "--note", metavar="TEXT", help="Replace the note; - reads it from stdin, an empty one removes it."
+    ),
+    tags: tuple[str, ...] = option("--tag", multiple=True, metavar="TAG", help="Add a tag; may be repeated."),
+    untags: tuple[str, ...] = option(
+        "--untag", multiple=True, metavar="TAG", help="Remove a tag; may be repeated."
+    ),
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
 ) -> None:
     """Change the name, note and tags of RUN, and show them.
 
@@ -105,12 +102,11 @@ _FREED_BY: Final = {
 
 
 @click.command("du", cls=Command)
-@filter_argument
-@folders_option
-@limit_option("20, with --json all")
-@json_option
 def du_command(
-    words: tuple[str, ...], recordings: tuple[Path, ...], limit: int | None, as_json: bool
+    words: tuple[str, ...] = filter_argument,
+    recordings: tuple[Path, ...] = folders_option,
+    limit: int | None = limit_option("20, with --json all"),
+    as_json: bool = json_option,
 ) -> None:
     """Show the disk usage of the runs that match FILTER (as in `dualtaxi ls`), or of all, largest first.
 
@@ -196,10 +192,10 @@ def index_command() -> None:
 
 
 @index_command.command("rebuild")
-@folders_option
-@json_option
-@click.pass_context
-def rebuild(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> None:
+def rebuild(
+    recordings: tuple[Path, ...] = folders_option,
+    as_json: bool = json_option,
+) -> None:
     """Rebuild the index from the runs in the recordings folder.
 
     This is never required: commands notice changes by themselves, and the index holds nothing of its own.
@@ -235,7 +231,7 @@ def rebuild(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> 
         draw(facts(rows | {"took": duration(took), "index": str(index_path())}))
         for problem in problems:
             say(problem)
-    ctx.exit(ExitCode.DIFFERENT if problems else ExitCode.OK)
+    raise click.exceptions.Exit(ExitCode.DIFFERENT if problems else ExitCode.OK)
 
 
 def _contents(index: Index) -> _Contents:

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import click
 
-from runner.cli import Command, Group
+from runner.cli.command import Command, Group, argument, option
 from runner.cli.options import (
     checkpoint_option,
     episode_option,
@@ -36,10 +36,11 @@ _LEFT: Final = ("checkpoint", "phase", "format", "digest", "content")
 
 
 @click.command("checkpoints", cls=Command)
-@run_argument
-@recordings_option
-@json_option
-def checkpoints_command(run_name: str, recordings: Path | None, as_json: bool) -> None:
+def checkpoints_command(
+    run_name: str = run_argument,
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
+) -> None:
     """List the checkpoints of RUN, which a loop recorded by `rec.checkpoint(name, ...)`.
 
     Examples:
@@ -73,14 +74,13 @@ def checkpoint_command() -> None:
 
 
 @checkpoint_command.command("get", short_help="Write a checkpoint into a file.")
-@run_argument
-@click.argument("reference", metavar="[NAME]@STEP", default="@latest")
-@output_option("NAME-STEP.FORMAT")
-@force_option
-@recordings_option
-@json_option
 def get_command(
-    run_name: str, reference: str, output: Path | None, force: bool, recordings: Path | None, as_json: bool
+    run_name: str = run_argument,
+    reference: str = argument(metavar="[NAME]@STEP", default="@latest"),
+    output: Path | None = output_option("NAME-STEP.FORMAT"),
+    force: bool = force_option,
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
 ) -> None:
     """Write a checkpoint of RUN into a file, after comparing its digest.
 
@@ -106,27 +106,19 @@ def get_command(
 
 
 @click.command("values", cls=Command)
-@run_argument
-@episode_option
-@trial_option
-@checkpoint_option
-@policy_option
-@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FILE.csv", help="Write a CSV file.")
-@force_option
-@trust_option
-@recordings_option
-@json_option
 def values_command(
-    run_name: str,
-    episode: int | None,
-    trial: tuple[int, int] | None,
-    checkpoint: str | None,
-    policy: str | None,
-    output: Path | None,
-    force: bool,
-    trust: bool,
-    recordings: Path | None,
-    as_json: bool,
+    run_name: str = run_argument,
+    episode: int | None = episode_option,
+    trial: tuple[int, int] | None = trial_option,
+    checkpoint: str | None = checkpoint_option,
+    policy: str | None = policy_option,
+    output: Path | None = option(
+        "-o", "--output", type=click.Path(path_type=Path), metavar="FILE.csv", help="Write a CSV file."
+    ),
+    force: bool = force_option,
+    trust: bool = trust_option,
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
 ) -> None:
     """Compute what the agent of a checkpoint of RUN thinks along an old episode of it.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from runner.cli import Command
+from runner.cli.command import Command, argument, option
 from runner.cli.options import (
     all_option,
     axis_option,
@@ -42,48 +42,36 @@ if TYPE_CHECKING:
 
 
 @click.command("compare", cls=Command)
-@runs_argument
-@click.option("--by", metavar="PATH", help="Group by a value of the configuration, such as discount.")
-@click.option(
-    "--metric",
-    "metrics",
-    multiple=True,
-    metavar="METRIC",
-    help="A metric; may be repeated.  [default: those of evaluations]",
-)
-@click.option(
-    "--moment",
-    default="last",
-    show_default=True,
-    metavar="last|best|area|N",
-    help="Compare at the last evaluation, at each run's best, the mean over all, or after N on the axis. "
-    "Values of training are means over a window, which a note states.",
-)
-@axis_option
-@click.option(
-    "--at-step", type=INDEX, metavar="N", help="Compare after N training steps: --axis steps --moment N."
-)
-@target_option(multiple=False)
-@normalise_option
-@json_option
-@markdown_option
-@html_option
-@force_option
-@recordings_option
 def compare_command(
-    run_names: tuple[str, ...],
-    by: str | None,
-    metrics: tuple[str, ...],
-    moment: str,
-    axis: Axis,
-    at_step: int | None,
-    target: tuple[str, float] | None,
-    normalise: str | None,
-    as_json: bool,
-    as_markdown: bool,
-    html: Path | None,
-    force: bool,
-    recordings: Path | None,
+    run_names: tuple[str, ...] = runs_argument,
+    by: str | None = option(
+        "--by", metavar="PATH", help="Group by a value of the configuration, such as discount."
+    ),
+    metrics: tuple[str, ...] = option(
+        "--metric",
+        multiple=True,
+        metavar="METRIC",
+        help="A metric; may be repeated.  [default: those of evaluations]",
+    ),
+    moment: str = option(
+        "--moment",
+        default="last",
+        show_default=True,
+        metavar="last|best|area|N",
+        help="Compare at the last evaluation, at each run's best, the mean over all, or after N on the axis. "
+        "Values of training are means over a window, which a note states.",
+    ),
+    axis: Axis = axis_option,
+    at_step: int | None = option(
+        "--at-step", type=INDEX, metavar="N", help="Compare after N training steps: --axis steps --moment N."
+    ),
+    target: tuple[str, float] | None = target_option(multiple=False),
+    normalise: str | None = normalise_option,
+    as_json: bool = json_option,
+    as_markdown: bool = markdown_option,
+    html: Path | None = html_option,
+    force: bool = force_option,
+    recordings: Path | None = recordings_option,
 ) -> None:
     """Compare groups of runs: medians, interquartile means, intervals, probabilities of improvement.
 
@@ -197,38 +185,27 @@ def _compare_tasks(
 
 
 @click.command("diff", cls=Command)
-@click.argument("a", metavar="A", type=RunName())
-@click.argument("b", metavar="B", type=RunName())
-@recordings_option
-@json_option
-@markdown_option
-@html_option
-@force_option
-@click.option(
-    "--ignore",
-    multiple=True,
-    metavar="GLOB",
-    help="Ignore settings and provenance whose path matches this pattern.",
-)
-@all_option
-@click.option(
-    "--first", is_flag=True, help="Compare only settings and where training first diverges, not the tables."
-)
-@target_option(multiple=True)
-@click.pass_context
 def diff_command(
-    ctx: click.Context,
-    a: str,
-    b: str,
-    recordings: Path | None,
-    as_json: bool,
-    as_markdown: bool,
-    html: Path | None,
-    force: bool,
-    ignore: tuple[str, ...],
-    everything: bool,
-    first: bool,
-    targets: tuple[tuple[str, float], ...],
+    a: str = argument(metavar="A", type=RunName()),
+    b: str = argument(metavar="B", type=RunName()),
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
+    as_markdown: bool = markdown_option,
+    html: Path | None = html_option,
+    force: bool = force_option,
+    ignore: tuple[str, ...] = option(
+        "--ignore",
+        multiple=True,
+        metavar="GLOB",
+        help="Ignore settings and provenance whose path matches this pattern.",
+    ),
+    everything: bool = all_option,
+    first: bool = option(
+        "--first",
+        is_flag=True,
+        help="Compare only settings and where training first diverges, not the tables.",
+    ),
+    targets: tuple[tuple[str, float], ...] = target_option(multiple=True),
 ) -> None:
     """Show what differs between the runs A and B, down to the first step at which they diverge, and why.
 
@@ -264,4 +241,4 @@ def diff_command(
         print_json(differences.as_json(difference))
     elif html is None or as_markdown:
         print_sections(sections(difference, everything), as_markdown)
-    ctx.exit(ExitCode.OK if difference.same_content else ExitCode.DIFFERENT)
+    raise click.exceptions.Exit(ExitCode.OK if difference.same_content else ExitCode.DIFFERENT)

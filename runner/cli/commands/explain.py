@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli import Command
+from runner.cli.command import Command, argument, option
 from runner.cli.options import json_option, markdown_option, ray_option, recordings_option, workers_option
 from runner.cli.output import draw, facts, print_json, print_sections, require_one_form, say
 from runner.cli.parameter_types import COUNT
@@ -30,43 +30,36 @@ class _Planned(Exception):
 
 
 @click.command("explain", cls=Command)
-@click.argument("a", metavar="A")
-@click.argument("b", metavar="B")
-@click.option(
-    "--metric", metavar="METRIC", help="A metric; of evaluations.  [default: success_percent, or mean_return]"
-)
-@click.option(
-    "--at",
-    type=COUNT,
-    metavar="EPISODE",
-    help="Compare after this number of training episodes.  [default: the end of each]",
-)
-@click.option(
-    "--seeds",
-    type=click.IntRange(1, 10_000),
-    default=20,
-    show_default=True,
-    metavar="N",
-    help="Number of seeds of each mixture.",
-)
-@workers_option("one per processor")
-@ray_option
-@click.option("--dry-run", is_flag=True, help="Show what would be trained and how long it takes, and stop.")
-@markdown_option
-@json_option
-@recordings_option
 def explain_command(
-    a: str,
-    b: str,
-    metric: str | None,
-    at: int | None,
-    seeds: int,
-    workers: int | None,
-    ray: str | None,
-    dry_run: bool,
-    as_markdown: bool,
-    as_json: bool,
-    recordings: Path | None,
+    a: str = argument(metavar="A"),
+    b: str = argument(metavar="B"),
+    metric: str | None = option(
+        "--metric",
+        metavar="METRIC",
+        help="A metric; of evaluations.  [default: success_percent, or mean_return]",
+    ),
+    at: int | None = option(
+        "--at",
+        type=COUNT,
+        metavar="EPISODE",
+        help="Compare after this number of training episodes.  [default: the end of each]",
+    ),
+    seeds: int = option(
+        "--seeds",
+        type=click.IntRange(1, 10_000),
+        default=20,
+        show_default=True,
+        metavar="N",
+        help="Number of seeds of each mixture.",
+    ),
+    workers: int | None = workers_option("one per processor"),
+    ray: str | None = ray_option,
+    dry_run: bool = option(
+        "--dry-run", is_flag=True, help="Show what would be trained and how long it takes, and stop."
+    ),
+    as_markdown: bool = markdown_option,
+    as_json: bool = json_option,
+    recordings: Path | None = recordings_option,
 ) -> None:
     """Find which settings make the difference between A and B: mixtures of them are trained.
 

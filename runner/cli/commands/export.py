@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli import Group
+from runner.cli.command import Group, option
 from runner.cli.commands import export_film, export_tables, export_tools
-from runner.cli.options import EXPORTS, run_argument, selection_options, writing_options
-from runner.cli.output import print_written, say
-from runner.cli.parameter_types import Ranges
+from runner.cli.options import Writing, run_argument, selection_options, writing_options
+from runner.cli.output import say
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_recorded
 from runner.export.places import require_new
@@ -20,7 +18,7 @@ from runner.export.rerun.viewer import require_rerun
 from runner.util.humanize import duration, size
 
 if TYPE_CHECKING:
-    from runner.export.rerun.selection import Selection
+    from runner.export.rerun.selection import Request, Selection
 
 
 @click.group("export", cls=Group)
@@ -33,21 +31,10 @@ def export_command() -> None:
 
 
 @export_command.command("rerun", short_help="For the Rerun viewer: every view of selected episodes.")
-@run_argument
-@selection_options
-@writing_options("exports/NAME-RUN.rrd", "FILE.rrd")
 def rerun(
-    run_name: str,
-    output: Path | None,
-    episodes: Ranges | None,
-    evaluations: tuple[int, ...] | None,
-    every: int | None,
-    everything: bool,
-    frames: bool,
-    trust: bool,
-    force: bool,
-    recordings: Path | None,
-    as_json: bool,
+    run_name: str = run_argument,
+    selected: Request = selection_options,
+    to: Writing = writing_options("exports/NAME-RUN.rrd", "FILE.rrd"),
 ) -> None:
     """Export RUN for the Rerun viewer, arranged and ready to look at.
 
@@ -64,21 +51,19 @@ def rerun(
 
     require_rerun("export rerun")
     from runner.export.rerun.runs import Source
-    from runner.export.rerun.selection import Request
     from runner.export.rerun.writing import export
 
     started = time.monotonic()
-    run = find_recorded(run_name, recordings)
-    path = output or EXPORTS / f"{run.file_stem}.rrd"
-    require_new(path, force)
-    request = Request(episodes or (), evaluations or (), every or 0, everything, frames=frames, trust=trust)
+    run = find_recorded(run_name, to.recordings)
+    path = to.path(run.file_stem)
+    require_new(path, to.force)
     with open_recording(run.recording) as recording, compilation_notice(), stage_line("exporting") as stage:
         source = Source(recording, f"{run.title} ({run.run_id})")
-        (selection,) = export([source], request, path, stage)
+        (selection,) = export([source], selected, path, stage)
     print_selection(selection)
     took = duration(time.monotonic() - started)
     text = f"{path}  {size(path.stat().st_size)}, {selection.steps:,} steps, in {took}"
-    print_written(text, as_json, path, steps=selection.steps, left_out=selection.left_out)
+    to.report(text, path, steps=selection.steps, left_out=selection.left_out)
 
 
 def print_selection(selection: Selection) -> None:
@@ -92,11 +77,12 @@ def print_selection(selection: Selection) -> None:
 
 
 @export_command.command("mcap", short_help="One file with everything, for `dualtaxi import`.")
-@run_argument
-@click.option("--anonymous", is_flag=True, help="Leave out host, user, command line and folder.")
-@writing_options("NAME-RUN.mcap")
 def mcap(
-    run_name: str, output: Path | None, anonymous: bool, force: bool, recordings: Path | None, as_json: bool
+    run_name: str = run_argument,
+    anonymous: bool = option(
+        "--anonymous", is_flag=True, help="Leave out host, user, command line and folder."
+    ),
+    to: Writing = writing_options("NAME-RUN.mcap"),
 ) -> None:
     """Write RUN into one MCAP file with its labels, for `dualtaxi import` on another machine.
 
@@ -109,14 +95,14 @@ def mcap(
     """
     from runner.export.mcap import export_mcap
 
-    run = find_recorded(run_name, recordings)
-    path = output or Path(f"{run.file_stem}.mcap")
+    run = find_recorded(run_name, to.recordings)
+    path = to.path(run.file_stem)
     with stage_line(f"exporting {run.run_id}"):
-        exported = export_mcap(run, path, anonymous, force)
+        exported = export_mcap(run, path, anonymous, to.force)
     for warning in exported.warnings:
         say(warning)
     text = f"{path}  {size(path.stat().st_size)}; `dualtaxi import {path}` takes it in"
-    print_written(text, as_json, path, anonymous=anonymous)
+    to.report(text, path, anonymous=anonymous)
 
 
 for _command in (

@@ -7,19 +7,16 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli import Command
+from runner.cli.command import Command, option
 from runner.cli.options import (
-    EXPORTS,
-    best_option,
-    episode_option,
-    require_one_choice,
+    EpisodeChoice,
+    Writing,
+    choice_options,
     run_argument,
-    trial_option,
     trust_option,
-    worst_option,
     writing_options,
 )
-from runner.cli.output import print_written, say
+from runner.cli.output import say
 from runner.cli.parameter_types import GRID
 from runner.cli.progress import count_line
 from runner.cli.runs import opened_run
@@ -41,45 +38,29 @@ _MAX_GIF_FPS = 50
 
 
 @click.command("film", cls=Command, short_help="A film of an episode: MP4, WebM, GIF or WebP.")
-@run_argument
-@episode_option
-@trial_option
-@best_option
-@worst_option
-@click.option(
-    "--grid",
-    type=GRID,
-    metavar="RxC",
-    help="Several episodes side by side, evenly from the best to the worst, such as 3x3.",
-)
-@click.option(
-    "--fps",
-    type=click.FloatRange(0.1, 240),
-    metavar="STEPS",
-    help="Steps per second.  [default: 4 of a drawn scene, else 30]",
-)
-@click.option(
-    "--width",
-    type=click.IntRange(160, 4096),
-    metavar="PIXELS",
-    help="Width of the film.  [default: about that of the pictures]",
-)
-@trust_option
-@writing_options("exports/NAME-RUN.mp4")
 def command(
-    run_name: str,
-    episode: int | None,
-    trial: tuple[int, int] | None,
-    best: bool,
-    worst: bool,
-    grid: tuple[int, int] | None,
-    output: Path | None,
-    fps: float | None,
-    width: int | None,
-    trust: bool,
-    force: bool,
-    recordings: Path | None,
-    as_json: bool,
+    run_name: str = run_argument,
+    choice: EpisodeChoice = choice_options,
+    grid: tuple[int, int] | None = option(
+        "--grid",
+        type=GRID,
+        metavar="RxC",
+        help="Several episodes side by side, evenly from the best to the worst, such as 3x3.",
+    ),
+    fps: float | None = option(
+        "--fps",
+        type=click.FloatRange(0.1, 240),
+        metavar="STEPS",
+        help="Steps per second.  [default: 4 of a drawn scene, else 30]",
+    ),
+    width: int | None = option(
+        "--width",
+        type=click.IntRange(160, 4096),
+        metavar="PIXELS",
+        help="Width of the film.  [default: about that of the pictures]",
+    ),
+    trust: bool = trust_option,
+    to: Writing = writing_options("exports/NAME-RUN.mp4"),
 ) -> None:
     """Make a film of a recorded episode of RUN; the ending of the file chooses the format.
 
@@ -98,23 +79,17 @@ def command(
       dualtaxi export film k3v9m2xq --eval 3000:7 -o trial.gif
       dualtaxi export film k3v9m2xq --grid 3x3 -o nine.webm --fps 60
     """
-    require_one_choice(episode=episode, eval=trial, best=best, worst=worst, grid=grid)
+    choice.require_one(grid=grid)
     from runner.export import film
     from runner.export.encoder import format_of
-    from runner.export.episodes import chosen_episode, extreme_episode
     from runner.export.pictures import Source, pictures, source_of
     from runner.export.places import require_new, write_new
 
-    with opened_run(run_name, recordings) as (run, recording):
-        path = output or EXPORTS / f"{run.file_stem}.mp4"
+    with opened_run(run_name, to.recordings) as (run, recording):
+        path = to.path(run.file_stem)
         format_of(path)
-        require_new(path, force)
-        if best or worst:
-            shown = [extreme_episode(recording, best)]
-        elif grid:
-            shown = _ranked(recording, grid)
-        else:
-            shown = [chosen_episode(recording, episode, trial)]
+        require_new(path, to.force)
+        shown = _ranked(recording, grid) if grid else [choice.find(recording)]
         is_scene = source_of(recording, shown[0].phase, trust)[0] is Source.SCENE
         speed = fps or (_SCENE_FPS if is_scene else _FPS)
         if path.suffix.lower() == ".gif" and speed > _MAX_GIF_FPS:
@@ -136,16 +111,15 @@ def command(
                 else:
                     made.append(film.write_film(path, next(shots()), speed, width, progress))
 
-            write_new(path, force, write)
+            write_new(path, to.force, write)
     for note in dict.fromkeys(each.reason for each in opened if each.reason):
         say(f"The film shows {opened[0].source}: {note}")
     for note in made[0].notes:
         say(note)
     what = shown[0].title if len(shown) == 1 else f"{len(shown)} episodes"
     facts = f"{made[0].frames:,} frames of {made[0].width}x{made[0].height}, {size(path.stat().st_size)}"
-    print_written(
+    to.report(
         f"{path}: {what}, {opened[0].source}, {facts}",
-        as_json,
         path,
         episodes=[one.title for one in shown],
         source=str(opened[0].source),

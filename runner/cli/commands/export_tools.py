@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from runner.cli import Command
+from runner.cli.command import Command, option
 from runner.cli.options import (
-    EXPORTS,
+    Writing,
     episodes_option,
     force_option,
     json_option,
@@ -24,24 +24,17 @@ from runner.export.places import new_folder
 
 
 @click.command("minari", cls=Command, short_help="A Minari dataset, for offline learning.")
-@run_argument
-@click.option(
-    "--phase",
-    type=click.Choice(["train", "eval"]),
-    default="train",
-    show_default=True,
-    help="The phase of the episodes.",
-)
-@episodes_option
-@writing_options(EXPORTS / "minari", "FOLDER")
 def minari(
-    run_name: str,
-    output: Path,
-    phase: str,
-    episodes: Ranges | None,
-    force: bool,
-    recordings: Path | None,
-    as_json: bool,
+    run_name: str = run_argument,
+    phase: str = option(
+        "--phase",
+        type=click.Choice(["train", "eval"]),
+        default="train",
+        show_default=True,
+        help="The phase of the episodes.",
+    ),
+    episodes: Ranges | None = episodes_option,
+    to: Writing = writing_options("exports/minari", "FOLDER"),
 ) -> None:
     """Export the episodes of RUN as a Minari dataset: observations, actions, rewards, how each ended.
 
@@ -56,26 +49,26 @@ def minari(
     from runner.export.minari import PATTERNS, dataset_id, require_packages, write_dataset
 
     require_packages()
-    with opened_run(run_name, recordings, needs_steps=True) as (_, recording):
-        path = output / dataset_id(recording)
+    with opened_run(run_name, to.recordings, needs_steps=True) as (_, recording):
+        folder = to.path()
+        path = folder / dataset_id(recording)
         total = recording.count(recording.topic(f"/{phase}/episode"))
-        with new_folder(path, force, PATTERNS) as folder, count_line("episodes", total) as report:
-            written = write_dataset(recording, folder, phase, episodes or (), report)
+        with new_folder(path, to.force, PATTERNS) as fresh, count_line("episodes", total) as report:
+            written = write_dataset(recording, fresh, phase, episodes or (), report)
     for note in written.notes:
         say(note)
     text = (
         f"{path}  {written.episodes:,} episodes, {written.steps:,} steps; read it by: "
-        f"MINARI_DATASETS_PATH={output} and minari.load_dataset('{path.name}')"
+        f"MINARI_DATASETS_PATH={folder} and minari.load_dataset('{path.name}')"
     )
     counts = {"episodes": written.episodes, "steps": written.steps}
-    print_written(text, as_json, path, dataset=path.name, **counts)
+    to.report(text, path, dataset=path.name, **counts)
 
 
 @click.command("tensorboard", cls=Command, short_help="An event file for TensorBoard.")
-@run_argument
-@writing_options("exports/tensorboard/NAME-RUN", "FOLDER")
 def tensorboard(
-    run_name: str, output: Path | None, force: bool, recordings: Path | None, as_json: bool
+    run_name: str = run_argument,
+    to: Writing = writing_options("exports/tensorboard/NAME-RUN", "FOLDER"),
 ) -> None:
     """Export RUN for TensorBoard: every metric, and length and return of each training episode.
 
@@ -89,43 +82,40 @@ def tensorboard(
     from runner.export.tensorboard import PATTERNS, require_packages, write_events
 
     require_packages()
-    with opened_run(run_name, recordings) as (run, recording):
-        path = output or EXPORTS / "tensorboard" / run.file_stem
-        with new_folder(path, force, PATTERNS) as folder, stage_line("writing events"):
+    with opened_run(run_name, to.recordings) as (run, recording):
+        path = to.path(run.file_stem)
+        with new_folder(path, to.force, PATTERNS) as folder, stage_line("writing events"):
             count = write_events(recording, folder)
     text = (
         f"{path}  {count:,} numbers; view them by: "
         f"tensorboard --logdir {path.parent} --samples_per_plugin scalars=100000"
     )
-    print_written(text, as_json, path, numbers=count)
+    to.report(text, path, numbers=count)
 
 
 @click.command("mlflow", cls=Command, short_help="A run in an MLflow store.")
-@run_argument
-@click.option(
-    "--tracking-uri",
-    "tracking",
-    envvar="MLFLOW_TRACKING_URI",
-    default="sqlite:///exports/mlflow.db",
-    show_default="$MLFLOW_TRACKING_URI, or sqlite:///exports/mlflow.db",
-    metavar="URI",
-    help="The store: a database or a server.",
-)
-@click.option(
-    "--experiment", default="dualtaxi", show_default=True, help="The experiment; created if it is missing."
-)
-@click.option("--with-recording", is_flag=True, help="Also store the recording as an artifact.")
-@force_option
-@recordings_option
-@json_option
 def mlflow(
-    run_name: str,
-    tracking: str,
-    experiment: str,
-    with_recording: bool,
-    force: bool,
-    recordings: Path | None,
-    as_json: bool,
+    run_name: str = run_argument,
+    tracking: str = option(
+        "--tracking-uri",
+        envvar="MLFLOW_TRACKING_URI",
+        default="sqlite:///exports/mlflow.db",
+        show_default="$MLFLOW_TRACKING_URI, or sqlite:///exports/mlflow.db",
+        metavar="URI",
+        help="The store: a database or a server.",
+    ),
+    experiment: str = option(
+        "--experiment",
+        default="dualtaxi",
+        show_default=True,
+        help="The experiment; created if it is missing.",
+    ),
+    with_recording: bool = option(
+        "--with-recording", is_flag=True, help="Also store the recording as an artifact."
+    ),
+    force: bool = force_option,
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
 ) -> None:
     """Export RUN into MLflow: parameters, metrics over training steps, tags, and run.json as an artifact.
 

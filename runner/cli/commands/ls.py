@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import click
 
-from runner.cli import Command
+from runner.cli.command import Command, option
 from runner.cli.options import filter_argument, folders_option, json_option, limit_option
 from runner.cli.output import aligned, console, draw, json_list, printable, say, table
 from runner.cli.parameter_types import INDEX
@@ -71,27 +71,18 @@ class _Query(NamedTuple):
 
 
 @click.command("ls", cls=Command)
-@filter_argument
-@folders_option
-@click.option(
-    "--sort", default="", metavar="FIELD,...", help="Sort by these fields; -FIELD for descending order."
-)
-@click.option("--columns", metavar="FIELD,...", help="Show these fields.")
-@limit_option(f"{ON_A_TERMINAL} in a terminal's table, else all")
-@click.option("--offset", type=INDEX, default=0, metavar="N", help="Skip the first N.")
-@click.option("-q", "--quiet", is_flag=True, help="Print ids only.")
-@click.option("--csv", "as_csv", is_flag=True, help="Print CSV.")
-@json_option
 def ls_command(
-    words: tuple[str, ...],
-    recordings: tuple[Path, ...],
-    sort: str,
-    columns: str | None,
-    limit: int | None,
-    offset: int,
-    quiet: bool,
-    as_csv: bool,
-    as_json: bool,
+    words: tuple[str, ...] = filter_argument,
+    recordings: tuple[Path, ...] = folders_option,
+    sort: str = option(
+        "--sort", default="", metavar="FIELD,...", help="Sort by these fields; -FIELD for descending order."
+    ),
+    columns: str | None = option("--columns", metavar="FIELD,...", help="Show these fields."),
+    limit: int | None = limit_option(f"{ON_A_TERMINAL} in a terminal's table, else all"),
+    offset: int = option("--offset", type=INDEX, default=0, metavar="N", help="Skip the first N."),
+    quiet: bool = option("-q", "--quiet", is_flag=True, help="Print ids only."),
+    as_csv: bool = option("--csv", is_flag=True, help="Print CSV."),
+    as_json: bool = json_option,
 ) -> None:
     """List the runs that match FILTER, or all, newest first.
 

@@ -14,17 +14,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from runner.cli import Command
+from runner.cli.command import Command, option
 from runner.cli.options import (
-    best_option,
-    episode_option,
+    EpisodeChoice,
+    choice_options,
     json_option,
     recordings_option,
-    require_one_choice,
     run_argument,
-    trial_option,
     trust_option,
-    worst_option,
 )
 from runner.cli.output import console, print_json, say
 from runner.cli.progress import stage_line
@@ -59,34 +56,21 @@ _POLL_SECONDS: Final = 0.02
 
 
 @click.command("play", cls=Command)
-@run_argument
-@episode_option
-@trial_option
-@best_option
-@worst_option
-@click.option(
-    "--speed",
-    type=click.FloatRange(0, min_open=True),
-    default=4.0,
-    show_default=True,
-    metavar="STEPS",
-    help="Steps per second.",
-)
-@click.option("--no-pictures", is_flag=True, help="Show text alone.")
-@trust_option
-@recordings_option
-@json_option
 def play_command(
-    run_name: str,
-    episode: int | None,
-    trial: tuple[int, int] | None,
-    best: bool,
-    worst: bool,
-    speed: float,
-    no_pictures: bool,
-    trust: bool,
-    recordings: Path | None,
-    as_json: bool,
+    run_name: str = run_argument,
+    choice: EpisodeChoice = choice_options,
+    speed: float = option(
+        "--speed",
+        type=click.FloatRange(0, min_open=True),
+        default=4.0,
+        show_default=True,
+        metavar="STEPS",
+        help="Steps per second.",
+    ),
+    no_pictures: bool = option("--no-pictures", is_flag=True, help="Show text alone."),
+    trust: bool = trust_option,
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
 ) -> None:
     """Replay a recorded episode of RUN, step by step, with actions and rewards.
 
@@ -106,18 +90,14 @@ def play_command(
       dualtaxi play k3v9m2xq --best
       dualtaxi play k3v9m2xq --episode 0 | less
     """
-    require_one_choice(episode=episode, eval=trial, best=best, worst=worst)
+    choice.require_one()
     from runner.cli.episode import Episode
-    from runner.export.episodes import chosen_episode, extreme_episode
     from runner.recording.reader import open_recording
 
     run, terminal = find_recorded(run_name, recordings), console()
     with open_recording(run.recording) as recording, contextlib.ExitStack() as stack:
-        if best or worst:
-            choice = extreme_episode(recording, best)
-        else:
-            choice = chosen_episode(recording, episode, trial)
-        played = Episode(recording, choice, f"{run.title}: {choice.title}")
+        place = choice.find(recording)
+        played = Episode(recording, place, f"{run.title}: {place.title}")
         if as_json:
             for step in played.steps():
                 print_json(step, indent=None)
@@ -129,7 +109,7 @@ def play_command(
             return
         image = None if no_pictures else _image_type(recording.tabular)
         frames = played.frames()
-        if image is not None and (shown := _pictures(recording, choice, trust, stack)) is not None:
+        if image is not None and (shown := _pictures(recording, place, trust, stack)) is not None:
             frames = played.illustrated(shown)
 
         from rich.live import Live
@@ -157,13 +137,13 @@ def _image_type(is_tabular: bool) -> Any:
 
 
 def _pictures(
-    recording: Recording, choice: EpisodePlace, trust: bool, stack: contextlib.ExitStack
+    recording: Recording, place: EpisodePlace, trust: bool, stack: contextlib.ExitStack
 ) -> Pictures | None:
     """Return the pictures of an episode, closed with the stack; None if there are only values."""
     from runner.export.pictures import Source, pictures
 
     with stage_line("drawing the first picture"):
-        shown = pictures(recording, choice.phase, choice.number, trust)
+        shown = pictures(recording, place.phase, place.number, trust)
     stack.callback(shown.close)
     if shown.source is Source.VALUES:
         say(f"There are no pictures: {shown.reason}")

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli import Group, error_as_json, exit_code_of
+from runner.cli import error_as_json, exit_code_of
+from runner.cli.command import Group, argument, option, record
 from runner.cli.options import json_option, limit_option, recordings_option
 from runner.cli.output import draw, facts, print_json, say, table
-from runner.cli.parameter_types import ConfigName, RunName
+from runner.cli.parameter_types import FILE, ConfigName, RunName
 from runner.cli.progress import bytes_line
 from runner.cli.runs import find_recorded, print_received
 from runner.errors import ExitCode, RunnerError
@@ -51,39 +52,33 @@ class Server:
         return Client(url, self.token, log=say)
 
 
-def _server_options(command: Callable[..., object]) -> Callable[..., object]:
-    """Add --server, --token and --token-file to a command, which receives a `Server`."""
-
-    @click.option(
+@record
+def server_options(
+    url: str | None = option(
         "--server",
-        "url",
         metavar="URL",
         envvar="DUALTAXI_SERVER",
         help="The server, such as http://localhost:8000.  [default: $DUALTAXI_SERVER]",
-    )
-    @click.option(
+    ),
+    token: str | None = option(
         "--token",
         metavar="TOKEN",
         help="The access token.  [default: $DUALTAXI_TOKEN, or the file $DUALTAXI_TOKEN_FILE]",
-    )
-    @click.option(
+    ),
+    token_file: Path | None = option(
         "--token-file",
-        type=click.Path(dir_okay=False, path_type=Path),
+        type=FILE,
         metavar="FILE",
         help="A file with the token; unlike --token, no other user can see it.",
-    )
-    @functools.wraps(command)
-    def with_server(
-        *args: object, url: str | None, token: str | None, token_file: Path | None, **rest: object
-    ) -> object:
-        from runner.client.connection import find_token
+    ),
+) -> Server:
+    """Return the server."""
+    from runner.client.connection import find_token
 
-        return command(*args, server=Server(url, find_token(token, token_file)), **rest)
-
-    return with_server
+    return Server(url, find_token(token, token_file))
 
 
-_job_argument = click.argument("number", metavar="JOB", type=click.IntRange(1))
+_job_argument = argument(metavar="JOB", type=click.IntRange(1))
 
 
 @click.group("remote", cls=Group)
@@ -101,17 +96,16 @@ def remote_command() -> None:
 
 
 @remote_command.command("push")
-@click.argument("names", metavar="[RUN]...", nargs=-1, type=RunName())
-@click.option(
-    "--outbox",
-    is_flag=True,
-    help="Upload the runs that could not be sent while they were recorded, each to its server.",
-)
-@_server_options
-@recordings_option
-@json_option
 def push(
-    names: tuple[str, ...], outbox: bool, server: Server, recordings: Path | None, as_json: bool
+    names: tuple[str, ...] = argument(metavar="[RUN]...", nargs=-1, type=RunName()),
+    outbox: bool = option(
+        "--outbox",
+        is_flag=True,
+        help="Upload the runs that could not be sent while they were recorded, each to its server.",
+    ),
+    server: Server = server_options,
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
 ) -> None:
     """Upload runs to a server, which lists them once it has verified every byte.
 
@@ -179,11 +173,12 @@ def _stored(status: UploadStatus, name: str, run_bytes: int) -> Json:
 
 
 @remote_command.command("pull")
-@click.argument("run_name", metavar="RUN")
-@_server_options
-@recordings_option
-@json_option
-def pull(run_name: str, server: Server, recordings: Path | None, as_json: bool) -> None:
+def pull(
+    run_name: str = argument(metavar="RUN"),
+    server: Server = server_options,
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
+) -> None:
     """Download RUN from a server into the folder of runs, with its tags and note.
 
     RUN is named as the server knows it: its id, the beginning of one, its name, or @latest. Every byte is
@@ -203,14 +198,14 @@ def pull(run_name: str, server: Server, recordings: Path | None, as_json: bool) 
 
 
 @remote_command.command("submit")
-@click.argument("file", metavar="FILE", type=ConfigName())
-@click.option(
-    "--watch", "is_watched", is_flag=True, help="Wait until the job is over, and show its progress."
-)
-@_server_options
-@json_option
-@click.pass_context
-def submit(ctx: click.Context, file: Path, is_watched: bool, server: Server, as_json: bool) -> None:
+def submit(
+    file: Path = argument(metavar="FILE", type=ConfigName()),
+    is_watched: bool = option(
+        "--watch", is_flag=True, help="Wait until the job is over, and show its progress."
+    ),
+    server: Server = server_options,
+    as_json: bool = json_option,
+) -> None:
     """Submit the experiment or sweep in FILE to a server.
 
     The server checks it as `dualtaxi run` would, and queues it. The server's pages and `dualtaxi remote
@@ -234,14 +229,15 @@ def submit(ctx: click.Context, file: Path, is_watched: bool, server: Server, as_
             job = _watched(client, job.number)
     _print_job(job, as_json)
     if is_watched and job.state != "finished":
-        ctx.exit(ExitCode.DIFFERENT)
+        raise click.exceptions.Exit(ExitCode.DIFFERENT)
 
 
 @remote_command.command("jobs")
-@limit_option(20)
-@_server_options
-@json_option
-def jobs(limit: int, server: Server, as_json: bool) -> None:
+def jobs(
+    limit: int = limit_option(20),
+    server: Server = server_options,
+    as_json: bool = json_option,
+) -> None:
     """List the jobs of a server, newest first.
 
     Example:
@@ -260,11 +256,11 @@ def jobs(limit: int, server: Server, as_json: bool) -> None:
 
 
 @remote_command.command("watch")
-@_job_argument
-@_server_options
-@json_option
-@click.pass_context
-def watch(ctx: click.Context, number: int, server: Server, as_json: bool) -> None:
+def watch(
+    number: int = _job_argument,
+    server: Server = server_options,
+    as_json: bool = json_option,
+) -> None:
     """Show the progress of JOB until it is over; Ctrl-C ends the watching, not the job.
 
     A broken connection is restored. Exit code 0 when the job finished, 1 when it failed or was cancelled.
@@ -276,14 +272,15 @@ def watch(ctx: click.Context, number: int, server: Server, as_json: bool) -> Non
         job = _watched(client, number)
     _print_job(job, as_json)
     if job.state != "finished":
-        ctx.exit(ExitCode.DIFFERENT)
+        raise click.exceptions.Exit(ExitCode.DIFFERENT)
 
 
 @remote_command.command("cancel")
-@_job_argument
-@_server_options
-@json_option
-def cancel(number: int, server: Server, as_json: bool) -> None:
+def cancel(
+    number: int = _job_argument,
+    server: Server = server_options,
+    as_json: bool = json_option,
+) -> None:
     """Cancel JOB, whether queued or running; what it has recorded is kept.
 
     Example:
@@ -294,11 +291,14 @@ def cancel(number: int, server: Server, as_json: bool) -> None:
 
 
 @remote_command.command("resume")
-@_job_argument
-@click.option("--accept-changes", is_flag=True, help="Resume although the code has changed.")
-@_server_options
-@json_option
-def resume(number: int, accept_changes: bool, server: Server, as_json: bool) -> None:
+def resume(
+    number: int = _job_argument,
+    accept_changes: bool = option(
+        "--accept-changes", is_flag=True, help="Resume although the code has changed."
+    ),
+    server: Server = server_options,
+    as_json: bool = json_option,
+) -> None:
     """Resume JOB, which failed or was cancelled, as if it had never stopped.
 
     Example:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from runner.archive.places import archive_place
-from runner.cli import Command
+from runner.cli.command import Command, option
 from runner.cli.options import filter_argument, folders_option, json_option, recordings_option, runs_argument
 from runner.cli.output import aligned, console, draw, print_json, printable, say, table
 from runner.cli.parameter_types import INDEX
@@ -32,32 +32,25 @@ _MAX_DRAWN: Final = 1000
 _HEADINGS: Final = ("id", "name", "seed", "status", "success %", "age", "frees")
 _LEFT: Final = ("id", "name", "status")
 
-_yes_option = click.option("--yes", "-y", is_flag=True, help="Do not ask for confirmation.")
-_foreign_option = click.option(
+_yes_option = option("--yes", "-y", is_flag=True, help="Do not ask for confirmation.")
+_foreign_option = option(
     "--foreign-files",
-    "foreign",
     is_flag=True,
     help="Also remove files and folders in a run's folder that no run writes.",
 )
-_dry_run_option = click.option(
+_dry_run_option = option(
     "--dry-run", is_flag=True, help="Show what would be removed and how much is freed, and remove nothing."
 )
 
 
 @click.command("rm", cls=Command)
-@runs_argument
-@recordings_option
-@_yes_option
-@_dry_run_option
-@_foreign_option
-@json_option
 def rm_command(
-    run_names: tuple[str, ...],
-    recordings: Path | None,
-    yes: bool,
-    dry_run: bool,
-    foreign: bool,
-    as_json: bool,
+    run_names: tuple[str, ...] = runs_argument,
+    recordings: Path | None = recordings_option,
+    yes: bool = _yes_option,
+    dry_run: bool = _dry_run_option,
+    foreign: bool = _foreign_option,
+    as_json: bool = json_option,
 ) -> None:
     """Remove runs and their recordings, after confirmation.
 
@@ -81,35 +74,30 @@ def rm_command(
 
 
 @click.command("prune", cls=Command)
-@filter_argument
-@folders_option
-@click.option("--older-than", metavar="AGE", help="Runs that started longer ago than this: 30d, 12h, 2w.")
-@click.option("--keep-last", type=INDEX, metavar="N", help="Keep the newest N runs of each configuration.")
-@click.option(
-    "--status",
-    "statuses",
-    multiple=True,
-    type=click.Choice([status for status in STATUSES if status != "running"]),
-    help="Runs with this status; may be repeated. Archived runs are removed only with --status archived.",
-)
-@click.option(
-    "--explanations", is_flag=True, help="Instead of runs: what `dualtaxi explain` trained, and its results."
-)
-@_dry_run_option
-@_yes_option
-@_foreign_option
-@json_option
 def prune_command(
-    words: tuple[str, ...],
-    recordings: tuple[Path, ...],
-    older_than: str | None,
-    keep_last: int | None,
-    statuses: tuple[str, ...],
-    explanations: bool,
-    dry_run: bool,
-    yes: bool,
-    foreign: bool,
-    as_json: bool,
+    words: tuple[str, ...] = filter_argument,
+    recordings: tuple[Path, ...] = folders_option,
+    older_than: str | None = option(
+        "--older-than", metavar="AGE", help="Runs that started longer ago than this: 30d, 12h, 2w."
+    ),
+    keep_last: int | None = option(
+        "--keep-last", type=INDEX, metavar="N", help="Keep the newest N runs of each configuration."
+    ),
+    statuses: tuple[str, ...] = option(
+        "--status",
+        multiple=True,
+        type=click.Choice([status for status in STATUSES if status != "running"]),
+        help="Runs with this status; may be repeated. Archived runs are removed only with --status archived.",
+    ),
+    explanations: bool = option(
+        "--explanations",
+        is_flag=True,
+        help="Instead of runs: what `dualtaxi explain` trained, and its results.",
+    ),
+    dry_run: bool = _dry_run_option,
+    yes: bool = _yes_option,
+    foreign: bool = _foreign_option,
+    as_json: bool = json_option,
 ) -> None:
     """Remove the runs that match FILTER (as in `dualtaxi ls`) and all options, after confirmation.
 

@@ -8,9 +8,16 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli import Command
-from runner.cli.options import EXPORTS, curve_options, normalise_option, runs_argument, writing_options
-from runner.cli.output import print_written, say
+from runner.cli.command import Command, option
+from runner.cli.options import (
+    Writing,
+    axis_option,
+    curve_options,
+    normalise_option,
+    runs_argument,
+    writing_options,
+)
+from runner.cli.output import say
 from runner.cli.parameter_types import INDEX, TRIAL
 from runner.cli.progress import count_line, stage_line
 from runner.cli.runs import find_all_recorded
@@ -26,22 +33,12 @@ if TYPE_CHECKING:
 
 
 @click.command("plot", cls=Command)
-@runs_argument
-@curve_options
-@normalise_option
-@writing_options(EXPORTS / "plot.png", "FILE.png|svg|pdf")
 def plot_command(
-    run_names: tuple[str, ...],
-    axis: Axis,
-    lines: bool,
-    smooth: float,
-    log_x: bool,
-    log_y: bool,
-    normalise: str | None,
-    output: Path,
-    force: bool,
-    recordings: Path | None,
-    as_json: bool,
+    run_names: tuple[str, ...] = runs_argument,
+    axis: Axis = axis_option,
+    style: CurveStyle = curve_options,
+    normalise: str | None = normalise_option,
+    to: Writing = writing_options("exports/plot.png", "FILE.png|svg|pdf"),
 ) -> None:
     """Draw every metric of one or several runs over an axis, in one figure; or a sweep.
 
@@ -70,9 +67,8 @@ def plot_command(
     from runner.export.plots.metrics import CurveStyle, panels_of
     from runner.recording.reader import open_recording
 
+    output, folder = to.path(), recordings_folder(to.recordings)
     check_suffix(output)
-    folder = recordings_folder(recordings)
-    style = CurveStyle(lines, smooth, log_x, log_y)
     if normalise is not None and style != CurveStyle():
         raise click.UsageError(
             "--normalise has a figure of its own: leave out --lines, --smooth, --log-x and --log-y."
@@ -81,7 +77,7 @@ def plot_command(
         _refuse_style(axis, style)
         if normalise is not None:
             raise click.UsageError("--normalise: found a sweep, expected runs.")
-        _plot_sweep(run_names[0], folder, output, force, as_json)
+        _plot_sweep(run_names[0], folder, to)
         return
     series = []
     runs = find_all_recorded(run_names, folder)
@@ -93,7 +89,7 @@ def plot_command(
                     say(shortcoming)
             progress(len(series))
     if normalise is not None:
-        _plot_tasks(series, normalise, output, force, as_json)
+        _plot_tasks(series, normalise, to)
         return
     groups = groups_of(series)
     for note in duplicates(groups):
@@ -102,27 +98,27 @@ def plot_command(
         say(sentence)
     panels = panels_of(groups)
     with stage_line("drawing"):
-        write_new(output, force, lambda path: save(curves_sheet(groups, panels, style), path))
+        write_new(output, to.force, lambda path: save(curves_sheet(groups, panels, style), path))
     count = sum(len(group.runs) for group in groups)
     text = f"{output}: {len(panels)} metric{'s' if len(panels) != 1 else ''} of {_runs(count)}"
-    print_written(text, as_json, output, metrics=len(panels), runs=count)
+    to.report(text, output, metrics=len(panels), runs=count)
 
 
-def _plot_tasks(series: list[RunSeries], normalise: str, output: Path, force: bool, as_json: bool) -> None:
+def _plot_tasks(series: list[RunSeries], normalise: str, to: Writing) -> None:
     from runner.analysis.compare.score_table import scores_of
     from runner.analysis.compare.tasks import compare_algorithms
     from runner.export.plots.image import save
     from runner.export.plots.tasks import tasks_sheet
 
-    table = scores_of(normalise)
+    output, table = to.path(), scores_of(normalise)
     with stage_line("computing intervals") as stage:
         found = compare_algorithms(series, table)
         stage("drawing")
-        write_new(output, force, lambda path: save(tasks_sheet(found), path))
+        write_new(output, to.force, lambda path: save(tasks_sheet(found), path))
     for note in found.notes:
         say(f"Note: {note}.")
     text = f"{output}: {len(found.algorithms)} groups in {len(found.tasks)} environments"
-    print_written(text, as_json, output, groups=len(found.algorithms), environments=len(found.tasks))
+    to.report(text, output, groups=len(found.algorithms), environments=len(found.tasks))
 
 
 def _refuse_style(axis: Axis, style: CurveStyle) -> None:
@@ -134,7 +130,7 @@ def _refuse_style(axis: Axis, style: CurveStyle) -> None:
         raise click.UsageError("--lines, --smooth, --log-x, --log-y: found a sweep, expected runs.")
 
 
-def _plot_sweep(name: str, recordings: Path, output: Path, force: bool, as_json: bool) -> None:
+def _plot_sweep(name: str, recordings: Path, to: Writing) -> None:
     from runner.export.plots.image import save
     from runner.sweep.charts import learning, panel_of, picture_of, sweep_sheet
     from runner.sweep.results import results_of
@@ -146,44 +142,31 @@ def _plot_sweep(name: str, recordings: Path, output: Path, force: bool, as_json:
     panel = panel_of(results.sweep.objective.metric, panels)
     with stage_line("drawing"):
         sheet = sweep_sheet(f"Sweep {name}", picture, groups, panel)
-        write_new(output, force, lambda path: save(sheet, path))
+        write_new(to.path(), to.force, lambda path: save(sheet, path))
     count = len(picture.trials)
-    print_written(f"{output}: the sweep {name}, {count} trials", as_json, output, sweep=name, trials=count)
+    to.report(f"{to.path()}: the sweep {name}, {count} trials", to.path(), sweep=name, trials=count)
 
 
 @click.command("report", cls=Command)
-@runs_argument
-@click.option(
-    "--episode",
-    "episodes",
-    type=INDEX,
-    multiple=True,
-    metavar="N",
-    help="Also show this training episode, counted from 0; may be repeated.",
-)
-@click.option(
-    "--eval",
-    "trials",
-    type=TRIAL,
-    multiple=True,
-    metavar="N:TRIAL",
-    help="Also show this trial of the evaluation after N training episodes; may be repeated.",
-)
-@curve_options
-@writing_options(EXPORTS / "report.html", "FILE.html")
 def report_command(
-    run_names: tuple[str, ...],
-    output: Path,
-    episodes: tuple[int, ...],
-    trials: tuple[tuple[int, int], ...],
-    axis: Axis,
-    lines: bool,
-    smooth: float,
-    log_x: bool,
-    log_y: bool,
-    force: bool,
-    recordings: Path | None,
-    as_json: bool,
+    run_names: tuple[str, ...] = runs_argument,
+    episodes: tuple[int, ...] = option(
+        "--episode",
+        type=INDEX,
+        multiple=True,
+        metavar="N",
+        help="Also show this training episode, counted from 0; may be repeated.",
+    ),
+    trials: tuple[tuple[int, int], ...] = option(
+        "--eval",
+        type=TRIAL,
+        multiple=True,
+        metavar="N:TRIAL",
+        help="Also show this trial of the evaluation after N training episodes; may be repeated.",
+    ),
+    axis: Axis = axis_option,
+    style: CurveStyle = curve_options,
+    to: Writing = writing_options("exports/report.html", "FILE.html"),
 ) -> None:
     """Write one self-contained page about one or several runs, or about a sweep.
 
@@ -200,17 +183,15 @@ def report_command(
       dualtaxi report hyperparameters -o hyperparameters.html
       dualtaxi report k3v9m2xq --episode 500 --eval 3000:7 --force
     """
-    from runner.export.plots.metrics import CurveStyle
     from runner.export.reports.report import require_packages, write_report
 
     require_packages()
-    style = CurveStyle(lines, smooth, log_x, log_y)
-    folder = recordings_folder(recordings)
+    output, folder = to.path(), recordings_folder(to.recordings)
     if is_sweep(run_names, folder):
         if episodes or trials:
             raise click.UsageError("the page of a sweep shows no episode: leave out --episode and --eval.")
         _refuse_style(axis, style)
-        _report_sweep(run_names[0], folder, output, force, as_json)
+        _report_sweep(run_names[0], folder, to)
         return
     replays = [*(("train", number, 0) for number in episodes), *(("eval", *trial) for trial in trials)]
     paths = [run.recording for run in find_all_recorded(run_names, folder)]
@@ -218,25 +199,25 @@ def report_command(
     with stage_line("reading") as progress:
         write_new(
             output,
-            force,
+            to.force,
             lambda path: notes.extend(write_report(path, paths, replays, progress, axis, style)),
         )
     for note in notes:
         say(note)
     text = f"{output}: {size(output.stat().st_size)}, {_runs(len(paths))}"
-    print_written(text, as_json, output, runs=len(paths))
+    to.report(text, output, runs=len(paths))
 
 
-def _report_sweep(name: str, recordings: Path, output: Path, force: bool, as_json: bool) -> None:
+def _report_sweep(name: str, recordings: Path, to: Writing) -> None:
     from runner.sweep.page import render_sweep
     from runner.sweep.results import results_of
     from runner.sweep.state import read_sweep
 
     results = results_of(read_sweep(name, recordings), recordings)
     with stage_line("drawing"):
-        write_text_new(output, force, render_sweep(results, recordings))
-    text = f"{output}: {size(output.stat().st_size)}, the sweep {name}"
-    print_written(text, as_json, output, sweep=name)
+        write_text_new(to.path(), to.force, render_sweep(results, recordings))
+    output = to.path()
+    to.report(f"{output}: {size(output.stat().st_size)}, the sweep {name}", output, sweep=name)
 
 
 def _runs(count: int) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from runner.cli import Command
+from runner.cli.command import Command, option
 from runner.cli.options import (
     accept_changes_option,
     checkpoint_option,
@@ -39,13 +39,11 @@ if TYPE_CHECKING:
 
 
 @click.command("resume", cls=Command)
-@run_argument
-@accept_changes_option
-@recordings_option
-@json_option
-@click.pass_context
 def resume_command(
-    ctx: click.Context, run_name: str, accept_changes: bool, recordings: Path | None, as_json: bool
+    run_name: str = run_argument,
+    accept_changes: bool = accept_changes_option,
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
 ) -> None:
     """Resume RUN, which was interrupted or failed, as if it had never stopped.
 
@@ -74,15 +72,16 @@ def resume_command(
         say(f"Run {run.run_id} is finished; there is nothing to do.")
     if interrupt.came and run.status == "interrupted":
         say(f"Interrupted again; `{command_for(run, 'resume')}` continues from there.")
-        ctx.exit(ExitCode.INTERRUPTED)
+        raise click.exceptions.Exit(ExitCode.INTERRUPTED)
 
 
 @click.command("rerecord", cls=Command)
-@run_argument
-@recordings_option
-@trust_option
-@json_option
-def rerecord_command(run_name: str, recordings: Path | None, trust: bool, as_json: bool) -> None:
+def rerecord_command(
+    run_name: str = run_argument,
+    recordings: Path | None = recordings_option,
+    trust: bool = trust_option,
+    as_json: bool = json_option,
+) -> None:
     """Record the steps of RUN, which was recorded without them.
 
     A job (recording.steps: none) is trained again. The environment of a loop (steps="actions") takes the
@@ -122,47 +121,37 @@ LOOP_TRIALS: Final = 20
 
 
 @click.command("evaluate", cls=Command)
-@run_argument
-@click.option("--step", type=INDEX, metavar="N", help="After N training steps.  [default: the last]")
-@click.option(
-    "--trials",
-    type=COUNT,
-    metavar="K",
-    help=f"Number of episodes.  [default: {TRIALS}, of a loop {LOOP_TRIALS}]",
-)
-@click.option(
-    "--start",
-    default="random",
-    show_default=True,
-    metavar="random|each|STATE",
-    help="Start states: random ones, each one once, or this one.",
-)
-@click.option(
-    "--seed",
-    type=click.IntRange(0, 2**64 - 1),
-    default=0,
-    show_default=True,
-    metavar="S",
-    help="Seed of the new episodes.",
-)
-@checkpoint_option
-@policy_option
-@trust_option
-@recordings_option
-@json_option
-@click.pass_context
 def evaluate_command(
-    ctx: click.Context,
-    run_name: str,
-    step: int | None,
-    trials: int | None,
-    start: str,
-    seed: int,
-    checkpoint: str | None,
-    policy: str | None,
-    trust: bool,
-    recordings: Path | None,
-    as_json: bool,
+    run_name: str = run_argument,
+    step: int | None = option(
+        "--step", type=INDEX, metavar="N", help="After N training steps.  [default: the last]"
+    ),
+    trials: int | None = option(
+        "--trials",
+        type=COUNT,
+        metavar="K",
+        help=f"Number of episodes.  [default: {TRIALS}, of a loop {LOOP_TRIALS}]",
+    ),
+    start: str = option(
+        "--start",
+        default="random",
+        show_default=True,
+        metavar="random|each|STATE",
+        help="Start states: random ones, each one once, or this one.",
+    ),
+    seed: int = option(
+        "--seed",
+        type=click.IntRange(0, 2**64 - 1),
+        default=0,
+        show_default=True,
+        metavar="S",
+        help="Seed of the new episodes.",
+    ),
+    checkpoint: str | None = checkpoint_option,
+    policy: str | None = policy_option,
+    trust: bool = trust_option,
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
 ) -> None:
     """Evaluate the trained Q-table of RUN greedily in new episodes.
 
@@ -219,7 +208,7 @@ def evaluate_command(
         draw(grid, "", facts(run_facts(run) | {"table": table, "next": play}))
     if interrupt.came and run.status == "interrupted":
         say(f"Interrupted: the episodes so far are kept; `{command_for(run, 'resume')}` plays the rest.")
-        ctx.exit(ExitCode.INTERRUPTED)
+        raise click.exceptions.Exit(ExitCode.INTERRUPTED)
 
 
 def _evaluate_checkpoint(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from runner.cli import Command
+from runner.cli.command import Command, option
 from runner.cli.options import config_argument, json_option, recordings_option, set_option, workers_option
 from runner.cli.output import console, draw, facts, print_json, say
 from runner.cli.parameter_types import COUNT, INDEX
@@ -37,36 +37,26 @@ LIVE_EPISODES: Final = 200
 
 
 @click.command("run", cls=Command)
-@config_argument
-@click.option("--seed", type=INDEX, metavar="N", help="The seed, instead of the configuration's.")
-@set_option
-@click.option("--name", help="Name of the run.  [default: the configuration's name]")
-@click.option("--live", is_flag=True, help="Open the Rerun viewer and watch the training in it.")
-@click.option(
-    "--live-every",
-    type=COUNT,
-    metavar="N",
-    help=f"Show every Nth episode, step by step.  [default: about {LIVE_EPISODES} of them]",
-)
-@click.option(
-    "--live-url", metavar="URL", help="Connect to a running viewer at this URL instead of starting one."
-)
-@workers_option(1)
-@recordings_option
-@json_option
-@click.pass_context
 def run_command(
-    ctx: click.Context,
-    config: Path,
-    seed: int | None,
-    overrides: tuple[str, ...],
-    name: str | None,
-    live: bool,
-    live_every: int | None,
-    live_url: str | None,
-    workers: int,
-    recordings: Path | None,
-    as_json: bool,
+    config: Path = config_argument,
+    seed: int | None = option(
+        "--seed", type=INDEX, metavar="N", help="The seed, instead of the configuration's."
+    ),
+    overrides: tuple[str, ...] = set_option,
+    name: str | None = option("--name", help="Name of the run.  [default: the configuration's name]"),
+    live: bool = option("--live", is_flag=True, help="Open the Rerun viewer and watch the training in it."),
+    live_every: int | None = option(
+        "--live-every",
+        type=COUNT,
+        metavar="N",
+        help=f"Show every Nth episode, step by step.  [default: about {LIVE_EPISODES} of them]",
+    ),
+    live_url: str | None = option(
+        "--live-url", metavar="URL", help="Connect to a running viewer at this URL instead of starting one."
+    ),
+    workers: int = workers_option(1),
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
 ) -> None:
     """Train, evaluate and record the experiment CONFIG: a file, or a shipped one (`dualtaxi config ls`).
 
@@ -96,7 +86,7 @@ def run_command(
     if workers > 1:
         if live or live_every or live_url:
             raise click.UsageError("--live shows one run at a time: leave out --workers.")
-        _run_parallel(ctx, experiment, folder, run_name, workers, as_json)
+        _run_parallel(experiment, folder, run_name, workers, as_json)
         return
     watch = _watcher(experiment, live, live_every, live_url)
     for number, job in enumerate(jobs_in(experiment, folder)):
@@ -108,7 +98,7 @@ def run_command(
             if run.status == "interrupted":
                 say(f"`{command_for(run, 'resume')}` continues from there.")
             _say_left(experiment, number + 1)
-            ctx.exit(ExitCode.INTERRUPTED)
+            raise click.exceptions.Exit(ExitCode.INTERRUPTED)
 
 
 def _run_one(job: Job, folder: Path, name: str | None, number: int, watch: Watch | None) -> tuple[Run, bool]:
@@ -138,7 +128,7 @@ def _run_one(job: Job, folder: Path, name: str | None, number: int, watch: Watch
 
 
 def _run_parallel(
-    ctx: click.Context, config: ExperimentConfig, folder: Path, name: str | None, workers: int, as_json: bool
+    config: ExperimentConfig, folder: Path, name: str | None, workers: int, as_json: bool
 ) -> None:
     """Run the seeds of an experiment in parallel, and print each run."""
     from runner.api import interruptible, jobs_in, run_parallel
@@ -161,7 +151,7 @@ def _run_parallel(
             if run.status == "interrupted":
                 say(f"Interrupted: {run.recording}; `{command_for(run, 'resume')}` continues from there.")
         _say_left(config, len(runs))
-        ctx.exit(ExitCode.INTERRUPTED)
+        raise click.exceptions.Exit(ExitCode.INTERRUPTED)
 
 
 def _watcher(config: ExperimentConfig, live: bool, every: int | None, url: str | None) -> Watch | None:

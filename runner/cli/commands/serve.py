@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from runner.cli import Command
+from runner.cli.command import Command, option
 from runner.cli.options import folders_option, workers_option
 from runner.cli.output import say
 from runner.cli.parameter_types import FILE
@@ -17,52 +17,43 @@ from runner.util.files import storage_errors
 
 
 @click.command("serve", cls=Command)
-@folders_option
-@click.option(
-    "--host", default="127.0.0.1", show_default=True, metavar="HOST", help="The address to listen on."
-)
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=8000,
-    show_default=True,
-    metavar="PORT",
-    help="The port to listen on; 0 for any free port.",
-)
-@click.option(
-    "--allow-host",
-    "hosts",
-    multiple=True,
-    metavar="NAME",
-    help="A host name to accept requests for, such as that of a proxy; may be repeated.",
-)
-@click.option(
-    "--proxy",
-    "proxies",
-    multiple=True,
-    metavar="ADDRESS",
-    help="Trust X-Forwarded-* headers from this proxy.",
-)
-@click.option("--require-token", is_flag=True, help="Require a token for reading too, on any host.")
-@workers_option(2)
-@click.option(
-    "--ray",
-    metavar="ADDRESS",
-    help="Run jobs on this Ray cluster, which must see the recordings under the same path.",
-)
-@click.option(
-    "--log", type=FILE, metavar="FILE", help="Append the log to this file, as JSON lines.  [default: stderr]"
-)
 def serve_command(
-    recordings: tuple[Path, ...],
-    host: str,
-    port: int,
-    hosts: tuple[str, ...],
-    proxies: tuple[str, ...],
-    require_token: bool,
-    workers: int,
-    ray: str | None,
-    log: Path | None,
+    recordings: tuple[Path, ...] = folders_option,
+    host: str = option(
+        "--host", default="127.0.0.1", show_default=True, metavar="HOST", help="The address to listen on."
+    ),
+    port: int = option(
+        "--port",
+        type=click.IntRange(0, 65535),
+        default=8000,
+        show_default=True,
+        metavar="PORT",
+        help="The port to listen on; 0 for any free port.",
+    ),
+    hosts: tuple[str, ...] = option(
+        "--allow-host",
+        multiple=True,
+        metavar="NAME",
+        help="A host name to accept requests for, such as that of a proxy; may be repeated.",
+    ),
+    proxies: tuple[str, ...] = option(
+        "--proxy", multiple=True, metavar="ADDRESS", help="Trust X-Forwarded-* headers from this proxy."
+    ),
+    require_token: bool = option(
+        "--require-token", is_flag=True, help="Require a token for reading too, on any host."
+    ),
+    workers: int = workers_option(2),
+    ray: str | None = option(
+        "--ray",
+        metavar="ADDRESS",
+        help="Run jobs on this Ray cluster, which must see the recordings under the same path.",
+    ),
+    log: Path | None = option(
+        "--log",
+        type=FILE,
+        metavar="FILE",
+        help="Append the log to this file, as JSON lines.  [default: stderr]",
+    ),
 ) -> None:
     """Serve the runs to browsers and programs: list, replay, compare, upload, submit.
 

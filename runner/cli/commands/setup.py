@@ -6,16 +6,17 @@ from pathlib import Path
 
 import click
 
-from runner.cli import Command, Group
+from runner.cli.command import Command, Group, argument
 from runner.cli.options import config_argument, json_option, output_option, set_option
 from runner.cli.output import draw, print_json, print_written, say, table
 from runner.cli.parameter_types import DIRECTORY, SHIPPED
 
 
 @click.command("init", cls=Command)
-@click.argument("folder", metavar="[FOLDER]", default=".", type=DIRECTORY)
-@json_option
-def init_command(folder: Path, as_json: bool) -> None:
+def init_command(
+    folder: Path = argument(metavar="[FOLDER]", default=".", type=DIRECTORY),
+    as_json: bool = json_option,
+) -> None:
     """Create a folder to start in, with configs/, recordings/ and a README of what to type.
 
     FOLDER defaults to the current one. Existing files are left as they are.
@@ -54,8 +55,9 @@ def config_command() -> None:
 
 
 @config_command.command("ls")
-@json_option
-def ls(as_json: bool) -> None:
+def ls(
+    as_json: bool = json_option,
+) -> None:
     """List the shipped experiments, for `run`, and sweeps, for `sweep run`.
 
     Example:
@@ -76,10 +78,11 @@ def ls(as_json: bool) -> None:
 
 
 @config_command.command("copy")
-@click.argument("name", metavar="NAME", type=SHIPPED)
-@output_option("NAME.yaml")
-@json_option
-def copy(name: str, output: Path | None, as_json: bool) -> None:
+def copy(
+    name: str = argument(metavar="NAME", type=SHIPPED),
+    output: Path | None = output_option("NAME.yaml"),
+    as_json: bool = json_option,
+) -> None:
     """Copy the shipped experiment NAME into a file of your own, to change it.
 
     Examples:
@@ -97,10 +100,11 @@ def copy(name: str, output: Path | None, as_json: bool) -> None:
 
 
 @config_command.command("check")
-@config_argument
-@set_option
-@json_option
-def check(config: Path, overrides: tuple[str, ...], as_json: bool) -> None:
+def check(
+    config: Path = config_argument,
+    overrides: tuple[str, ...] = set_option,
+    as_json: bool = json_option,
+) -> None:
     """Check CONFIG, a file or a shipped experiment, and print it with every value spelled out.
 
     The output is a configuration again. All problems are reported at once, with file, line, column and key;
@@ -121,8 +125,9 @@ def check(config: Path, overrides: tuple[str, ...], as_json: bool) -> None:
 
 
 @config_command.command("schema")
-@json_option
-def schema(as_json: bool) -> None:  # noqa: ARG001 - a schema is JSON anyway
+def schema(
+    as_json: bool = json_option,  # noqa: ARG001 - a schema is JSON anyway
+) -> None:
     """Print the JSON Schema of configuration files, with which editors check and complete them.
 
     It is JSON with or without --json.
@@ -136,8 +141,9 @@ def schema(as_json: bool) -> None:  # noqa: ARG001 - a schema is JSON anyway
 
 
 @click.command("completion", cls=Command)
-@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
-def completion_command(shell: str) -> None:
+def completion_command(
+    shell: str = argument(type=click.Choice(["bash", "zsh", "fish"])),
+) -> None:
     """Print the script that makes SHELL complete commands, options, files and the names of runs.
 
     Examples:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from runner.cli import Command
+from runner.cli.command import Command, option
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import console, draw, facts, patch_text, print_json, printable, say, title
 from runner.cli.progress import stage_line
@@ -35,13 +35,14 @@ MAX_CYCLES: Final = 8
 
 
 @click.command("show", cls=Command)
-@run_argument
-@recordings_option
-@json_option
-@click.option(
-    "--code", is_flag=True, help="Print the code that ran: commit, script, and a patch for `git apply`."
-)
-def show_command(run_name: str, recordings: Path | None, as_json: bool, code: bool) -> None:
+def show_command(
+    run_name: str = run_argument,
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
+    code: bool = option(
+        "--code", is_flag=True, help="Print the code that ran: commit, script, and a patch for `git apply`."
+    ),
+) -> None:
     """Show a run: its evaluations, tables, configuration and provenance.
 
     With --code the code that ran. `git checkout COMMIT && dualtaxi show RUN --code | git apply` restores it;

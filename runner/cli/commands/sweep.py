@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.cli import Group
+from runner.cli.command import Group, argument, option
 from runner.cli.options import (
     accept_changes_option,
     all_option,
@@ -54,29 +54,21 @@ def sweep_command() -> None:
 
 
 @sweep_command.command("run")
-@click.argument("file", metavar="FILE", type=ConfigName("sweep"))
-@workers_option("one per processor")
-@ray_option
-@click.option("--resume", "is_resumed", is_flag=True, help="Resume a sweep.")
-@click.option("--retry-failed", is_flag=True, help="With --resume: retry failed runs.")
-@accept_changes_option
-@click.option("--dry-run", is_flag=True, help="Show what would run and how much disk it takes, and stop.")
-@click.option("--name", help="Name of the sweep.  [default: the name in the file, or of the file]")
-@json_option
-@recordings_option
-@click.pass_context
 def run(
-    ctx: click.Context,
-    file: Path,
-    workers: int | None,
-    ray: str | None,
-    is_resumed: bool,
-    retry_failed: bool,
-    accept_changes: bool,
-    dry_run: bool,
-    name: str | None,
-    as_json: bool,
-    recordings: Path | None,
+    file: Path = argument(metavar="FILE", type=ConfigName("sweep")),
+    workers: int | None = workers_option("one per processor"),
+    ray: str | None = ray_option,
+    is_resumed: bool = option("--resume", is_flag=True, help="Resume a sweep."),
+    retry_failed: bool = option("--retry-failed", is_flag=True, help="With --resume: retry failed runs."),
+    accept_changes: bool = accept_changes_option,
+    dry_run: bool = option(
+        "--dry-run", is_flag=True, help="Show what would run and how much disk it takes, and stop."
+    ),
+    name: str | None = option(
+        "--name", help="Name of the sweep.  [default: the name in the file, or of the file]"
+    ),
+    as_json: bool = json_option,
+    recordings: Path | None = recordings_option,
 ) -> None:
     """Run the sweep FILE: many runs of one experiment with other values.
 
@@ -136,31 +128,23 @@ def run(
             )
     _print_results(sweep, trials, status, as_json)
     if status.stopped or status.failed:
-        ctx.exit(ExitCode.INTERRUPTED if interrupt.came else ExitCode.DIFFERENT)
+        raise click.exceptions.Exit(ExitCode.INTERRUPTED if interrupt.came else ExitCode.DIFFERENT)
 
 
 @sweep_command.command("show")
-@click.argument("name")
-@all_option
-@click.option(
-    "--write-best",
-    "best",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Write the best configuration, with fresh seeds.",
-)
-@force_option
-@markdown_option
-@json_option
-@recordings_option
 def show(
-    name: str,
-    everything: bool,
-    best: Path | None,
-    force: bool,
-    as_markdown: bool,
-    as_json: bool,
-    recordings: Path | None,
+    name: str = argument(),
+    everything: bool = all_option,
+    best: Path | None = option(
+        "--write-best",
+        type=click.Path(path_type=Path),
+        metavar="FILE",
+        help="Write the best configuration, with fresh seeds.",
+    ),
+    force: bool = force_option,
+    as_markdown: bool = markdown_option,
+    as_json: bool = json_option,
+    recordings: Path | None = recordings_option,
 ) -> None:
     """Rank the trials of the sweep NAME with intervals over seeds, and show which parameters mattered.
 
@@ -206,9 +190,10 @@ def show(
 
 
 @sweep_command.command("ls")
-@recordings_option
-@json_option
-def ls(recordings: Path | None, as_json: bool) -> None:
+def ls(
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
+) -> None:
     """List the sweeps of a recordings folder.
 
     Example:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.cli import Command
+from runner.cli.command import Command, option
 from runner.cli.options import force_option, json_option, recordings_option, run_argument, set_option
 from runner.cli.output import draw, facts, files_written, print_json, say, table, title
 from runner.cli.parameter_types import FILE, INDEX
@@ -29,31 +29,25 @@ ROWS_AT_ONCE = 50_000
 
 
 @click.command("qtable", cls=Command)
-@run_argument
-@click.option("--step", type=INDEX, metavar="N", help="After N training steps.  [default: the last]")
-@click.option("--episode", type=INDEX, metavar="N", help="After N training episodes.")
-@click.option(
-    "--state", metavar="S", help="The state: a number or a name; shows its values and their history."
-)
-@click.option(
-    "-o",
-    "--output",
-    type=FILE,
-    metavar="FILE.npy",
-    help="Write the whole table: float64 [states, actions], of several agents [agents, states, actions].",
-)
-@force_option
-@recordings_option
-@json_option
 def qtable_command(
-    run_name: str,
-    step: int | None,
-    episode: int | None,
-    state: str | None,
-    output: Path | None,
-    force: bool,
-    recordings: Path | None,
-    as_json: bool,
+    run_name: str = run_argument,
+    step: int | None = option(
+        "--step", type=INDEX, metavar="N", help="After N training steps.  [default: the last]"
+    ),
+    episode: int | None = option("--episode", type=INDEX, metavar="N", help="After N training episodes."),
+    state: str | None = option(
+        "--state", metavar="S", help="The state: a number or a name; shows its values and their history."
+    ),
+    output: Path | None = option(
+        "-o",
+        "--output",
+        type=FILE,
+        metavar="FILE.npy",
+        help="Write the whole table: float64 [states, actions], of several agents [agents, states, actions].",
+    ),
+    force: bool = force_option,
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
 ) -> None:
     """Show the exact Q-table of RUN at any step: the nearest snapshot, with the recorded steps replayed.
 
@@ -138,17 +132,17 @@ def _state_table(rows: list[ActionValue]) -> Table:
 
 
 @click.command("table", cls=Command)
-@click.option(
-    "--env",
-    "env_id",
-    default="dualtaxi:DualTaxi-v1",
-    show_default=True,
-    metavar="ID",
-    help="Gymnasium's id of the environment; before a colon, the module to import for it.",
-)
-@set_option
-@json_option
-def table_command(env_id: str, overrides: tuple[str, ...], as_json: bool) -> None:
+def table_command(
+    env_id: str = option(
+        "--env",
+        default="dualtaxi:DualTaxi-v1",
+        show_default=True,
+        metavar="ID",
+        help="Gymnasium's id of the environment; before a colon, the module to import for it.",
+    ),
+    overrides: tuple[str, ...] = set_option,
+    as_json: bool = json_option,
+) -> None:
     """Print an environment's transition table as CSV, with names.
 
     A row for each state, action and outcome that can happen: state, action, probability, next_state, reward,

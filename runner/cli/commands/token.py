@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from runner.cli import Group
+from runner.cli.command import Group, argument, option
 from runner.cli.options import json_option
 from runner.cli.output import draw, print_json, say, table
 from runner.service.settings import tokens_file
@@ -25,16 +25,17 @@ def token_command() -> None:
 
 
 @token_command.command("create")
-@click.argument("name")
-@click.option(
-    "--scope",
-    type=click.Choice(("read", "write")),
-    default="read",
-    show_default=True,
-    help="What the token allows; writing includes reading.",
-)
-@json_option
-def create(name: str, scope: str, as_json: bool) -> None:
+def create(
+    name: str = argument(),
+    scope: str = option(
+        "--scope",
+        type=click.Choice(("read", "write")),
+        default="read",
+        show_default=True,
+        help="What the token allows; writing includes reading.",
+    ),
+    as_json: bool = json_option,
+) -> None:
     """Create a token called NAME and print it, once: only its hash is stored.
 
     Examples:
@@ -51,8 +52,9 @@ def create(name: str, scope: str, as_json: bool) -> None:
 
 
 @token_command.command("ls")
-@json_option
-def ls(as_json: bool) -> None:
+def ls(
+    as_json: bool = json_option,
+) -> None:
     """List the tokens; only their hashes are stored.
 
     Example:
@@ -70,9 +72,10 @@ def ls(as_json: bool) -> None:
 
 
 @token_command.command("revoke")
-@click.argument("which", metavar="TOKEN")
-@json_option
-def revoke(which: str, as_json: bool) -> None:
+def revoke(
+    which: str = argument(metavar="TOKEN"),
+    as_json: bool = json_option,
+) -> None:
     """Revoke a token by its id or name; a running server refuses it from now on.
 
     Example:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from runner.cli import Command
+from runner.cli.command import Command, option
 from runner.cli.options import json_option, recordings_option, run_argument, trust_option
 from runner.cli.output import draw, facts, print_json
 from runner.cli.progress import bytes_line, count_line
@@ -26,32 +26,25 @@ if TYPE_CHECKING:
 
 
 @click.command("verify", cls=Command)
-@run_argument
-@click.option(
-    "--rerun/--no-rerun",
-    default=None,
-    help="Run it again in the installed environment; by default loops only, where that is possible.",
-)
-@click.option("--sample", type=click.IntRange(1), help="Do only N episodes of a loop again, evenly spread.")
-@click.option(
-    "--tolerance",
-    type=click.FloatRange(0, 1),
-    default=0.0,
-    help="Accept this absolute and relative difference of a loop's observations and rewards.",
-)
-@trust_option
-@recordings_option
-@json_option
-@click.pass_context
 def verify_command(
-    ctx: click.Context,
-    run_name: str,
-    rerun: bool | None,
-    sample: int | None,
-    tolerance: float,
-    trust: bool,
-    recordings: Path | None,
-    as_json: bool,
+    run_name: str = run_argument,
+    rerun: bool | None = option(
+        "--rerun/--no-rerun",
+        default=None,
+        help="Run it again in the installed environment; by default loops only, where that is possible.",
+    ),
+    sample: int | None = option(
+        "--sample", type=click.IntRange(1), help="Do only N episodes of a loop again, evenly spread."
+    ),
+    tolerance: float = option(
+        "--tolerance",
+        type=click.FloatRange(0, 1),
+        default=0.0,
+        help="Accept this absolute and relative difference of a loop's observations and rewards.",
+    ),
+    trust: bool = trust_option,
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
 ) -> None:
     """Check RUN, or a recording by its path: every byte, step, episode, figure and table.
 
@@ -99,7 +92,7 @@ def verify_command(
         draw(facts(_verification(found, with_installed) | (_redone(redone) if redone else {})))
     failures = ("differs", "impossible") if rerun else ("differs",)
     if not found.sound or (redone is not None and redone.verdict in failures):
-        ctx.exit(ExitCode.DIFFERENT)
+        raise click.exceptions.Exit(ExitCode.DIFFERENT)
 
 
 def _redone(redone: Redone) -> dict[str, str]:
@@ -229,11 +222,11 @@ _MESSAGES: Final = {
 
 
 @click.command("repair", cls=Command)
-@run_argument
-@recordings_option
-@json_option
-@click.pass_context
-def repair_command(ctx: click.Context, run_name: str, recordings: Path | None, as_json: bool) -> None:
+def repair_command(
+    run_name: str = run_argument,
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
+) -> None:
     """Repair the recording of RUN, or one given by its path, so that every reader opens it.
 
     Every good chunk is copied to a new file, also those after a damaged place; the file is read back and
@@ -266,7 +259,7 @@ def repair_command(ctx: click.Context, run_name: str, recordings: Path | None, a
     else:
         draw(facts(_repair(repaired, run)))
     if not repaired.lossless:
-        ctx.exit(ExitCode.DIFFERENT)
+        raise click.exceptions.Exit(ExitCode.DIFFERENT)
 
 
 def _repair(repaired: Repair, run: Run | None) -> dict[str, str]:

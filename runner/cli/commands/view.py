@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli import Command
+from runner.cli.command import Command, argument, option
 from runner.cli.commands.export import print_selection
 from runner.cli.options import force_option, recordings_option, selection_options
 from runner.cli.output import say
@@ -20,58 +20,45 @@ from runner.cli.runs import compilation_notice, find_recorded
 if TYPE_CHECKING:
     from runner.analysis.step_reference import StepRef
     from runner.export.rerun.location import Location
+    from runner.export.rerun.selection import Request
 
 
 @click.command("view", cls=Command)
-@click.argument("run_names", metavar="RUN [RUN]", nargs=-1, required=True, type=RunName())
-@click.option(
-    "--at",
-    "step",
-    type=STEP,
-    metavar="EPISODE:T",
-    help="The step: EPISODE:T of training, or eval:N:TRIAL:T of an evaluation. T and TRIAL default to 0.",
-)
-@click.option("--web", is_flag=True, help="Serve the web viewer on 127.0.0.1 instead of opening a window.")
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=0,
-    metavar="PORT",
-    help="Port of the viewer.  [default: any free port]",
-)
-@click.option(
-    "--screenshot",
-    type=click.Path(dir_okay=False, path_type=Path),
-    metavar="FILE.png",
-    help="Write one frame to a file; no screen is needed.",
-)
-@click.option(
-    "--size",
-    "picture_size",
-    type=PICTURE_SIZE,
-    default="1600x900",
-    show_default=True,
-    metavar="WxH",
-    help="Size of the screenshot in pixels.",
-)
-@force_option
-@selection_options
-@recordings_option
 def view_command(
-    run_names: tuple[str, ...],
-    step: StepRef | None,
-    web: bool,
-    port: int,
-    screenshot: Path | None,
-    picture_size: str,
-    force: bool,
-    episodes: tuple[tuple[int, int | None], ...] | None,
-    evaluations: tuple[int, ...] | None,
-    every: int | None,
-    everything: bool,
-    frames: bool,
-    trust: bool,
-    recordings: Path | None,
+    run_names: tuple[str, ...] = argument(metavar="RUN [RUN]", nargs=-1, required=True, type=RunName()),
+    step: StepRef | None = option(
+        "--at",
+        type=STEP,
+        metavar="EPISODE:T",
+        help="The step: EPISODE:T of training, or eval:N:TRIAL:T of an evaluation. T and TRIAL default to 0.",
+    ),
+    web: bool = option(
+        "--web", is_flag=True, help="Serve the web viewer on 127.0.0.1 instead of opening a window."
+    ),
+    port: int = option(
+        "--port",
+        type=click.IntRange(0, 65535),
+        default=0,
+        metavar="PORT",
+        help="Port of the viewer.  [default: any free port]",
+    ),
+    screenshot: Path | None = option(
+        "--screenshot",
+        type=click.Path(dir_okay=False, path_type=Path),
+        metavar="FILE.png",
+        help="Write one frame to a file; no screen is needed.",
+    ),
+    picture_size: str = option(
+        "--size",
+        type=PICTURE_SIZE,
+        default="1600x900",
+        show_default=True,
+        metavar="WxH",
+        help="Size of the screenshot in pixels.",
+    ),
+    force: bool = force_option,
+    selected: Request = selection_options,
+    recordings: Path | None = recordings_option,
 ) -> None:
     """Open RUN in the Rerun viewer at a step, or two runs side by side where they diverge.
 
@@ -98,21 +85,16 @@ def view_command(
     with stage_line("loading Rerun") as stage:
         from runner.export.rerun.cache import cached_export
         from runner.export.rerun.location import locate, locate_divergence
-        from runner.export.rerun.selection import Request
-
-        request = Request(
-            episodes or (), evaluations or (), every or 0, everything, frames=frames, trust=trust
-        )
 
         divergence = None
         if len(runs) == 2 and step is None:
             stage("comparing the runs")
             divergence, message = locate_divergence(runs)
             say(message)
-        location = locate(runs[0], request, step or divergence)
+        location = locate(runs[0], selected, step or divergence)
         if divergence is not None:
             # Trials before it that differ in length shift the second run's timeline.
-            first, second = location.time, locate(runs[1], request, divergence).time
+            first, second = location.time, locate(runs[1], selected, divergence).time
             also = "" if first == second else f" in the first run, step {second:,} in the second"
             say(f"On the timeline that is step {first:,}{also}.")
         stage("exporting")

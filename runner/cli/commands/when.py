@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from runner.cli import Command
+from runner.cli.command import Command, argument, option
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, print_sections
 from runner.cli.progress import steps_line
@@ -14,26 +14,20 @@ from runner.cli.runs import command_for, compilation_notice, find_recorded
 
 
 @click.command("when", cls=Command)
-@run_argument
-@click.argument("expression", metavar="EXPRESSION")
-@click.option(
-    "--all",
-    "everything",
-    is_flag=True,
-    help="Include everything, not only a selection: every interval in which it holds, with its end.",
-)
-@click.option("--from", "first", metavar="STEP", help="The first training step: its number, or EPISODE:T.")
-@click.option("--to", "last", metavar="STEP", help="The last training step, as for --from.")
-@recordings_option
-@json_option
 def when_command(
-    run_name: str,
-    expression: str,
-    everything: bool,
-    first: str | None,
-    last: str | None,
-    recordings: Path | None,
-    as_json: bool,
+    run_name: str = run_argument,
+    expression: str = argument(metavar="EXPRESSION"),
+    everything: bool = option(
+        "--all",
+        is_flag=True,
+        help="Include everything, not only a selection: every interval in which it holds, with its end.",
+    ),
+    first: str | None = option(
+        "--from", metavar="STEP", help="The first training step: its number, or EPISODE:T."
+    ),
+    last: str | None = option("--to", metavar="STEP", help="The last training step, as for --from."),
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
 ) -> None:
     """Find the first training step of RUN after which EXPRESSION holds, exactly: every step is replayed.
 

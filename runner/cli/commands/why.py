@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli import Command
+from runner.cli.command import Command, option
 from runner.cli.options import json_option, limit_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, print_sections
 from runner.cli.parameter_types import STEP
@@ -19,29 +19,27 @@ if TYPE_CHECKING:
 
 
 @click.command("why", cls=Command)
-@run_argument
-@click.option("--state", metavar="S", help="The state: a number or a name.  [default: that of --at]")
-@click.option("--action", metavar="A", help="The action: a number or a name.  [default: that of --at]")
-@click.option("--agent", metavar="NAME", help="Whose Q-table, where each agent has its own.")
-@click.option(
-    "--at",
-    type=STEP,
-    metavar="STEP",
-    help="The step: EPISODE:T, or eval:N:TRIAL:T; T defaults to 0, so 120 is the start of episode 120. The "
-    "value before the step is shown.  [default: the last]",
-)
-@limit_option(10)
-@recordings_option
-@json_option
 def why_command(
-    run_name: str,
-    state: str | None,
-    action: str | None,
-    agent: str | None,
-    at: StepRef | None,
-    limit: int,
-    recordings: Path | None,
-    as_json: bool,
+    run_name: str = run_argument,
+    state: str | None = option(
+        "--state", metavar="S", help="The state: a number or a name.  [default: that of --at]"
+    ),
+    action: str | None = option(
+        "--action", metavar="A", help="The action: a number or a name.  [default: that of --at]"
+    ),
+    agent: str | None = option(
+        "--agent", metavar="NAME", help="Whose Q-table, where each agent has its own."
+    ),
+    at: StepRef | None = option(
+        "--at",
+        type=STEP,
+        metavar="STEP",
+        help="The step: EPISODE:T, or eval:N:TRIAL:T; T defaults to 0, so 120 is the start of episode 120. "
+        "The value before the step is shown.  [default: the last]",
+    ),
+    limit: int = limit_option(10),
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
 ) -> None:
     """Show where a Q-value of RUN comes from: the recorded rewards and initial values that it is the sum of.
 

@@ -1,0 +1,99 @@
+"""Commands as functions, whose parameters' defaults declare the arguments and options.
+
+@click.command("qtable", cls=Command)
+def qtable_command(
+    run_name: str = argument(metavar="RUN"),
+    step: int | None = option("--step", type=INDEX, help="After N training steps."),
+) -> None:
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import click
+
+from runner.errors import nearest
+
+
+def argument(**attributes: Any) -> Any:
+    """Return the default of a parameter that is an argument; attributes as for `click.Argument`."""
+    return lambda name: click.Argument([name], **attributes)
+
+
+def option(*flags: str, **attributes: Any) -> Any:
+    """Return the default of a parameter that is an option; attributes as for `click.Option`."""
+    return lambda name: click.Option([name, *flags], **attributes)
+
+
+def record(make: Callable[..., object]) -> Any:
+    """Return the default of a parameter that a function makes of several arguments and options.
+
+    The defaults of the function's own parameters declare them.
+    """
+    return _Record(make)
+
+
+class _Record:
+    """What a function returns, given the values of the arguments and options that its parameters declare."""
+
+    def __init__(self, make: Callable[..., object]) -> None:
+        self._make = make
+        declared = inspect.signature(make).parameters.values()
+        self._declared = {parameter.name: parameter.default for parameter in declared}
+
+    def parameters(self) -> Iterator[click.Parameter]:
+        """Yield the arguments and options."""
+        for name, declared in self._declared.items():
+            if isinstance(declared, _Record):
+                yield from declared.parameters()
+            else:
+                yield declared(name)
+
+    def __call__(self, **values: object) -> object:
+        """Call the function with its part of all values."""
+        own = {
+            name: declared(**values) if isinstance(declared, _Record) else values[name]
+            for name, declared in self._declared.items()
+        }
+        return self._make(**own)
+
+
+def _with_examples(text: str | None) -> str | None:
+    """Return a help text with Click's mark for preformatted text before its examples and other lists."""
+    return text and re.sub(r"\n\n(?=[A-Z][a-z ]*:\n)", "\n\n\b\n", inspect.cleandoc(text))
+
+
+class Command(click.Command):
+    """A command of a function that declares its parameters; its help keeps the lines of its examples."""
+
+    def __init__(self, *args: Any, callback: Callable[..., object], **attributes: Any) -> None:
+        call = _Record(callback)
+        super().__init__(*args, **attributes | {"callback": call, "params": list(call.parameters())})
+        self.help = _with_examples(self.help)
+
+
+class Group(click.Group):
+    """A group of such commands, which suggests the nearest name for an unknown one."""
+
+    command_class = Command
+
+    def __init__(self, *args: Any, **attributes: Any) -> None:
+        super().__init__(*args, **attributes)
+        self.help = _with_examples(self.help)
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        """Return the names in the order of definition."""
+        return list(self.commands)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find a command, or suggest one."""
+        known = self.list_commands(ctx)
+        if args[0] not in known and not args[0].startswith("-") and not ctx.resilient_parsing:
+            ctx.fail(f"there is no command {args[0]!r}.{nearest(args[0], known)}")
+        return super().resolve_command(ctx, args)
