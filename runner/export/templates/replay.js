@@ -308,7 +308,7 @@ class Replay {
   play() {
     if (this.timer) return this.pause();
     if (this.k === this.length) this.show(0);
-    this.button.textContent = "\u23f8";
+    this.button.textContent = "\u275a\u275a";
     this.button.setAttribute("aria-label", "Pause");
     this.timer = setInterval(() => {
       if (this.k >= this.length) return this.pause();

@@ -43,7 +43,7 @@ function pause() {
 function play() {
   if (timer) return pause();
   if (Number(slider.value) === length) show(0);
-  button.textContent = "\u23f8";
+  button.textContent = "\u275a\u275a";
   button.setAttribute("aria-label", "Pause all");
   const pace = Math.max(...replays.map((replay) => replay.pace));
   timer = setInterval(() => Number(slider.value) < length ? show(Number(slider.value) + 1) : pause(), pace);
