@@ -86,16 +86,12 @@ def find_run(
     run = run_at(Path(name)) if _is_path(name) else run_of_id(name, folder)
     if run is not None and run.run_id != exclude:
         return run
-    from runner.runs.catalogue.folders import Depth
     from runner.runs.catalogue.index import look
 
-    def matches(depth: Depth) -> list[Candidate]:
-        return look([folder], lambda index: matching(name, index, exclude), report, depth=depth)
+    def matches(quick: bool) -> list[Candidate]:
+        return look([folder], lambda index: matching(name, index, exclude), report, quick=quick)
 
-    candidates = matches(Depth.NAMES)
-    # Ids and ages never change, but a run may have been given or have lost a name since the last look.
-    if name != LATEST and not (len(candidates) == 1 and candidates[0].name != name):
-        candidates = matches(Depth.FOLDERS) or matches(Depth.FILES)
+    candidates = matches(quick=True) or matches(quick=False)
     if not candidates:
         raise look([folder], lambda index: not_found(name, index, folder), report, cached=True)
     return choose(name, candidates)._replace(root=os.fspath(folder)).run()  # the path as the user gave it
@@ -118,19 +114,17 @@ def find_runs(name: str, recordings: Path, report: Report = lambda _: None) -> l
     Raises:
         RunNotFound: no run matches, or the name is a prefix of several ids.
     """
-    from runner.runs.catalogue.folders import Depth
     from runner.runs.catalogue.index import look
 
-    runs = look([recordings], lambda index: of_name(name, index), report, depth=Depth.FOLDERS)
+    runs = look([recordings], lambda index: of_name(name, index), report, quick=True)
     return [found.run() for found in runs] or [find_run(name, recordings, report=report)]
 
 
 def run_with_id(run_id: str, recordings: Path) -> Run | None:
     """Return the run with an id, whatever its folder is called; None if there is none."""
-    from runner.runs.catalogue.folders import Depth
     from runner.runs.catalogue.index import look
 
-    found = look([recordings], lambda index: matching(run_id, index), depth=Depth.FOLDERS)
+    found = look([recordings], lambda index: matching(run_id, index), quick=True)
     place = next((Path(run.root, run.entry) for run in found if run.run_id == run_id), None)
     return run_in(place) if place else None
 
@@ -199,7 +193,6 @@ def completions(beginning: str, recordings: Path) -> dict[str, str]:
 
     Of very many only the newest are offered.
     """
-    from runner.runs.catalogue.folders import Depth
     from runner.runs.catalogue.index import look
 
     def work(index: Index) -> dict[str, str]:
@@ -212,7 +205,7 @@ def completions(beginning: str, recordings: Path) -> dict[str, str]:
                 found[f"{name}{LATEST}"] = "the newest of this name"
         return {text: meaning for text, meaning in found.items() if text.startswith(beginning)}
 
-    return look([recordings], work, depth=Depth.FOLDERS)
+    return look([recordings], work, quick=True)
 
 
 def _is_path(name: str) -> bool:

@@ -12,7 +12,6 @@ from typing import Final, TypeVar
 
 from runner.errors import RunnerError, RunNotFound
 from runner.runs.catalogue.database import Version, version
-from runner.runs.catalogue.folders import Depth
 from runner.runs.catalogue.index import Index, look
 from runner.runs.resolve import choose, matching, not_found, of_name, run_of_id
 from runner.runs.run import Run
@@ -132,7 +131,7 @@ class Catalogue:
     def _do_scan(self) -> None:
         began = time.monotonic()
         is_full = began - self._fully_scanned > FULL_INTERVAL
-        look(self.roots, lambda _: None, self._log, depth=Depth.FILES if is_full else Depth.FOLDERS)
+        look(self.roots, lambda _: None, self._log, quick=not is_full)
         self._scanned_version = version() or NOTHING
         self._scanned = began
         if is_full:

@@ -1,12 +1,12 @@
 """Find and apply the differences between recordings folders and the index.
 
-A check is as thorough as it needs to be: listing the names in a recordings folder takes 0.5 us a run, a stat
-of each run's folder 3 us, and a stat of each run's files 10 us. Files are read where something changed.
+A quick check notices runs that are new or gone, files that were created, replaced or removed, as all commands
+do, and runs that are running: a stat of each run's folder takes 3 us. A whole one, with a stat of each run's
+files, takes 10 us, and also notices files that were changed in place. Files are read where something changed.
 """
 
 from __future__ import annotations
 
-import enum
 import os
 import time
 from collections.abc import Sequence
@@ -31,17 +31,6 @@ _FEW: Final = 500
 """Values in one statement."""
 
 
-class Depth(enum.IntEnum):
-    """Which changes of a recordings folder are detected."""
-
-    NAMES = 0
-    """New and removed runs."""
-    FOLDERS = 1
-    """Also runs with a file created, replaced or removed, as all commands do, and running ones."""
-    FILES = 2
-    """Also files changed in place."""
-
-
 @dataclass(frozen=True)
 class Difference:
     """How a recordings folder differs from the index; runs are given by the names of their folders."""
@@ -62,13 +51,11 @@ class Folders:
         self,
         database: SqliteDatabase,
         roots: Sequence[str],
-        depth: Depth = Depth.FILES,
-        rebuild: bool = False,
+        quick: bool = False,
     ) -> None:
         self._database = database
         self._roots = roots
-        self._depth = depth
-        self._rebuild = rebuild
+        self._quick = quick
         self._tokens: dict[str, dict[str, str]] = {}
         self._read: dict[str, set[str]] = {root: set() for root in roots}
 
@@ -91,30 +78,31 @@ class Folders:
             for entries in chunked(difference.gone, _FEW):
                 Row.delete().where(here & Row.entry.in_(entries)).execute(self._database)
 
-    def forget_missing(self) -> None:
-        """Delete the rows of recordings folders that no longer exist."""
+    def expire(self) -> None:
+        """Have all runs of these folders read again, and delete the rows of folders that no longer exist."""
         known = [root for (root,) in tuples_of(self._database, Row.select(Row.root).distinct())]
         stale = [root for root in known if not os.path.isdir(root)]  # noqa: PTH112
         Row.delete().where(Row.root.in_(stale)).execute(self._database)
+        Row.update(fingerprint="", mark="").where(Row.root.in_(self._roots)).execute(self._database)
 
     def _difference(self, root: str) -> Difference:
         """Return the difference of one folder; entries without files of a run are left out, or gone."""
-        stored = Row.mark if self._depth is Depth.FOLDERS else Row.fingerprint
+        stored = Row.mark if self._quick else Row.fingerprint
         own = Row.select(Row.entry, stored).where(Row.root == root)
         known: dict[str, str] = dict(tuples_of(self._database, own))
         tokens = self._tokens_of(root)
-        died: list[str] = []
-        if self._depth is Depth.NAMES and not self._rebuild:
-            changed = [entry for entry in tokens if entry not in known]
-        else:
-            changed = [entry for entry, token in tokens.items() if known.get(entry) != token]
-            running, unstable = self._unstable(root)
-            again = [*tokens] if self._rebuild else unstable
-            if self._depth is Depth.FOLDERS:
-                again = [*again, *running]  # their recordings grow in place
-            changed += [e for e in again if known.get(e) == tokens.get(e) and e not in self._read[root]]
-            unchanged = set(running) - set(changed)
-            died = [entry for entry in unchanged if entry in tokens and not _is_running(root, entry)]
+        changed = [entry for entry, token in tokens.items() if known.get(entry) != token]
+        unsteady = (Row.status == "running") | (Row.stable == False)  # noqa: E712 - an expression of SQL
+        rows = Row.select(Row.entry, Row.status, Row.stable).where((Row.root == root) & unsteady)
+        running = set()
+        for entry, status, stable in tuples_of(self._database, rows):
+            if status == "running":
+                running.add(entry)
+            may_differ = not stable or self._quick  # the recording of a running one grows in place
+            if may_differ and known.get(entry) == tokens.get(entry) and entry not in self._read[root]:
+                changed.append(entry)
+        unchanged = running - set(changed)
+        died = [entry for entry in unchanged if entry in tokens and not _is_running(root, entry)]
         there = [entry for entry in dict.fromkeys(changed) if _state_of(root, entry) is not None]
         missing = {*known} - {*tokens} | {*changed} - {*there}
         gone = [entry for entry in missing if entry in known and _state_of(root, entry) is None]
@@ -128,27 +116,16 @@ class Folders:
         return self._tokens[root]
 
     def _token(self, root: str, entry: str) -> str:
-        match self._depth:
-            case Depth.NAMES:
-                return ""
-            case Depth.FOLDERS:
-                return _mark(root, entry)[0]
+        if self._quick:
+            return _mark(root, entry)[0]
         seen = _state_of(root, entry)
         return "" if seen is None else seen.fingerprint
-
-    def _unstable(self, root: str) -> tuple[list[str], list[str]]:
-        """Return the runs that were running when they were read, and those just changed then."""
-        unsteady = (Row.status == "running") | (Row.stable == False)  # noqa: E712 - an expression of SQL
-        rows = Row.select(Row.entry, Row.status, Row.stable).where((Row.root == root) & unsteady)
-        found = list(tuples_of(self._database, rows))
-        running = [entry for entry, status, _ in found if status == "running"]
-        return running, [entry for entry, _, stable in found if not stable]
 
     def _row(self, root: str, entry: str) -> dict[str, object]:
         mark, changed = _mark(root, entry)  # before the files: later changes are found next time
         seen = _state_of(root, entry) or State("", 0, None)
         stable = max(changed, seen.changed) + _STABLE_NS < time.time_ns()
-        self._tokens[root][entry] = mark if self._depth is Depth.FOLDERS else seen.fingerprint
+        self._tokens[root][entry] = mark if self._quick else seen.fingerprint
         self._read[root].add(entry)
         place = {"root": root, "entry": entry, "fingerprint": seen.fingerprint, "mark": mark}
         if run := run_in(Path(root, entry)):

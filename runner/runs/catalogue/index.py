@@ -20,7 +20,7 @@ from runner.runs.branches import BranchNode, Origin, parse_origin
 from runner.runs.catalogue.columns import SETTING, IndexRow, Kind, field_of, with_same_as
 from runner.runs.catalogue.database import Report, create, index_path, open_index, renew, tuples_of, version
 from runner.runs.catalogue.filters import ANY_RUN, Filter, matches, setting_path
-from runner.runs.catalogue.folders import Depth, Folders
+from runner.runs.catalogue.folders import Folders
 from runner.runs.catalogue.rows import Expression, Row, SqlRow, text
 from runner.runs.run import check_folder_name
 
@@ -223,13 +223,15 @@ def look(
     report: Report = lambda _: None,
     rebuild: bool = False,
     cached: bool = False,
-    depth: Depth = Depth.FILES,
+    quick: bool = False,
 ) -> Result:
     """Return the result of some work on the index of these folders, which is brought up to date before.
 
     Args:
         work: called once, or once more if the index turns out to be damaged.
+        rebuild: read all runs again.
         cached: use the index as it is, without checking the folders.
+        quick: miss files that were changed in place, as `runner.runs.catalogue.folders` explains.
     """
     paths = (os.path.abspath(root) for root in roots)  # noqa: PTH100 - links stay as they are
     places = list(dict.fromkeys(paths))
@@ -242,7 +244,7 @@ def look(
                 if cached and before is not None and before.file == (version() or before).file:
                     with database.atomic("DEFERRED"):
                         return work(Index(database, places))
-                return _look(database, places, work, depth, rebuild)
+                return _look(database, places, work, quick, rebuild)
         except (OperationalError, OSError) as error:
             report(f"The index {index_path()} cannot be used ({error}); the folders are read without it.")
             break
@@ -251,7 +253,7 @@ def look(
             renew()
             cached = False
     with contextlib.closing(create(":memory:")) as database:
-        return _look(database, places, work, depth, rebuild)
+        return _look(database, places, work, quick, rebuild)
 
 
 def order_of(text: str) -> list[Expression]:
@@ -276,12 +278,12 @@ def _look(
     database: SqliteDatabase,
     roots: Sequence[str],
     work: Callable[[Index], Result],
-    depth: Depth,
+    quick: bool,
     rebuild: bool,
 ) -> Result:
-    folders, index = Folders(database, roots, depth, rebuild), Index(database, roots)
+    folders, index = Folders(database, roots, quick), Index(database, roots)
     if rebuild:
-        folders.forget_missing()
+        folders.expire()
     before = _data_version(database)
     differences = folders.differences()
     if not differences:
