@@ -13,7 +13,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import IO, Final
 
 import click
 
@@ -126,7 +126,7 @@ class Failure(click.ClickException):
         self.problems = error.problems if isinstance(error, ConfigError) else ()
         self.as_json = as_json
 
-    def show(self, file: Any = None) -> None:
+    def show(self, file: IO[str] | None = None) -> None:
         """Print the message; each of several problems has a line, which begins with its place."""
         lines = self.message.count("\n") + 1
         head = f"{lines} problems\n" if self.problems and lines > 1 else ""

@@ -18,18 +18,21 @@ import click
 
 from runner.errors import nearest
 
+Declared = Any
+"""The default of a parameter, which stands for values of the parameter's own type."""
 
-def argument(**attributes: Any) -> Any:
+
+def argument(**attributes: Any) -> Declared:
     """Return the default of a parameter that is an argument; attributes as for `click.Argument`."""
     return lambda name: click.Argument([name], **attributes)
 
 
-def option(*flags: str, **attributes: Any) -> Any:
+def option(*flags: str, **attributes: Any) -> Declared:
     """Return the default of a parameter that is an option; attributes as for `click.Option`."""
     return lambda name: click.Option([name, *flags], **attributes)
 
 
-def record(make: Callable[..., object]) -> Any:
+def record(make: Callable[..., object]) -> Declared:
     """Return the default of a parameter that a function makes of several arguments and options.
 
     The defaults of the function's own parameters declare them.
@@ -70,9 +73,9 @@ def _with_examples(text: str | None) -> str | None:
 class Command(click.Command):
     """A command of a function that declares its parameters; its help keeps the lines of its examples."""
 
-    def __init__(self, *args: Any, callback: Callable[..., object], **attributes: Any) -> None:
+    def __init__(self, name: str | None, callback: Callable[..., object], **attributes: Any) -> None:
         call = _Record(callback)
-        super().__init__(*args, **attributes | {"callback": call, "params": list(call.parameters())})
+        super().__init__(name, **attributes | {"callback": call, "params": list(call.parameters())})
         self.help = _with_examples(self.help)
 
 
@@ -81,8 +84,8 @@ class Group(click.Group):
 
     command_class = Command
 
-    def __init__(self, *args: Any, **attributes: Any) -> None:
-        super().__init__(*args, **attributes)
+    def __init__(self, name: str | None, **attributes: Any) -> None:
+        super().__init__(name, **attributes)
         self.help = _with_examples(self.help)
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002

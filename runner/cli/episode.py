@@ -18,6 +18,7 @@ from runner.export.values import action_in_words, plain_value, value_in_words
 from runner.replay.steps import check_steps, reset_of, transitions_of
 from runner.util.humanize import number
 from runner.util.jsonable import as_json
+from runner.util.values import Json
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from runner.export.pictures import Pictures
     from runner.recording.reader import Recording
 
+Row = Any
+"""A recorded step, whose fields are found by name."""
 _MAX_NUMBERS: Final = 32
 """Larger arrays of an observation are not written out."""
 
@@ -112,7 +115,7 @@ def _state_drawer(recording: Recording, phase: str, episode: int) -> Callable[..
     if not recording.tabular:
         reset = reset_of(recording, phase, episode)
 
-        def words(row: Any, is_first: bool) -> Text:
+        def words(row: Row, is_first: bool) -> Text:
             if recording.kind == "step":
                 return Text(f"state {row['state' if is_first else 'next_state']}\n")
             if not is_first:
@@ -126,7 +129,7 @@ def _state_drawer(recording: Recording, phase: str, episode: int) -> Callable[..
     mdp = recording.mdp
     names, drawing = states_in_words(mdp), Drawing(mdp.scene) if mdp.scene is not None else None
 
-    def drawn(row: Any, is_first: bool) -> Text:
+    def drawn(row: Row, is_first: bool) -> Text:
         check_steps(np.asarray(row).reshape(1), mdp, str(recording.path), "recorded")
         state, text = int(row["state" if is_first else "next_state"]), Text()
         if drawing is not None and mdp.scene_cells is not None:
@@ -139,13 +142,13 @@ def _state_drawer(recording: Recording, phase: str, episode: int) -> Callable[..
     return drawn
 
 
-def _named(recording: Recording) -> Callable[[Any], dict[str, object]]:
+def _named(recording: Recording) -> Callable[[Row], dict[str, object]]:
     """Return a function that gives the states, action and events of a step with their names."""
     mdp, agents = recording.mdp, recording.agents
     states, actions = states_in_words(mdp), actions_in_words(mdp)
     words = {"state": states, "action": actions, "next_state": states}
 
-    def describe(row: Any) -> dict[str, object]:
+    def describe(row: Row) -> dict[str, object]:
         step = np.asarray(row).reshape(1)
         check_steps(step, mdp, str(recording.path), "recorded")
         events, explored = int(events_of(mdp, step)[0]), int(row["explored"])
@@ -160,7 +163,7 @@ def _named(recording: Recording) -> Callable[[Any], dict[str, object]]:
     return describe
 
 
-def _valued(recording: Recording, phase: str) -> Callable[[Any], dict[str, object]]:
+def _valued(recording: Recording, phase: str) -> Callable[[Row], dict[str, object]]:
     """Return a function that gives the action of a step, by name where it has one, and the observation."""
     agents = recording.agents if len(recording.agents) > 1 else ("",)
     words = {
@@ -169,9 +172,9 @@ def _valued(recording: Recording, phase: str) -> Callable[[Any], dict[str, objec
         if recording.action_names(phase, agent)
     }
 
-    def describe(row: Any) -> dict[str, object]:
+    def describe(row: Row) -> dict[str, object]:
         if recording.kind == "step":
-            found: dict[str, Any] = {name: int(row[name]) for name in ("state", "action", "next_state")}
+            found: Json = {name: int(row[name]) for name in ("state", "action", "next_state")}
         else:
             found = {name: as_json(plain_value(row[name])) for name in ("action", "next_observation")}
         if agents != ("",):

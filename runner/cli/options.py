@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import click
 
-from runner.cli.command import argument, option, record
+from runner.cli.command import Declared, argument, option, record
 from runner.cli.output import print_written
 from runner.cli.parameter_types import (
     AXIS,
@@ -168,7 +168,11 @@ class EpisodeChoice:
             UsageError: there is more than one.
         """
         choices = {"episode": self.episode, "eval": self.trial, "best": self.best, "worst": self.worst}
-        given = [f"--{name}" for name, value in (choices | others).items() if value not in (None, False)]
+        given = [
+            f"--{name}"
+            for name, value in (choices | others).items()
+            if value is not None and value is not False  # 0 is given
+        ]
         if len(given) > 1:
             raise click.UsageError(f"{' and '.join(given[:2])} exclude each other: choose one.")
 
@@ -184,7 +188,7 @@ class EpisodeChoice:
 choice_options: Final = record(EpisodeChoice)
 
 
-def output_option(default: str, metavar: str = "FILE") -> Any:
+def output_option(default: str, metavar: str = "FILE") -> Declared:
     """Return the option -o, with a text that describes the default."""
     kind = "file" if metavar.startswith("FILE") else "folder"
     return option(
@@ -216,7 +220,7 @@ class Writing:
         print_written(text, self.as_json, *paths, **more)
 
 
-def writing_options(default: str, metavar: str = "FILE") -> Any:
+def writing_options(default: str, metavar: str = "FILE") -> Declared:
     """Return the options of a command that writes files made from runs, by default at the path `default`."""
 
     def writing(
@@ -230,7 +234,7 @@ def writing_options(default: str, metavar: str = "FILE") -> Any:
     return record(writing)
 
 
-def limit_option(default: int | str) -> Any:
+def limit_option(default: int | str) -> Declared:
     """Return the option --limit, with a default number of rows, or a text that describes the default."""
     return option(
         "--limit",
@@ -241,7 +245,7 @@ def limit_option(default: int | str) -> Any:
     )
 
 
-def workers_option(default: int | str) -> Any:
+def workers_option(default: int | str) -> Declared:
     """Return the option --workers, with a default number, or a text that describes the default."""
     return option(
         "--workers",
@@ -261,7 +265,7 @@ ray_option: Final = option(
 )
 
 
-def target_option(multiple: bool) -> Any:
+def target_option(multiple: bool) -> Declared:
     """Return the option --target: a level of a metric; runs are compared when they first reach it."""
     return option(
         "--target",

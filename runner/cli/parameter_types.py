@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import click
 from click.shell_completion import CompletionItem
@@ -42,10 +42,10 @@ class Completed(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # gen
 class Parsed(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
     """Text that a function parses; the function raises ValueError or RunnerError."""
 
-    def __init__(self, name: str, expected: str, parse: Callable[[str], Any]) -> None:
+    def __init__(self, name: str, expected: str, parse: Callable[[str], object]) -> None:
         self.name, self.expected, self.parse = name, expected, parse
 
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> object:
         """Return the parsed value."""
         try:
             return self.parse(value) if isinstance(value, str) else value

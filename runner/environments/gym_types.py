@@ -6,12 +6,14 @@ import gymnasium
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
+from runner.util.values import Json
+
 Space = spaces.Space[Any]
 Env = gymnasium.Env[Any, Any]
 AnyVectorEnv = VectorEnv[Any, Any, Any]
-Info = dict[str, Any]
-"""What an environment tells besides, by field."""
+Info = Json
+"""Further results of a step or reset, by name."""
 StepResult = tuple[Any, Any, bool, bool, Info]
 VectorStepResult = tuple[Any, Any, Any, Any, Info]
 ResetResult = tuple[Any, Info]
-ResetOptions = dict[str, Any]
+ResetOptions = Json

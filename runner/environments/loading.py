@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
-from runner.environments.mdp import Mdp, check_mdp
+from runner.environments.mdp import Mdp, Transitions, check_mdp
 from runner.environments.toy_text import grid_world
 from runner.errors import EnvironmentNotUsable
+from runner.util.values import JsonView
 
 
 def load_mdp(env_id: str, kwargs: Mapping[str, object], rewards: str = "team") -> Mdp:
@@ -108,7 +109,7 @@ def _one_reward_only(env_id: str) -> EnvironmentNotUsable:
     )
 
 
-def _make(env_id: str, kwargs: Mapping[str, Any]) -> Any:
+def _make(env_id: str, kwargs: JsonView) -> Any:
     """Return the environment, without the wrappers that only check or render."""
     import gymnasium
 
@@ -139,9 +140,9 @@ def _make(env_id: str, kwargs: Mapping[str, Any]) -> Any:
         if "competitive" in kwargs and "keyword argument 'competitive'" in str(error):
             raise _one_reward_only(env_id) from error
         given = ", ".join(f"{key}={value!r}" for key, value in kwargs.items()) or "no arguments"
-        speaks = isinstance(error, TypeError | ValueError | ImportError | gymnasium.error.Error)
+        is_clear = isinstance(error, TypeError | ValueError | ImportError | gymnasium.error.Error)
         raise EnvironmentNotUsable(
-            f"environment {env_id!r} cannot be made with {given}: {error if speaks else _raised(error)}"
+            f"environment {env_id!r} cannot be made with {given}: {error if is_clear else _raised(error)}"
         ) from error
 
 
@@ -152,7 +153,7 @@ def _raised(error: Exception) -> str:
     return f"{type(error).__name__}: {error}{at}"
 
 
-def _transitions(env_id: str, base: object) -> dict[str, NDArray[Any]]:
+def _transitions(env_id: str, base: object) -> Transitions:
     """Return the transition arrays, from the environment's own or from its `P`."""
     if hasattr(base, "transitions"):
         own = base.transitions
@@ -172,8 +173,8 @@ def _transitions(env_id: str, base: object) -> dict[str, NDArray[Any]]:
 
 
 def _transitions_from_p(
-    p: Mapping[int, Mapping[int, list[tuple[float, int, Any, bool]]]],
-) -> dict[str, NDArray[Any]]:
+    p: Mapping[int, Mapping[int, list[tuple[float, int, ArrayLike, bool]]]],
+) -> Transitions:
     """Return arrays from Gymnasium's `P[state][action] = [(probability, next state, reward, terminated)]`."""
     states, actions = len(p), len(p[0])
     most = max(len(outcomes) for row in p.values() for outcomes in row.values())

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,16 @@ _DTYPES = {
     "events": np.uint32,
     "start": np.float64,
 }
+
+
+class Transitions(TypedDict):
+    """The arrays of an environment's outcomes, as `Mdp` has them."""
+
+    next_state: NDArray[np.int32]
+    probability: NDArray[np.float64]
+    rewards: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    events: NDArray[np.uint32]
 
 
 @dataclass(frozen=True, eq=False)

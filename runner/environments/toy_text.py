@@ -15,13 +15,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.environments.mdp import Transitions
 from runner.errors import EnvironmentNotUsable
 
 # Okabe and Ito (2008): distinguishable with any common colour blindness.
 _VERMILLION, _GREEN, _YELLOW, _BLUE = "#D55E00", "#009E73", "#F0E442", "#0072B2"
 _GREY, _SKY_BLUE = "#777777", "#56B4E9"
 
-Arrays = Mapping[str, NDArray[Any]]
 Events = Mapping[str, NDArray[np.bool_]]
 
 
@@ -52,7 +52,7 @@ class GridWorld:
         return np.asarray(np.bitwise_or.reduce(list(bits)), np.uint32)
 
 
-def grid_world(env_id: str, base: object, arrays: Arrays) -> GridWorld | None:
+def grid_world(env_id: str, base: object, arrays: Transitions) -> GridWorld | None:
     """Return the additions to one of Gymnasium's grid worlds; None for any other environment.
 
     Args:
@@ -62,7 +62,7 @@ def grid_world(env_id: str, base: object, arrays: Arrays) -> GridWorld | None:
     return None if adapt is None else adapt(env_id, base, arrays)
 
 
-def _taxi(env_id: str, base: Any, arrays: Arrays) -> GridWorld:
+def _taxi(env_id: str, base: Any, arrays: Transitions) -> GridWorld:
     if base.fickle_passenger:
         raise EnvironmentNotUsable(
             f"environment {env_id!r} with fickle_passenger=True: found a passenger who changes the "
@@ -116,7 +116,7 @@ def _taxi(env_id: str, base: Any, arrays: Arrays) -> GridWorld:
     )
 
 
-def _frozen_lake(_: str, base: Any, arrays: Arrays) -> GridWorld:
+def _frozen_lake(_: str, base: Any, arrays: Transitions) -> GridWorld:
     tiles = base.desc.ravel()
     return GridWorld(
         scene=_scene(
@@ -132,7 +132,7 @@ def _frozen_lake(_: str, base: Any, arrays: Arrays) -> GridWorld:
     )
 
 
-def _cliff(_: str, base: Any, arrays: Arrays) -> GridWorld:
+def _cliff(_: str, base: Any, arrays: Transitions) -> GridWorld:
     tiles = np.where(base._cliff, b"C", b"F")
     tiles.ravel()[base.start_state_index], tiles.ravel()[-1] = b"S", b"G"
     return GridWorld(
@@ -150,7 +150,7 @@ def _cliff(_: str, base: Any, arrays: Arrays) -> GridWorld:
     )
 
 
-_ADAPTERS: Final[Mapping[str, Callable[[str, object, Arrays], GridWorld]]] = {
+_ADAPTERS: Final[Mapping[str, Callable[[str, object, Transitions], GridWorld]]] = {
     "gymnasium.envs.toy_text.taxi.TaxiEnv": _taxi,
     "gymnasium.envs.toy_text.frozen_lake.FrozenLakeEnv": _frozen_lake,
     "gymnasium.envs.toy_text.cliffwalking.CliffWalkingEnv": _cliff,
@@ -212,14 +212,14 @@ def _one_player(cells: int) -> dict[str, Any]:
     }
 
 
-def _action(arrays: Arrays, action: int) -> NDArray[np.bool_]:
+def _action(arrays: Transitions, action: int) -> NDArray[np.bool_]:
     """Return the real outcomes [S, J, K] of an action."""
     taken = np.zeros(arrays["next_state"].shape, np.bool_)
     taken[:, action] = True
     return np.asarray(taken & (arrays["probability"] > 0))
 
 
-def _arrives(arrays: Arrays, where: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _arrives(arrays: Transitions, where: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the outcomes [S, J, K] that enter one of these states from another."""
     entered = where[arrays["next_state"]] & ~where[:, np.newaxis, np.newaxis]
     return np.asarray(entered & (arrays["probability"] > 0))

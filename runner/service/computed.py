@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Sequence
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,7 @@ RecordKind = Literal["evaluations", "training", "optimality"]
 
 
 def curves(
-    paths: Sequence[Path],
+    paths: Path | Sequence[Path],
     axis: str = EPISODES.name,
     metrics: Sequence[str] = (),
     start: float = 0,
@@ -69,7 +69,7 @@ def curves(
     memory of this percentage of the part shown.
     """
     series, common = [], list(AXES.values())
-    for path in paths:
+    for path in [paths] if isinstance(paths, Path) else paths:
         with open_recording(path) as recording:
             series.append(read_series(recording, axis_of(axis)))
             own = axes_of(recording)
@@ -99,11 +99,6 @@ def curves(
             "curves": shown,
         }
     )
-
-
-def run_curves(path: Path, *options: Any) -> bytes:
-    """Return the metrics of one run; options as for `curves`."""
-    return curves([path], *options)
 
 
 def run_histograms(path: Path, axis: str) -> bytes:

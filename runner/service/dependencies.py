@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 from anyio import CapacityLimiter
 from fastapi import Depends, Request, Response
@@ -27,7 +27,7 @@ from runner.service.uploads import Uploads
 def _state(name: str) -> object:
     """Return the dependency on a part of the service, as `app.state` has it."""
 
-    def get(request: Request) -> Any:
+    def get(request: Request) -> object:
         return getattr(request.app.state, name)
 
     return Depends(get)

@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Hashable
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from starlette.concurrency import run_in_threadpool
 
@@ -56,7 +56,7 @@ class ResponseCache:
             task.add_done_callback(lambda done: self._store(key, done))
         return await asyncio.shield(self._pending[key])
 
-    def _store(self, key: Hashable, done: asyncio.Future[Any]) -> None:
+    def _store(self, key: Hashable, done: asyncio.Future[bytes]) -> None:
         del self._pending[key]
         if done.cancelled() or done.exception() is not None:
             return

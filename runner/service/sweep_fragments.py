@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 from markupsafe import Markup
 
@@ -65,7 +64,7 @@ def sweep_results(name: str, recordings: Path, digest: str) -> bytes:
     return "".join([*html, shown.best(results.best_yaml) if results.best_yaml else ""]).encode()
 
 
-def _run_links(runs: Mapping[Any, str]) -> str:
+def _run_links(runs: Mapping[int, str]) -> str:
     links = [
         Markup('<a href="/runs/{0}" title="{0}">{1}</a>').format(run, seed) for seed, run in runs.items()
     ]

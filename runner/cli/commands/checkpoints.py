@@ -6,7 +6,7 @@ import csv
 import io
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -146,7 +146,7 @@ def values_command(
             evaluation = evaluation_after(evaluations_of(recording), trial[0], where)
             phase, number = "eval", evaluation.trial(trial[1], where)
         along = values_along(recording, phase, number, chosen, policy, trust)
-    columns = {"t": list(range(len(along.rewards)))}
+    columns: dict[str, list[object]] = {"t": list(range(len(along.rewards)))}
     columns |= _columns("action", along.actions) | _columns("reward", along.rewards.sum(axis=1))
     for name, values in along.values.items():
         columns |= _columns(name, values)
@@ -165,7 +165,7 @@ def values_command(
         draw(table(*columns, rows=shown))
 
 
-def _columns(name: str, values: Any) -> dict[str, list[Any]]:
+def _columns(name: str, values: Any) -> dict[str, list[object]]:
     """Return values, nested as their space, as a column for each number."""
     if isinstance(values, Mapping):
         parts = (_columns(f"{name}.{key}", part) for key, part in values.items())
@@ -178,7 +178,7 @@ def _columns(name: str, values: Any) -> dict[str, list[Any]]:
     return {f"{name}[{i}]": flat[:, i].tolist() for i in range(flat.shape[1])}
 
 
-def _csv(columns: Mapping[str, list[Any]], rows: list[tuple[Any, ...]]) -> str:
+def _csv(columns: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)

@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -35,7 +35,7 @@ from runner.util.values import checked_name
 
 if TYPE_CHECKING:
     from runner.sweep.local import Workers
-    from runner.sweep.model import Sweep
+    from runner.sweep.model import Range, Sweep
     from runner.sweep.plan import Plan
     from runner.sweep.running import SweepStatus
     from runner.sweep.task import Result, Task
@@ -265,7 +265,7 @@ def _print_plan(sweep: Sweep, plan: Plan, as_json: bool) -> None:
     draw(facts(rows))
 
 
-def _range_text(parameter: Any) -> str:
+def _range_text(parameter: list[object] | Range) -> str:
     """Return the values of a parameter as text."""
     if isinstance(parameter, list):
         return ", ".join(map(str, parameter))

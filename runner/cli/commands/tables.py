@@ -6,7 +6,7 @@ import csv
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -161,7 +161,7 @@ def table_command(
     config = from_mapping({"env": {"id": env_id}, "episodes": 1}, overrides)
     columns = transition_columns(load_mdp(config.env.id, config.env.kwargs, config.rewards))
 
-    def rows() -> Iterator[tuple[Any, ...]]:
+    def rows() -> Iterator[tuple[object, ...]]:
         for start in range(0, len(columns["state"]), ROWS_AT_ONCE):
             part = [column[start : start + ROWS_AT_ONCE].tolist() for column in columns.values()]
             yield from zip(*part, strict=True)

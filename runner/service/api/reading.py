@@ -182,7 +182,7 @@ async def metrics(
     true; `start` and `stop` select a part at full resolution.
     """
     options = (axis, tuple(metric or ()), start, stop, points, False, smooth)
-    return await compute.json(computed.run_curves, *options)
+    return await compute.json(computed.curves, *options)
 
 
 @router.get(

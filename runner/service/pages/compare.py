@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, ClassVar, Final
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
@@ -177,7 +177,7 @@ async def overview(
 
 def _tasks_address(runs: list[Run], scores: str) -> str:
     environments = {json.dumps(run.file.config.get("env"), sort_keys=True) for run in runs}
-    query: dict[str, Any] = {"run": [run.run_id for run in runs]} | ({"scores": scores} if scores else {})
+    query: dict[str, object] = {"run": [run.run_id for run in runs]} | ({"scores": scores} if scores else {})
     return link("/compare/tasks", query) if len(environments) > 1 else ""
 
 
