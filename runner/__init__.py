@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from runner.loops.env import record
     from runner.loops.parallel import record_aec, record_parallel
     from runner.loops.vector import record_vector
-    from runner.recording.gym_json import register_space
+    from runner.recording.gym_spaces import register_space
     from runner.recording.reader import Recording, open_recording
     from runner.runs.listing import list_runs
     from runner.runs.resolve import find_run
@@ -94,7 +94,7 @@ _HOME = {
     "record_batches": "runner.loops.batches",
     "record_parallel": "runner.loops.parallel",
     "record_vector": "runner.loops.vector",
-    "register_space": "runner.recording.gym_json",
+    "register_space": "runner.recording.gym_spaces",
     "report": "runner.export.notebook",
     "rerecord": "runner.execution.rerecord",
     "resume": "runner.execution.resume",

@@ -231,8 +231,8 @@ def learn(
 
     Returns:
         The action of the next state whose value the target has, -1 for none; of Expected SARSA it has those
-        of all actions, and this is the greedy one. And which of two ways was taken: whether the second table
-        of Double Q-learning learned, or Hysteretic Q-learning lowered a value.
+        of all actions, and this is the greedy one. And which of two ways was taken: of Double Q-learning
+        whether the second table learned, of the others whether the value fell.
     """
     algorithm = len(rules.algorithm)
     width = model.width[i]
@@ -264,16 +264,22 @@ def learn(
             else:
                 td_target += now.discount * tables.value[i, next_state]
         old = tables.q[row + action]
-        rate = now.step_size
-        if algorithm == HYSTERETIC_Q_LEARNING and td_target < old:
-            second = True
-            rate = schedule_value(rules.parameters[DECREASE], now.episode, now.step)
+        second = td_target < old
+        rate = update_rate(rules, now.episode, now.step, now.step_size, second)
         _set(tables, i, state, action, row, width, old + rate * (td_target - old))
     if algorithm == WOLF_PHC:
         win = schedule_value(rules.parameters[WIN], now.episode, now.step)
         lose = schedule_value(rules.parameters[LOSE], now.episode, now.step)
         _improve_policy(tables, i, state, row, width, win, lose)
     return bootstrapped, second
+
+
+@numba.njit(inline="always")
+def update_rate(rules: Rules, episode: int, step: int, step_size: float, second: bool) -> float:
+    """Return the weight of the target in an update; `step_size` at this step, `second` as of `learn`."""
+    if len(rules.algorithm) == HYSTERETIC_Q_LEARNING and second:
+        return schedule_value(rules.parameters[DECREASE], episode, step)
+    return step_size
 
 
 @numba.njit(inline="always")

@@ -17,14 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.learning.algorithms import (
-    DECREASE,
     DOUBLE_Q_LEARNING,
     EXPECTED_SARSA,
     FIRST,
-    HYSTERETIC_Q_LEARNING,
     SECOND,
     Rules,
     exploring,
+    update_rate,
 )
 from runner.learning.model import Model
 from runner.learning.schedules import schedule_value
@@ -114,10 +113,8 @@ def spread(
             continue
         distance = ledger.distances[learned, cell]
         episode, step = update.episode, first + k
-        if algorithm == HYSTERETIC_Q_LEARNING and update.second:
-            rate = schedule_value(rules.parameters[DECREASE], episode, step)
-        else:
-            rate = schedule_value(rules.step_size, episode, step)
+        step_size = schedule_value(rules.step_size, episode, step)
+        rate = update_rate(rules, episode, step, step_size, update.second)
 
         # The reward.
         share = shares[filled]

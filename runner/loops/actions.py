@@ -14,7 +14,7 @@ from gymnasium.wrappers import StickyAction
 from runner.environments.gym_types import Space
 from runner.environments.naming import spoken
 from runner.errors import ConfigError, nearest, shortened
-from runner.recording.gym_json import registered, value_of
+from runner.recording.gym_spaces import comes_from_text, value_of
 from runner.recording.maker import MAX_NAMES
 from runner.recording.spaces import Value
 from runner.util.values import is_text
@@ -115,7 +115,7 @@ def _parsed(space: Space, given: object, recorded: Value, names: Sequence[str], 
         if isinstance(given, str) and given in space:
             return given
         raise ConfigError(f"{where}: found {_short(given)}, expected a text of {space}")
-    if registered(space) or isinstance(space, spaces.Graph | spaces.OneOf | spaces.Sequence):
+    if comes_from_text(space):
         return _parsed_json(space, given, where)
     try:
         values = given.split(",") if isinstance(given, str) else given

@@ -1,56 +1,54 @@
 """Gymnasium's spaces in a recording: one class each, which describes, encodes and restores the space.
 
-A new kind of space is a class here and an entry in `_KINDS`. Values are decoded in `spaces`, from the layout
-of their bytes, which needs no Gymnasium.
+A new kind of space is a class here, or in `gym_leaves` if it has no parts, and an entry in `_KINDS`; a space
+of a user's own becomes one by `register_space`:
+
+    runner.register_space(Board, to_json=lambda board: board.cells, from_json=Board.of_cells)
+
+Values are decoded in `spaces`, from the layout of their bytes, which needs no Gymnasium.
 """
 
 from __future__ import annotations
 
-import string
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector.utils import iterate
 
 from runner.environments.gym_types import Space
-from runner.errors import EnvironmentNotUsable
-from runner.recording.gym_json import numbers_in, registered, structure_of, text_of
+from runner.errors import ConfigError, EnvironmentNotUsable
+from runner.recording.gym_leaves import LEAVES, Keys, Kind, Part
 from runner.recording.spaces import MAX_VALUE_BYTES, Description, Value
 from runner.util.jsonable import as_json
 from runner.util.values import is_text
 
-Keys = tuple[str | int, ...]
-SpaceT = TypeVar("SpaceT", bound=Space)
-_MAX_TEXT: Final = 4096
-"""Declared length of the values of spaces that have no length of their own."""
-_MAX_BOUNDS: Final = 64
-"""The most different bounds of a box that are listed."""
 
+def register_space(
+    cls: type[Space], *, to_json: Callable[[object], object], from_json: Callable[[Value], object]
+) -> None:
+    """Record the values of a space of your own exactly, so that episodes with such actions can be repeated.
 
-@dataclass(frozen=True)
-class Part:
-    """A space inside of others that has no parts itself: how to get its value, and how to encode it."""
+    Call it in the module that defines the space: it is then registered wherever the environment is made.
+    Without it, values are recorded as text: strings unchanged, others as JSON or their `repr`.
 
-    keys: Keys
-    """Keys of the `Dict`s and `Tuple`s around it, from the outermost in."""
-    dtype: np.dtype[np.generic] | None
-    """The dtype of an array with its shape; None for values that are recorded as text."""
-    text: Callable[[object], str] | None = None
-    """Returns the text of a value; None for an array."""
+    Args:
+        cls: the class of the space.
+        to_json: returns a value of it as numbers, texts, arrays, lists and mappings.
+        from_json: returns the value for what `to_json` returned, in which arrays have become lists.
 
-    @property
-    def fields(self) -> tuple[str, ...]:
-        """The keys as names of NumPy's fields."""
-        return tuple(map(str, self.keys))
-
-    def of(self, value: Value) -> Value:
-        """Return the value of this part in a value of the whole space."""
-        for key in self.keys:
-            value = value[key]
-        return value
+    Raises:
+        ConfigError: it is no class of spaces, or one of Gymnasium's own.
+    """
+    if not (isinstance(cls, type) and issubclass(cls, spaces.Space)) or cls.__module__.startswith(
+        "gymnasium."
+    ):
+        raise ConfigError(
+            f"register_space: found {cls!r}, expected a subclass of gymnasium.Space of your own"
+        )
+    _KINDS[cls] = _Registered(cls, to_json, from_json)
 
 
 def parts_of(space: Space, where: str) -> list[Part]:
@@ -59,7 +57,7 @@ def parts_of(space: Space, where: str) -> list[Part]:
     Raises:
         EnvironmentNotUsable: one of them cannot be recorded; the message names `where`.
     """
-    parts = list(_kind(space).parts(space, where, ()))
+    parts = list(_kind_of(space).parts(space, where, ()))
     size = sum(part.dtype.itemsize for part in parts if part.dtype is not None)
     if size > MAX_VALUE_BYTES:
         raise EnvironmentNotUsable(
@@ -71,7 +69,7 @@ def parts_of(space: Space, where: str) -> list[Part]:
 
 def describe_space(space: Space) -> dict[str, object]:
     """Return a space as JSON, which `runner.recording.spaces` reads; `parts_of` has accepted the space."""
-    return _kind(space).describe(space)
+    return _kind_of(space).describe(space)
 
 
 def restore_space(description: Description) -> Space:
@@ -88,59 +86,69 @@ def widened(space: Space, value: object) -> Space:
 
     Only floating-point actions widen a space: whole numbers that it cannot hold are a mistake.
     """
-    return _kind(space).widened(space, value)
+    return _kind_of(space).widened(space, value)
 
 
 def can_widen(space: Space) -> bool:
     """Return whether there are actions for which `widened` returns another space."""
-    return _kind(space).can_widen(space)
+    return _kind_of(space).can_widen(space)
 
 
-class _Kind(Generic[SpaceT]):
-    """A space whose values have no layout; they are recorded as JSON text."""
-
-    def parts(self, space: SpaceT, where: str, keys: Keys) -> Iterator[Part]:  # noqa: ARG002
-        yield Part(keys, None, partial(text_of, space))
-
-    def describe(self, space: SpaceT) -> dict[str, object]:
-        return {"type": "Text", "max_length": _MAX_TEXT, **structure_of(space, describe_space)}
-
-    def restore(self, description: Description) -> Space:
-        raise KeyError(description["type"])
-
-    def widened(self, space: SpaceT, value: object) -> Space:  # noqa: ARG002
-        return space
-
-    def can_widen(self, space: SpaceT) -> bool:  # noqa: ARG002
-        return False
+def comes_from_text(space: Space) -> bool:
+    """Return whether values of a space are recorded as text that gives them back."""
+    return _kind_of(space).from_text
 
 
-class _Text(_Kind[spaces.Text]):
-    def parts(self, space: spaces.Text, where: str, keys: Keys) -> Iterator[Part]:  # noqa: ARG002
-        yield Part(keys, None, _checked_text)
+def text_of(space: Space, value: object) -> str:
+    """Return a value as text: a string of an unknown space as it is, other values as JSON.
 
-    def describe(self, space: spaces.Text) -> dict[str, object]:
-        return {"type": "Text", "max_length": int(space.max_length)}
-
-    def restore(self, description: Description) -> Space:
-        length = max(int(description["max_length"]), 1)
-        return spaces.Text(length, min_length=0, charset=string.printable)
+    Raises:
+        TypeError, ValueError, LookupError, AttributeError: it is not of the space.
+    """
+    return _kind_of(space).text(space, value)
 
 
-def _checked_text(value: object) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f"{type(value).__name__} is not a text")
-    return value
+def value_of(space: Space, text: str) -> object:
+    """Return the value of a text that `text_of` returned, in the dtypes of the space.
+
+    Raises:
+        ValueError: it is no value of the space, or of one whose values do not come back from JSON.
+    """
+    try:
+        return _from_json(space, json.loads(text))
+    except (TypeError, LookupError, AttributeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"{type(error).__name__}: {error}") from error
 
 
-class _Dict(_Kind[spaces.Dict]):
+def _to_json(space: Space, value: Value) -> Value:
+    return _kind_of(space).to_json(space, value)
+
+
+def _from_json(space: Space, data: Value) -> Value:
+    return _kind_of(space).from_json(space, data)
+
+
+def _batch(space: Space, values: Value) -> Value:
+    return _kind_of(space).batch(space, values)
+
+
+class _Dict(Kind[spaces.Dict]):
     def parts(self, space: spaces.Dict, where: str, keys: Keys) -> Iterator[Part]:
         for key, part in space.spaces.items():
             if not is_text(str(key)):
                 raise EnvironmentNotUsable(
                     f"{where}: found a part called {str(key)[:40]!r}, expected a short, printable name."
                 )
-            yield from _kind(part).parts(part, where, (*keys, key))
+            yield from _kind_of(part).parts(part, where, (*keys, key))
+
+    def to_json(self, space: spaces.Dict, value: Value) -> Value:
+        return {str(key): _to_json(part, value[key]) for key, part in space.spaces.items()}
+
+    def from_json(self, space: spaces.Dict, data: Value) -> Value:
+        return {key: _from_json(part, data[str(key)]) for key, part in space.spaces.items()}
+
+    def batch(self, space: spaces.Dict, values: Value) -> Value:
+        return {key: _batch(part, [own[str(key)] for own in values]) for key, part in space.spaces.items()}
 
     def describe(self, space: spaces.Dict) -> dict[str, object]:
         parts = {str(key): describe_space(part) for key, part in space.spaces.items()}
@@ -162,10 +170,19 @@ class _Dict(_Kind[spaces.Dict]):
         return any(map(can_widen, space.spaces.values()))
 
 
-class _Tuple(_Kind["spaces.Tuple[Any]"]):
+class _Tuple(Kind["spaces.Tuple[Any]"]):
     def parts(self, space: spaces.Tuple[Any], where: str, keys: Keys) -> Iterator[Part]:
         for i, part in enumerate(space.spaces):
-            yield from _kind(part).parts(part, where, (*keys, i))
+            yield from _kind_of(part).parts(part, where, (*keys, i))
+
+    def to_json(self, space: spaces.Tuple[Any], value: Value) -> Value:
+        return [_to_json(part, own) for part, own in zip(space.spaces, value, strict=True)]
+
+    def from_json(self, space: spaces.Tuple[Any], data: Value) -> Value:
+        return tuple(_from_json(part, own) for part, own in zip(space.spaces, data, strict=True))
+
+    def batch(self, space: spaces.Tuple[Any], values: Value) -> Value:
+        return tuple(_batch(part, [own[i] for own in values]) for i, part in enumerate(space.spaces))
 
     def describe(self, space: spaces.Tuple[Any]) -> dict[str, object]:
         return {"type": "Tuple", "spaces": [describe_space(part) for part in space.spaces]}
@@ -183,120 +200,100 @@ class _Tuple(_Kind["spaces.Tuple[Any]"]):
         return any(map(can_widen, space.spaces))
 
 
-class _Box(_Kind[SpaceT]):
-    """A box, and any space of another library whose values are arrays of one shape and dtype."""
+class _Sequence(Kind[spaces.Sequence]):
+    from_text = True
 
-    name = "Box"
+    def to_json(self, space: spaces.Sequence, value: Value) -> Value:
+        values = iterate(space.stacked_feature_space, value) if space.stack else value
+        return [_to_json(space.feature_space, own) for own in values]
 
-    def parts(self, space: SpaceT, where: str, keys: Keys) -> Iterator[Part]:
-        dtype = np.dtype(space.dtype)
-        if dtype.kind not in "biuf" or dtype.itemsize > 8:
-            raise EnvironmentNotUsable(
-                f"{where}: found {space} of dtype {dtype}, expected numbers of at most 64 bits."
-            )
-        yield Part(keys, np.dtype((dtype.newbyteorder("<"), space.shape or ())))
+    def from_json(self, space: spaces.Sequence, data: Value) -> Value:
+        if space.stack:
+            return _batch(space.feature_space, data)
+        return tuple(_from_json(space.feature_space, own) for own in data)
 
-    def describe(self, space: SpaceT) -> dict[str, object]:
-        dtype = np.dtype(space.dtype).newbyteorder("<").str
-        shape = [int(n) for n in space.shape or ()]
-        return {"type": self.name, "dtype": dtype, "shape": shape, **self.details(space)}
+    def structure(self, space: spaces.Sequence) -> Mapping[str, object]:
+        parts = {"space": describe_space(space.feature_space), "stack": bool(space.stack)}
+        return {"type": "Sequence", **parts}
 
-    def details(self, space: SpaceT) -> dict[str, object]:
-        return {name: _bound(getattr(space, name, None)) for name in ("low", "high")}
 
-    def restore(self, description: Description) -> Space:
-        dtype, shape = _dtype(description), tuple(description["shape"])
-        if dtype.kind == "f":
-            least, most = -np.inf, np.inf
-        else:
-            least, most = (0, 1) if dtype.kind == "b" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
-        low, high = (
-            np.broadcast_to(np.array(widest if bound is None else numbers_in(bound), dtype), shape)
-            for bound, widest in ((description["low"], least), (description["high"], most))
+class _OneOf(Kind["spaces.OneOf[Any]"]):
+    from_text = True
+
+    def to_json(self, space: spaces.OneOf[Any], value: Value) -> Value:
+        index = int(value[0])
+        return [index, _to_json(space.spaces[index], value[1])]
+
+    def from_json(self, space: spaces.OneOf[Any], data: Value) -> Value:
+        if not 0 <= data[0] < len(space.spaces):
+            raise ValueError(f"found the part {data[0]} of {space}")
+        return np.int64(data[0]), _from_json(space.spaces[data[0]], data[1])
+
+    def structure(self, space: spaces.OneOf[Any]) -> Mapping[str, object]:
+        return {"type": "OneOf", "spaces": [describe_space(part) for part in space.spaces]}
+
+
+class _Graph(Kind[spaces.Graph]):
+    from_text = True
+
+    def to_json(self, space: spaces.Graph, value: Value) -> Value:
+        nodes, edges = (
+            None if part is None or own is None else [_to_json(part, each) for each in own]
+            for part, own in ((space.node_space, value.nodes), (space.edge_space, value.edges))
         )
-        return spaces.Box(low, high, shape, dtype.type)
+        return {"nodes": nodes, "edges": edges, "edge_links": as_json(value.edge_links)}
 
-    def widened(self, space: SpaceT, value: object) -> Space:
-        try:
-            found = np.asarray(value).dtype
-        except (TypeError, ValueError):
-            return space
-        if not isinstance(space, spaces.Box) or found.kind != "f" or found.itemsize > 8:
-            return space
-        if np.can_cast(found, space.dtype):
-            return space
-        return spaces.Box(space.low.astype(found), space.high.astype(found), dtype=found.type)
+    def from_json(self, space: spaces.Graph, data: Value) -> Value:
+        nodes, edges, links = (data[name] for name in ("nodes", "edges", "edge_links"))
+        edge_space = space.edge_space
+        return spaces.GraphInstance(
+            nodes=_batch(space.node_space, nodes),
+            edges=None if edges is None or edge_space is None else _batch(edge_space, edges),
+            edge_links=None if links is None else np.array(links, np.int64).reshape(-1, 2),
+        )
 
-    def can_widen(self, space: SpaceT) -> bool:
-        return isinstance(space, spaces.Box) and not np.can_cast(np.float64, space.dtype)
-
-
-class _Discrete(_Box[spaces.Discrete]):
-    name = "Discrete"
-
-    def details(self, space: spaces.Discrete) -> dict[str, object]:
-        return {"n": int(space.n), "start": int(space.start)}
-
-    def restore(self, description: Description) -> Space:
-        return spaces.Discrete(int(description["n"]), start=int(description["start"]))
+    def structure(self, space: spaces.Graph) -> Mapping[str, object]:
+        edges = None if space.edge_space is None else describe_space(space.edge_space)
+        return {"type": "Graph", "node_space": describe_space(space.node_space), "edge_space": edges}
 
 
-class _MultiDiscrete(_Box[spaces.MultiDiscrete]):
-    name = "MultiDiscrete"
+class _Registered(Kind[Space]):
+    """A space of a user's own."""
 
-    def details(self, space: spaces.MultiDiscrete) -> dict[str, object]:
-        return {"nvec": np.asarray(space.nvec).tolist()}
+    from_text = True
 
-    def restore(self, description: Description) -> Space:
-        return spaces.MultiDiscrete(np.array(description["nvec"]), dtype=_dtype(description).type)
+    def __init__(
+        self, cls: type[Space], to_json: Callable[[object], object], from_json: Callable[[Value], object]
+    ) -> None:
+        self._cls = cls
+        self._to_json = to_json
+        self._from_json = from_json
+
+    def to_json(self, space: Space, value: Value) -> Value:  # noqa: ARG002
+        return as_json(self._to_json(value))
+
+    def from_json(self, space: Space, data: Value) -> Value:  # noqa: ARG002
+        return self._from_json(data)
+
+    def structure(self, space: Space) -> Mapping[str, object]:  # noqa: ARG002
+        return {"type": f"{self._cls.__module__}:{self._cls.__qualname__}"}
 
 
-class _MultiBinary(_Box[spaces.MultiBinary]):
-    name = "MultiBinary"
-
-    def details(self, space: spaces.MultiBinary) -> dict[str, object]:  # noqa: ARG002
-        return {}
-
-    def restore(self, description: Description) -> Space:
-        shape = tuple(description["shape"])
-        return spaces.MultiBinary(shape[0] if len(shape) == 1 else shape)
-
-
-_JSON: Final = _Kind[Space]()
-_KINDS: Final[dict[type[Space], _Kind[Any]]] = {
+_UNKNOWN: Final = Kind[Space]()
+_KINDS: Final[dict[type[Space], Kind[Any]]] = {
     spaces.Dict: _Dict(),
     spaces.Tuple: _Tuple(),
-    spaces.Text: _Text(),
-    spaces.Graph: _JSON,
-    spaces.Sequence: _JSON,
-    spaces.OneOf: _JSON,
-    spaces.Discrete: _Discrete(),
-    spaces.MultiDiscrete: _MultiDiscrete(),
-    spaces.MultiBinary: _MultiBinary(),
-    spaces.Box: _Box[Space](),
+    spaces.Graph: _Graph(),
+    spaces.Sequence: _Sequence(),
+    spaces.OneOf: _OneOf(),
+    **LEAVES,
 }
-_BY_NAME: Final = {kind.__name__: own for kind, own in _KINDS.items()}
+_BY_NAME: Final = {cls.__name__: kind for cls, kind in _KINDS.items()}
 
 
-def _kind(space: Space) -> _Kind[Any]:
-    if registered(space) is not None:
-        return _JSON
-    for kind, own in _KINDS.items():
-        if isinstance(space, kind):
-            return own
+def _kind_of(space: Space) -> Kind[Any]:
+    for cls in type(space).__mro__:
+        if cls in _KINDS:
+            return _KINDS[cls]
     has_layout = space.shape is not None and space.dtype is not None
-    return _KINDS[spaces.Box] if has_layout and np.dtype(space.dtype).kind in "biuf" else _JSON
-
-
-def _dtype(description: Description) -> np.dtype[Any]:
-    return np.dtype(description["dtype"]).newbyteorder("=")
-
-
-def _bound(bound: object) -> object:
-    """Return a bound of a box: one number if it is the same everywhere; None for too many."""
-    values = np.asarray(bound)
-    if not values.size or values.dtype.kind not in "biuf":
-        return None
-    if (values == values.flat[0]).all():
-        return as_json(values.flat[0].item())
-    return as_json(values.tolist()) if values.size <= _MAX_BOUNDS else None
+    return _KINDS[spaces.Box] if has_layout and np.dtype(space.dtype).kind in "biuf" else _UNKNOWN

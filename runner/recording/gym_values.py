@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from runner.environments.gym_types import Space
 from runner.errors import RecordingError
-from runner.recording.gym_spaces import Part, parts_of
+from runner.recording.gym_leaves import Part
+from runner.recording.gym_spaces import parts_of
 from runner.recording.spaces import MAX_VALUE_BYTES, Value, encode_text
 from runner.util.arrays import Array
 

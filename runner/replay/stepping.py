@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from runner.environments.gym_types import Space
 from runner.errors import CannotRedo, shortened
-from runner.recording.gym_json import value_of
-from runner.recording.gym_spaces import describe_space
+from runner.recording.gym_spaces import describe_space, value_of
 from runner.recording.gym_values import Put, filler, filler_by_agent, leaves_by_agent, leaves_of, value_bytes
 from runner.recording.reader import Recording
 from runner.recording.reset_states import ResetState

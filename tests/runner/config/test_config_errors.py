@@ -1,11 +1,16 @@
 """Errors: one line for each problem, with place, key, and what was expected."""
 
+from typing import get_args
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from runner.config import from_mapping, load
+from runner.config.sections import Algorithm
 from runner.errors import ConfigError
+
+ALGORITHMS = get_args(Algorithm)
 
 
 @pytest.mark.parametrize(
@@ -160,9 +165,8 @@ from runner.errors import ConfigError
         ("snapshots:", "2:1: snapshots: found null, expected a mapping with every"),
         (
             "algorithm: q_lerning",
-            "2:1: algorithm: found 'q_lerning', expected 'q_learning', 'sarsa', 'expected_sarsa', "
-            "'double_q_learning', 'hysteretic_q_learning', 'wolf_phc' or 'random'. "
-            "Did you mean 'q_learning'?",
+            f"2:1: algorithm: found 'q_lerning', expected {', '.join(map(repr, ALGORITHMS[:-1]))} "
+            f"or {ALGORITHMS[-1]!r}. Did you mean 'q_learning'?",
         ),
         ("episodes: 5", "2:1: episodes: given twice; first in line 1"),
         ("log: {window: 5, window: 6}", "2:18: log.window: given twice; first in line 2"),

@@ -19,6 +19,7 @@ from runner.config import (
     load,
 )
 from runner.errors import ConfigError
+from runner.util.packing import DEFAULT_LEVEL
 
 
 @pytest.fixture
@@ -47,7 +48,7 @@ def test_a_file_needs_only_episodes(write):
     assert (config.log.every_steps, config.log.window, config.log.episodes) == (50_000, 50_000, 50)
     assert config.snapshots.every is None
     recording = config.recording
-    assert (recording.steps, recording.compression, recording.level) == ("all", "zstd", 3)
+    assert (recording.steps, recording.compression, recording.level) == ("all", "zstd", DEFAULT_LEVEL)
     assert (recording.index, recording.chunk_steps) == ("message", 16_384)
     assert set(dict(config.quirks).values()) == {False}
 

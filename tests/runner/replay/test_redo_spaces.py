@@ -10,7 +10,7 @@ from gymnasium import spaces
 import runner
 from runner.errors import CannotRedo, ConfigError
 from runner.execution.verify import check_integrity
-from runner.recording.gym_json import text_of, value_of
+from runner.recording.gym_spaces import text_of, value_of
 from runner.recording.reader import open_recording
 from tests.runner.replay import varied
 from tests.runner.replay.loops import redone
