@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pyarrow as pa
@@ -169,10 +169,10 @@ class Shape:
             *(_plain("length", _INT32), _plain("penalties", _INT32)),
             *self._summed("return", "returns"),
             *(_plain(name, _FLAG) for name in ("success", "terminated", "truncated")),
-            *(_element(name, _INT32, "events", i) for i, name in enumerate(self.event_columns)),
+            *(_plain(name, _INT32, "events", i) for i, name in enumerate(self.event_columns)),
         ]
 
-    def _action_of(self, agent: int) -> Any:
+    def _action_of(self, agent: int) -> Callable[[Records], Array]:
         """Return the function that reads an agent's own action from the joint one."""
         counts, joint = self.action_counts, np.uint32(self.joint_actions)
         divisor, count = np.uint32(math.prod(counts[agent + 1 :])), np.uint32(counts[agent])
@@ -182,9 +182,9 @@ class Shape:
         """Return the column of the learners' sum and, where there are several, one for each."""
         own = self.per_learner(name)
         if not own:
-            return [_element(name, _FLOAT, source, 0)]
+            return [_plain(name, _FLOAT, source, 0)]
         total = Column(name, _FLOAT, lambda records: records[source].sum(axis=1))
-        return [total, *(_element(key, _FLOAT, source, i) for i, key in enumerate(own))]
+        return [total, *(_plain(key, _FLOAT, source, i) for i, key in enumerate(own))]
 
     def _explored(self) -> list[Column]:
         """Return the column for any learner's exploration and, where there are several, one for each."""
@@ -202,28 +202,19 @@ class Shape:
         return [any_explored, *own] if own else [bit("explored", 0)]
 
 
-def _plain(name: str, kind: pa.DataType) -> Column:
-    """Return the column of a field. Unsigned 32-bit numbers become signed, which readers can subtract."""
+def _plain(name: str, kind: pa.DataType, source: str = "", i: int | None = None) -> Column:
+    """Return the column of a field, or of element `i` of the field `source`, which is an array.
+
+    Unsigned 32-bit numbers become signed, which readers can subtract.
+    """
+    field, at = source or name, ... if i is None else (..., i)
 
     def read(records: Records) -> Array:
-        values = np.ascontiguousarray(records[name])
+        values = np.ascontiguousarray(records[field][at])
         return values.view(np.int32) if kind == _INT32 else values
 
     def write(records: Records, column: pa.Array) -> None:
-        records[name] = numbers(column)
-
-    return Column(name, kind, read, write)
-
-
-def _element(name: str, kind: pa.DataType, source: str, i: int) -> Column:
-    """Return the column of an element of a field that is an array."""
-
-    def read(records: Records) -> Array:
-        values = np.ascontiguousarray(records[source][:, i])
-        return values.view(np.int32) if kind == _INT32 else values
-
-    def write(records: Records, column: pa.Array) -> None:
-        records[source][:, i] = numbers(column)
+        records[field][at] = numbers(column)
 
     return Column(name, kind, read, write)
 

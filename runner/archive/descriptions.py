@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from datetime import UTC, datetime
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -25,7 +24,7 @@ def run_table(recording: Recording) -> pa.Table:
         created = datetime.fromisoformat(facts["created"]).astimezone(UTC)
     except (ValueError, OverflowError) as error:
         raise RecordingError(f"{recording.path}: was created at {facts['created']!r}, not a time.") from error
-    columns: dict[str, tuple[pa.DataType, Any]] = {
+    columns: dict[str, tuple[pa.DataType, object]] = {
         "run_id": (pa.string(), facts["run_id"]),
         "name": (pa.string(), recording.name),
         "seed": (pa.uint64(), facts["seed"]),

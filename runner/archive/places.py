@@ -112,43 +112,35 @@ def _places(run: Run) -> list[str]:
     return list(dict.fromkeys((run.archive.target, default)))
 
 
-def restore_to(folder: Path, path: Path, digest: str, report: Report) -> None:
-    """Restore an archive with a digest into a file; it is checked completely.
+def restore_to(folder: Path, path: Path | None, digest: str, report: Report) -> None:
+    """Restore an archive with a digest into a file, or in memory alone; it is checked completely.
 
     Raises:
         RecordingError: the archive is damaged, or has another digest; there is no file then.
     """
-    path.unlink(missing_ok=True)
+    if path is not None:
+        path.unlink(missing_ok=True)
     try:
-        found = _in_child_process(folder, path, report)
+        if multiprocessing.current_process().daemon:  # it has limits of its own, and must not start another
+            found = _restore(folder, path, report)
+        else:
+            with ChildProcess(MEMORY_BYTES, on_progress=report) as child:
+                found = child.call(_restore, _RESTORE_SECONDS, folder, path)
         if found != digest:
             raise RecordingError(f"{folder}: found an archive of digest {found}, expected {digest}.")
-    except BaseException:
-        path.unlink(missing_ok=True)
+    except BaseException as error:
+        if path is not None:
+            path.unlink(missing_ok=True)
+        if isinstance(error, OutOfMemory | ProcessDied):
+            raise RecordingError(
+                f"{folder}: restoring it needs more than {MEMORY_BYTES / (1 << 30):g} GiB of memory: the "
+                "archive is damaged, or was made to exhaust it."
+            ) from error
         raise
 
 
-def check_archive(folder: Path, report: Report) -> None:
-    """Restore an archive in memory alone."""
-    _in_child_process(folder, None, report)
-
-
-def _in_child_process(folder: Path, path: Path | None, report: Report) -> str:
-    if multiprocessing.current_process().daemon:  # it has limits of its own, and must not start another one
-        return _restore(folder, path, report)
-    try:
-        with ChildProcess(MEMORY_BYTES, on_progress=report) as child:
-            return child.call(_restore, _RESTORE_SECONDS, folder, path)
-    except (OutOfMemory, ProcessDied) as error:
-        raise RecordingError(
-            f"{folder}: restoring it needs more than {MEMORY_BYTES / (1 << 30):g} GiB of memory: the archive "
-            "is damaged, or was made to exhaust it."
-        ) from error
-
-
 def _restore(folder: Path, path: Path | None, report: Report = report_progress) -> str:
-    """Restore an archive into a file, or in memory alone; return its digest."""
-    from runner.archive.restoring import check, restore
+    """Restore an archive; return its digest."""
+    from runner.archive.restoring import restore
 
-    manifest = check(folder, report) if path is None else restore(folder, path, report)
-    return manifest.digest
+    return restore(folder, path, report).digest

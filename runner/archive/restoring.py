@@ -45,14 +45,20 @@ _MAX_PENDING: Final = 8
 """Blocks in the pipeline: as many as the recorder has of a topic."""
 
 
-def restore(folder: Path, path: Path, report: Callable[[int], None] = lambda _: None) -> Manifest:
+def restore(
+    folder: Path, path: Path | None = None, report: Callable[[int], None] = lambda _: None
+) -> Manifest:
     """Write the recording of an archive to a new file; return the archive's manifest.
 
     Args:
-        path: the file, which does not exist yet; nor does it after an error.
+        path: the file, which does not exist yet; nor does it after an error. None restores in memory alone,
+            which checks the archive.
     """
     archive = Archive(folder)
     archive.check_files()
+    if path is None:
+        _Restorer(archive, None, report).restore()
+        return archive.manifest
     try:
         with storage_errors(path), RecordingFile(path, archive.topics) as file:
             _Restorer(archive, file, report).restore()
@@ -61,14 +67,6 @@ def restore(folder: Path, path: Path, report: Callable[[int], None] = lambda _: 
     except BaseException:
         path.unlink(missing_ok=True)
         raise
-    return archive.manifest
-
-
-def check(folder: Path, report: Callable[[int], None] = lambda _: None) -> Manifest:
-    """Restore an archive in memory only, and return its manifest; errors as for `restore`."""
-    archive = Archive(folder)
-    archive.check_files()
-    _Restorer(archive, None, report).restore()
     return archive.manifest
 
 

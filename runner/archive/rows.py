@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
-
-from blake3 import blake3
 
 from runner.archive import layout
 from runner.archive.columns import Shape
 from runner.recording import schema
-from runner.recording.messages import Message, QTable, decode, encode, encode_image, encode_log, log_level
+from runner.recording.messages import Message, decode, encode, encode_image, encode_log, log_level
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.util.values import JsonView
 
 _WITH_SPACES: Final = (schema.TRANSITION, schema.RESET)
 """The messages with values of spaces, whose columns differ between runs."""
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedTable:
-    """A snapshot and its position: the number of environment steps before it."""
-
-    position: int
-    table: QTable
 
 
 def message_row(topic: Topic, payload: bytes, shape: Shape) -> Message:
@@ -69,21 +58,3 @@ def message_payload(topic: Topic, position: int, row: JsonView, shape: Shape) ->
         else:
             fields["seeded"] = True
     return encode(topic.message, fields)
-
-
-def snapshot_row(run_id: str, snapshot: PlacedTable, with_values: bool) -> dict[str, object]:
-    """Return the row of a snapshot; without its values, their hash checks the ones a replay gives."""
-    table = snapshot.table
-    data = table.values.tobytes()
-    return {
-        "run_id": run_id,
-        "position": snapshot.position,
-        "step": table.step,
-        "episode": table.episode,
-        "agent": table.agent,
-        "table": table.table,
-        "states": table.values.shape[0],
-        "actions": table.values.shape[1],
-        "blake3": blake3(data).hexdigest(),
-        "data": data if with_values else None,
-    }

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from runner.archive.layout import CONTENTS
 from runner.archive.manifest import Manifest
-from runner.archive.places import Report, archive_of, check_archive, restore_to
-from runner.archive.restoring import check
+from runner.archive.places import Report, archive_of, restore_to
+from runner.archive.restoring import restore
 from runner.archive.store import Store, no_archive, split_place, temporary_folder
 from runner.archive.writing import write_archive
 from runner.errors import RecordingError, RunnerError, StorageError
@@ -87,7 +87,10 @@ def _archive(run: Run, store: Store, remove: bool, report: Report, dry_run: bool
         return Archived(run, place, manifest, is_new, False, size)
     if remove or not is_new:
         with store.reading(run.run_id) as folder:
-            (check if is_new else check_archive)(folder, report)
+            if is_new:
+                restore(folder, report=report)
+            else:
+                restore_to(folder, None, manifest.digest, report)
     reference = {
         "target": place,
         "digest": manifest.digest,

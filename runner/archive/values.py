@@ -15,11 +15,10 @@ import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from runner.archive.layout import Column, Records
 from runner.recording.spaces import Leaf, encode_text, leaves_of
@@ -42,7 +41,7 @@ class _LeafColumns:
     is_spread: bool
 
     @property
-    def dtype(self) -> np.dtype[Any]:
+    def dtype(self) -> np.dtype[np.generic]:
         """The dtype of a value."""
         assert self.leaf.dtype is not None
         return self.leaf.dtype
@@ -86,7 +85,7 @@ class _LeafColumns:
 
         return Column(name, kind, read, write)
 
-    def _inside(self, values: NDArray[Any]) -> NDArray[Any]:
+    def _inside(self, values: Records) -> Array:
         for name in self.leaf.path:
             values = values[name]
         return values
@@ -177,7 +176,7 @@ def _not_fixed(records: Records) -> object:
     raise TypeError(f"a text is not of fixed width: {records.dtype}")
 
 
-def numbers(column: pa.Array) -> NDArray[Any]:
+def numbers(column: pa.Array) -> Array:
     """Return a column as an array: a view where possible."""
-    values: NDArray[Any] = column.to_numpy(zero_copy_only=False)
+    values: Array = column.to_numpy(zero_copy_only=False)
     return values

@@ -11,21 +11,20 @@ import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from types import TracebackType
 from typing import Final, Self
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from blake3 import blake3
 
 from runner.archive import layout
 from runner.archive.batches import Batches
 from runner.archive.descriptions import description_tables, run_table
 from runner.archive.layout import Table
 from runner.archive.manifest import Entry, Manifest, entries_of, is_inside
-from runner.archive.rows import PlacedTable, snapshot_row
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.messages import decode_q_table, encode_q_table
+from runner.recording.messages import QTable, decode_q_table, encode_q_table
 from runner.recording.reader import Recording
 from runner.replay.snapshots import DerivedTables, SnapshotVisitor
 from runner.replay.step_replay import StepReplay
@@ -100,10 +99,8 @@ class TableWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if error is None:
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is None:
             self.close()
         else:
             self._thread.shutdown()
@@ -193,7 +190,7 @@ class _ArchiveWriter:
         columns = layout.SCHEMAS[layout.Q_TABLES]
         with TableWriter(self._folder / layout.Q_TABLES, columns) as snapshots:
             visitor = SnapshotVisitor(
-                tables, self._snapshots(), lambda found: snapshots.add(self._snapshot_row(tables, found))
+                tables, self._snapshots(), lambda found: snapshots.add(self._snapshot_row(tables, *found))
             )
             for topic, records, batch in self._batches.blocks(table):
                 steps.add(batch)
@@ -202,19 +199,31 @@ class _ArchiveWriter:
                 self._report(self._batches.steps)
             visitor.finish()
 
-    def _snapshots(self) -> Iterator[tuple[int, PlacedTable]]:
+    def _snapshots(self) -> Iterator[tuple[int, tuple[int, QTable]]]:
+        """Yield the step of each snapshot, and the snapshot with its position."""
         topic = schema.Q_TABLE_TOPIC
         for position, payload in self._batches.messages(topic):
             table = decode_q_table(payload)
             self._batches.compare(topic, position, encode_q_table(table), payload)
-            yield table.step, PlacedTable(position, table)
+            yield table.step, (position, table)
 
-    def _snapshot_row(self, tables: DerivedTables, snapshot: PlacedTable) -> pa.RecordBatch:
-        """Return the row of a snapshot: without its values if the steps before it give them."""
-        table = snapshot.table
-        derived = tables.at(table.step, table.table)
-        is_derived = derived is not None and derived.tobytes() == table.values.tobytes()
+    def _snapshot_row(self, tables: DerivedTables, position: int, table: QTable) -> pa.RecordBatch:
+        """Return the row of a snapshot; of values that the steps before it give, only their hash."""
+        derived, data = tables.at(table.step, table.table), table.values.tobytes()
+        is_derived = derived is not None and derived.tobytes() == data
         if not is_derived:
             tables.give(table.step, table.table, table.values)
-        row = snapshot_row(self._batches.shape.run_id, snapshot, with_values=not is_derived)
+        states, actions = table.values.shape
+        row = {
+            "run_id": self._batches.shape.run_id,
+            "position": position,
+            "step": table.step,
+            "episode": table.episode,
+            "agent": table.agent,
+            "table": table.table,
+            "states": states,
+            "actions": actions,
+            "blake3": blake3(data).hexdigest(),
+            "data": None if is_derived else data,
+        }
         return pa.RecordBatch.from_pylist([row], layout.SCHEMAS[layout.Q_TABLES])

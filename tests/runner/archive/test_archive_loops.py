@@ -17,7 +17,7 @@ from gymnasium.vector import SyncVectorEnv
 import runner
 from runner.archive import layout, places
 from runner.archive.manifest import Manifest, entries_of, read_manifest
-from runner.archive.restoring import check, restore
+from runner.archive.restoring import restore
 from runner.errors import RecordingError
 from runner.execution.verify import verify
 from runner.recording import schema
@@ -289,7 +289,7 @@ def test_memory_does_not_grow_with_the_size_of_values(tmp_path):
     folder = archived(rec.run.recording, tmp_path / "archive")
     about = pq.ParquetFile(folder / layout.STEPS).metadata
     assert about.num_row_groups > 1
-    check(folder)
+    restore(folder)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the memory limit is the system's")

@@ -17,7 +17,7 @@ import pytest
 from runner.archive import layout
 from runner.archive.manifest import Entry, Manifest, entries_of
 from runner.archive.reading import Archive
-from runner.archive.restoring import check, restore
+from runner.archive.restoring import restore
 from runner.archive.runs import archive_run
 from runner.errors import RecordingError, RunnerError
 from runner.execution.verify import verify
@@ -144,10 +144,10 @@ def test_a_missing_file_and_a_missing_manifest_are_named(archive, tmp_path):
     folder = shutil.copytree(archive, tmp_path / "less")
     (folder / layout.EPISODES).unlink()
     with pytest.raises(RecordingError, match=r"episodes\.parquet: cannot be read"):
-        check(folder)
+        restore(folder)
     (folder / layout.MANIFEST).unlink()
     with pytest.raises(RecordingError, match=r"is no archive: manifest\.json"):
-        check(folder)
+        restore(folder)
 
 
 def forged(archive, folder, name, table, **options):
@@ -179,7 +179,7 @@ def test_a_forged_value_is_found_by_the_topics_hash(archive, tmp_path):
         archive, tmp_path / "forged", layout.STEPS, with_column(steps, "reward", pa.array(reward))
     )
     with pytest.raises(RecordingError, match=r"/eval/step: restored"):
-        check(folder)
+        restore(folder)
 
 
 @pytest.mark.parametrize(
@@ -205,7 +205,7 @@ def test_tables_of_another_kind_are_refused(archive, tmp_path, forge, message):
     steps = pq.read_table(archive / layout.STEPS)
     folder = forged(archive, tmp_path / "forged", layout.STEPS, forge(steps))
     with pytest.raises(RunnerError, match=message):
-        check(folder)
+        restore(folder)
 
 
 def test_rows_without_end_are_refused_before_they_are_read(archive, tmp_path):
@@ -225,7 +225,7 @@ def test_rows_without_end_are_refused_before_they_are_read(archive, tmp_path):
 
     sealed(folder, with_as_many)
     with pytest.raises(RecordingError, match="made to exhaust the disk"):
-        check(folder)
+        restore(folder)
 
 
 @pytest.mark.parametrize("name", ["../outside", "/etc/passwd", "a\\b", "c:d", "."])
@@ -233,7 +233,7 @@ def test_no_file_of_an_archive_is_outside_of_it(archive, tmp_path, name):
     folder = shutil.copytree(archive, tmp_path / "outside")
     sealed(folder, lambda manifest: replace(manifest, files={**manifest.files, name: Entry(1, "0" * 64)}))
     with pytest.raises(RecordingError, match="would leave the archive"):
-        check(folder)
+        restore(folder)
 
 
 def test_an_archive_of_a_later_version_is_refused_by_its_version(archive, tmp_path):
@@ -241,7 +241,7 @@ def test_an_archive_of_a_later_version_is_refused_by_its_version(archive, tmp_pa
     path = folder / layout.MANIFEST
     path.write_text(path.read_text().replace('"version": 1', '"version": 7'))
     with pytest.raises(RecordingError, match="version 7, expected 1"):
-        check(folder)
+        restore(folder)
 
 
 def test_reading_a_table_keeps_nothing_of_the_groups_before(tmp_path):

@@ -12,7 +12,7 @@ from pyarrow import fs
 
 from runner.archive import layout
 from runner.archive.manifest import Manifest, entries_of
-from runner.archive.restoring import check
+from runner.archive.restoring import restore
 from runner.archive.store import Store
 from runner.cli import cli
 from runner.errors import RecordingError, RunnerError, StorageError
@@ -120,7 +120,7 @@ def test_an_interrupted_upload_leaves_no_archive_and_is_repeated(archive, bucket
             Store(URL).manifest("k3v9m2xq")
     store_copy(archive, "k3v9m2xq")
     with Store(URL).reading("k3v9m2xq") as folder:
-        check(folder)
+        restore(folder)
 
 
 def test_files_of_several_parts(bucket, tmp_path):
@@ -142,7 +142,7 @@ def test_an_upload_leaves_those_of_other_processes_alone(archive, bucket):
     store_copy(archive, "k3v9m2xq")
     assert bucket.open_input_stream("lab/runs/p7/steps.parquet").read() == b"another's"
     with Store(URL).reading("k3v9m2xq") as folder:
-        check(folder)
+        restore(folder)
     other.close()  # it was not aborted
 
 
@@ -159,7 +159,7 @@ def test_what_is_missing_or_changed_there_is_named(archive, bucket):
     data[7] ^= 1
     put(bucket, key, bytes(data))
     with store.reading("k3v9m2xq") as folder, pytest.raises(RecordingError, match=r"episodes\.parquet"):
-        check(folder)
+        restore(folder)
     put(bucket, key, bytes(data[:-1]))
     with pytest.raises(RecordingError, match=r"episodes\.parquet: found .* bytes"), store.reading("k3v9m2xq"):
         pass
