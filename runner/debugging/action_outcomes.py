@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from html import escape
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -97,7 +97,7 @@ class WhatIf:
         plain = {
             name: value for name, value in vars(self).items() if name not in ("recorded", "actions", "mdp")
         }
-        fields: dict[str, Any] = finite(
+        fields: Json = finite(
             plain | {"recorded": vars(self.recorded), "actions": [vars(action) for action in self.actions]}
         )
         return fields

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from blake3 import blake3
 
@@ -38,8 +38,9 @@ from runner.runs.resolve import find_run
 from runner.runs.run import Run, recordings_folder
 from runner.sweep.cluster import worker_pool
 from runner.sweep.local import Workers
+from runner.util.values import JsonView
 
-Source = str | os.PathLike[str] | Mapping[str, Any] | ExperimentConfig | Run
+Source = str | os.PathLike[str] | JsonView | ExperimentConfig | Run
 DEFAULT_SEEDS: Final = 20
 MAX_SEEDS: Final = 10_000
 _PROBES: Final = 2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from html import escape
-from typing import Any, Final
+from typing import Final
 
 from runner.analysis.sections import Grid, Section
 from runner.analysis.step_reference import StepRef
@@ -12,6 +12,7 @@ from runner.drawing.svg_moves import Move
 from runner.environments.naming import spoken
 from runner.errors import MissingExtra
 from runner.export.reports.rendering import page_style, partials
+from runner.util.values import Json
 
 EXPLANATION: Final = (
     "This is a decomposition along the path that training took, not a counterfactual: `dualtaxi branch` "
@@ -116,7 +117,7 @@ class Why:
     picture: str = field(repr=False)
     """The moves on the grid, as SVG; empty without a scene."""
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> Json:
         """Return all fields but the picture as JSON can hold them."""
         fields = asdict(self) | {"moves": [move._asdict() for move in self.moves]}
         del fields["picture"]

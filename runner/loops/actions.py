@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from gymnasium import ActionWrapper, spaces
@@ -147,9 +147,7 @@ def _parsed_json(space: Space, given: object, where: str) -> object:
     raise ConfigError(f"{where}: found {_short(given)}, expected an element of {space}")
 
 
-def _parsed_parts(
-    space: spaces.Dict | spaces.Tuple[Any], given: object, recorded: Value, where: str
-) -> object:
+def _parsed_parts(space: Space, given: object, recorded: Value, where: str) -> object:
     """Return an action of a `Dict` or `Tuple`, whose text is JSON."""
     try:
         values = json.loads(given) if isinstance(given, str) else given
@@ -164,6 +162,7 @@ def _parsed_parts(
         return {
             key: _parsed(space[key], values[str(key)], recorded[key], (), f"{where}[{key!r}]") for key in keys
         }
+    assert isinstance(space, spaces.Tuple)
     if not isinstance(values, Sequence) or len(values) != len(space.spaces):
         raise ConfigError(f"{where}: found {_short(values)}, expected a list of {len(space.spaces)} parts")
     return tuple(

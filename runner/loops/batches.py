@@ -17,7 +17,7 @@ from runner.environments.gym_types import AnyVectorEnv, Space
 from runner.errors import ConfigError, RunnerError
 from runner.loops.batch_rows import BatchRows
 from runner.loops.loop import Loop
-from runner.loops.makers import checked_make, vector_maker_of
+from runner.loops.makers import NAME_MAKE, checked_make, vector_maker_of
 from runner.loops.options import Options, RunOptions, options_of
 from runner.loops.recorded import Recorded
 from runner.loops.values import as_array, check_phase
@@ -43,10 +43,7 @@ class NamedEnvironments(AnyVectorEnv):
 class RecordedBatches(Recorded[BatchRows]):
     """The recording of environments whose steps come in batches; made by `record_batches`."""
 
-    why_not_made = (
-        "it was recorded in batches, and is known by its name alone; name a function that makes it: "
-        'make="module:function"'
-    )
+    why_not_made = f"it was recorded in batches, and is known by its name alone; {NAME_MAKE}"
     """Why an environment cannot be made again that is known by its name alone."""
 
     def __init__(
@@ -64,7 +61,7 @@ class RecordedBatches(Recorded[BatchRows]):
         if isinstance(envs, VectorEnv):
             self._open(envs)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         if name in ("_loop", "_messages", "_rows"):
             raise RunnerError(
                 "found no batch so far, expected one: it tells how many environments there are."
@@ -291,12 +288,12 @@ def _numpy(values: object) -> object:
     return as_array(values)
 
 
-def _arrays(values: object) -> Iterator[Any]:
+def _arrays(values: object) -> Iterator[Array]:
     if isinstance(values, Mapping | tuple):
         for part in values.values() if isinstance(values, Mapping) else values:
             yield from _arrays(part)
     else:
-        yield values
+        yield np.asarray(values)
 
 
 def _flags(what: str, values: object, shape: tuple[int, ...]) -> Flags:
@@ -314,13 +311,14 @@ def _flags(what: str, values: object, shape: tuple[int, ...]) -> Flags:
     return found.astype(np.bool_, copy=False)
 
 
-def _derived(batch: Any) -> Space:
+def _derived(batch: object) -> Space:
     """Return a space for what the values of a batch, [T, N, ...], are to each environment."""
     if isinstance(batch, Mapping):
         return spaces.Dict({str(key): _derived(part) for key, part in batch.items()})
     if isinstance(batch, tuple):
         return spaces.Tuple([_derived(part) for part in batch])
-    kind, shape = batch.dtype, batch.shape[2:]
+    array = np.asarray(batch)
+    kind, shape = array.dtype, array.shape[2:]
     if kind.kind == "b":
         return spaces.Box(0, 1, shape, np.uint8)
     if kind.kind in "iu":

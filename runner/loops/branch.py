@@ -197,8 +197,7 @@ class _Player:
             where = str(recording.path)
             trials = evaluation_after(evaluations_of(recording), task.at.after, where)
             self.phase, self.episode = "eval", trials.trial(task.at.episode, where)
-        function: Any = policy_named(task.policy) if ":" in task.policy else None
-        self._function: Policy | None = function
+        self._function: Policy | None = policy_named(task.policy) if ":" in task.policy else None
         self._is_game = False
         self._actions: Iterator[Value] = iter(())
 

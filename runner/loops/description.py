@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final
+from typing import Final
 
 from gymnasium import spaces
 
@@ -135,8 +135,10 @@ def kind_of(observation: Space, action: Space) -> str:
     return "variable" if any(part.dtype is None for part in parts) else "transition"
 
 
-def _tabular(env: object, kwargs: dict[str, object], observation: Any, action: Any) -> Mdp | None:
+def _tabular(env: object, kwargs: dict[str, object], observation: Space, action: Space) -> Mdp | None:
     """Return the arrays of an environment if it is tabular and its observations are its states."""
+    assert isinstance(observation, spaces.Discrete)
+    assert isinstance(action, spaces.Discrete)
     base = getattr(env, "unwrapped", env)
     if not hasattr(base, "transitions") and not hasattr(base, "P"):
         return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, Unpack
+from typing import Literal, Unpack
 
 import gymnasium
 from gymnasium.vector import VectorEnv
@@ -24,7 +24,7 @@ from runner.loops.values import check_phase
 from runner.runs.run import Run
 
 
-class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
+class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[object, object, object, object]):
     """A Gymnasium environment whose every reset and step is recorded; made by `record`."""
 
     env: Env
@@ -45,7 +45,7 @@ class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
         self._take = self._rows.take
         self._lock = self._loop.lock
 
-    def step(self, action: Any, extras: Mapping[str, object] | None = None) -> StepResult:
+    def step(self, action: object, extras: Mapping[str, object] | None = None) -> StepResult:
         """Take a step, and record it, with values of your own: `extras={"value": v, "logits": logits}`.
 
         A name keeps the dtype and the shape of its first value; a step need not have all names.

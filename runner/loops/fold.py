@@ -7,7 +7,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -232,7 +232,7 @@ class Fold:
 
     # --- messages -------------------------------------------------------------------------------------
 
-    def _copy_messages(self, topic: Topic, spool: Any) -> None:
+    def _copy_messages(self, topic: Topic, spool: BinaryIO) -> None:
         """Copy the messages of a topic, but those of steps, in the order of the run."""
         if topic in schema.UNIFORM_TOPICS or topic.name.endswith(("/step", "/reset", "/episode")):
             return

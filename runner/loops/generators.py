@@ -54,7 +54,7 @@ class GeneratorWatch:
             return None
         ale_state = b"" if self._ale is None else self._ale.cloneState(include_rng=True).serialize()
         bits = getattr(generator, "bit_generator", None)
-        state: Any = bits.state if type(bits) is np.random.PCG64 else None
+        state = bits.state if type(bits) is np.random.PCG64 else None
         self.due = steps + max(STEPS_BETWEEN, self._steps_a_byte * len(ale_state))
         if state is None and not ale_state:
             return None

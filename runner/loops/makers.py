@@ -46,7 +46,7 @@ from runner.replay.games import MultiAgent, Turns
 from runner.replay.stepping_vector import spaces_of_one
 from runner.util.values import MAX_TEXT
 
-_NAME_MAKE: Final = 'name a function that makes it: make="module:function"'
+NAME_MAKE: Final = 'name a function that makes it: make="module:function"'
 _SIMULATORS: Final = ("Box2D", "ale_py", "mujoco", "pettingzoo", "supersuit")
 """Modules whose versions are recorded if they are loaded."""
 _DISTRIBUTIONS: Final = {"Box2D": ("box2d", "box2d-py")}
@@ -64,7 +64,7 @@ def maker_of(env: Any, make: str = "") -> EnvironmentMaker:
     return _with_spec(maker, getattr(layers[-1], "spec", None), partial(wrappers_as_fields, wrappers), top)
 
 
-def _maker_of_spec(spec: Any) -> EnvironmentMaker:
+def _maker_of_spec(spec: object) -> EnvironmentMaker:
     """Return how an environment in another process was made, whose specification has its wrappers."""
     wrappers = getattr(spec, "additional_wrappers", ())
     names = tuple(wrapper.entry_point for wrapper in reversed(wrappers))
@@ -128,14 +128,14 @@ def vector_maker_of(
     else:
         maker = maker_of(first)
         if mode == "sync" and any(maker_of(other) != maker for other in base.envs[1:]):
-            reason = f"its environments were not all made in the same way; {_NAME_MAKE}"
+            reason = f"its environments were not all made in the same way; {NAME_MAKE}"
     assumed = list(maker.assumed)
     specs = "[]"
     try:
         wrappers = [layer for layer in reversed(layers[:-1]) if not only_observes(layer)]
         specs = json.dumps([wrapper_fields(wrapper, assumed) for wrapper in wrappers], default=plain_number)
     except CannotBeMade as unknown:
-        reason = reason or f"{unknown}; {_NAME_MAKE}"
+        reason = reason or f"{unknown}; {NAME_MAKE}"
     names = tuple(class_name(layer) for layer in layers[:-1])
     has_others = any(isinstance(layer, VectorActionWrapper) for layer in layers)
     space = spaces_of_one(envs)[1]
@@ -157,7 +157,7 @@ def vector_maker_of(
     )
 
 
-def _custom_vector(base: Any) -> EnvironmentMaker:
+def _custom_vector(base: object) -> EnvironmentMaker:
     """Return how a vector environment of its own class was made."""
     spec, top = getattr(base, "spec", None), top_package(type(base).__module__)
     if not isinstance(spec, EnvSpec):
@@ -277,9 +277,9 @@ def _main_name() -> str | None:
 def _with_versions(maker: EnvironmentMaker, tops: Sequence[str], reason: object = "") -> EnvironmentMaker:
     """Return a maker with the versions of the packages, the platform, and why it is incomplete."""
     if reason:
-        maker = replace(maker, reason=f"{reason}; {_NAME_MAKE}")
+        maker = replace(maker, reason=f"{reason}; {NAME_MAKE}")
     if len(maker.spec) > MAX_SPEC:
-        maker = replace(maker, spec="", reason=f"its arguments take {len(maker.spec):,} bytes; {_NAME_MAKE}")
+        maker = replace(maker, spec="", reason=f"its arguments take {len(maker.spec):,} bytes; {NAME_MAKE}")
     return replace(maker, packages=package_versions(tops), platform=_platform(), machine=platform.machine())
 
 

@@ -18,7 +18,7 @@ from runner.runs.run import Run
 from runner.runs.shards import find_joined
 from runner.util.extras import require
 from runner.util.jsonable import as_json, as_mapping
-from runner.util.values import Json, checked_run_name, is_whole
+from runner.util.values import Json, JsonView, checked_run_name, is_whole
 
 MADE_BY: Final = "runner.record"
 ALL_INFO: Final = "*"
@@ -203,7 +203,7 @@ def options_of(
     )
 
 
-def settings_in(config: object) -> Mapping[Any, Any]:
+def settings_in(config: object) -> JsonView:
     """Return the user's own settings in a mapping, a dataclass or a namespace; none in None.
 
     Raises:

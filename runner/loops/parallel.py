@@ -161,7 +161,7 @@ def record_parallel(
     return kind(env, Loop(described, options_of(recordings, options), maker, AgentRows), phase)
 
 
-def record_aec(env: Any, recordings: str | os.PathLike[str] | None = None, **options: Any) -> RecordedAec:
+def record_aec(env: object, recordings: str | os.PathLike[str] | None = None, **options: Any) -> RecordedAec:
     """Return a PettingZoo game in turns, with everything that a loop does with it recorded.
 
         with runner.record_aec(tictactoe_v3.env(), name="mine") as env:

@@ -171,7 +171,7 @@ class Recorded(Generic[R]):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *raised: Any) -> Literal[False]:
+    def __exit__(self, *raised: object) -> Literal[False]:
         try:
             self.env.close()
         finally:
@@ -196,8 +196,8 @@ class Recorded(Generic[R]):
         self._enter(self._phase)
 
 
-def ending_of(error: BaseException | None) -> tuple[str, str]:
-    """Return the status of a run that ended with this error, and the text of the error."""
+def ending_of(error: object) -> tuple[str, str]:
+    """Return the status of a run that ended with this error, None without one, and the text of the error."""
     if error is None:
         return "finished", ""
     if isinstance(error, KeyboardInterrupt) or (isinstance(error, SystemExit) and not error.code):
@@ -205,7 +205,7 @@ def ending_of(error: BaseException | None) -> tuple[str, str]:
     return "failed", f"{type(error).__name__}: {error}"
 
 
-def _close_abandoned(loop: Loop[Any]) -> None:
+def _close_abandoned(loop: Loop[R]) -> None:
     """Close a recording that was not closed: as failed if an uncaught exception ended the process.
 
     Python keeps such an exception in `sys.last_value`; an interactive session continues after it.

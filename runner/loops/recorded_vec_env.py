@@ -17,10 +17,10 @@ from runner.loops.vector import record_vector
 _METHODS = ("reset", "step_async", "step_wait")
 
 
-def _passed_on(name: str) -> Callable[..., Any]:
+def _passed_on(name: str) -> Callable[..., object]:
     """Return a method that calls the one of this name of the `VecEnv` inside."""
 
-    def method(self: RecordedVecEnv, *args: object, **keywords: object) -> Any:
+    def method(self: RecordedVecEnv, *args: object, **keywords: object) -> object:
         return getattr(self.base, name)(*args, **keywords)
 
     return method
@@ -74,7 +74,7 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         found = getattr(vars(base).get("step_wait"), "__self__", None)
         return found if isinstance(found, RecordedVecEnv) else None
 
-    def reset(self) -> Any:
+    def reset(self) -> object:
         """Reset all environments, and record it."""
         if self.training_steps is not None:
             self.recorded.at_step(self.training_steps())
@@ -92,7 +92,7 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         self._actions = actions
         self._vector.step_async(actions)
 
-    def step_wait(self) -> Any:
+    def step_wait(self) -> object:
         """Wait for the steps, and record them."""
         self.recorded.step(self._actions)
         self.reset_infos = self.base.reset_infos

@@ -6,14 +6,16 @@ A unit is a reset of one environment, and the steps that it took up to its next 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.recording import schema
+from runner.recording.messages import Message
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
+from runner.util.arrays import Ints, Records
 
 PHASES: Final = tuple(schema.PHASES)
 UNIT: Final = np.dtype(
@@ -61,7 +63,7 @@ class Source:
         """The numbers of those at which an environment was only reset."""
         self.taken = {phase: self.stops[phase] - len(self.only_resets[phase]) for phase in PHASES}
         self.units = {phase: self._units(phase) for phase in PHASES}
-        self._messages: dict[str, Iterator[Any]] = {}
+        self._messages: dict[str, Iterator[Message]] = {}
         self.times = {phase: self._times(phase) for phase in PHASES}
         """`log_time` of each step where values vary in size; else empty."""
 
@@ -136,14 +138,15 @@ class Source:
 
     # --- what a unit holds, read in the order of the run ----------------------------------------------
 
-    def reset(self, phase: str, unit: np.void) -> Any:
+    def reset(self, phase: str, unit: np.void) -> np.void | Message:
         """Return the reset of a unit."""
         topic, number = self._topic(phase, "reset"), int(unit["reset"])
         if self._is_fixed:
-            return next(self.recording.blocks(topic, number, number + 1))[0]
+            found: np.void = next(self.recording.blocks(topic, number, number + 1))[0]
+            return found
         return next(self._stream(f"/{phase}/reset"))
 
-    def steps(self, phase: str, unit: np.void) -> Iterator[tuple[Any, NDArray[np.int64]]]:
+    def steps(self, phase: str, unit: np.void) -> Iterator[tuple[Records | list[Message], Ints]]:
         """Yield the steps of a unit in pieces, with their numbers in the phase of its process."""
         first, stop = int(unit["first"]), int(unit["stop"])
         if first >= stop:
@@ -160,7 +163,7 @@ class Source:
             if len(rows):
                 yield rows, rows["step"].astype(np.int64)
 
-    def _stream(self, name: str) -> Iterator[object]:
+    def _stream(self, name: str) -> Iterator[Message]:
         """Return the messages of a topic of varying size; units of one environment come in their order."""
         if name not in self._messages:
             self._messages[name] = self.recording.decoded(self.recording.topic(name))

@@ -96,12 +96,12 @@ def arrays_of(name: str, value: object) -> Iterator[tuple[str, Array]]:
     yield name, values.astype(values.dtype.newbyteorder("<"), copy=False)
 
 
-def as_array(value: Any) -> Array:
+def as_array(value: object) -> Array:
     """Return an array or tensor as NumPy's; the short floats that NumPy lacks become float32, exactly."""
     if callable(detach := getattr(value, "detach", None)):
-        value = detach().cpu()
-        if "bfloat16" in str(value.dtype) or "float8" in str(value.dtype):
-            value = value.float()
+        tensor = detach().cpu()
+        is_short = "bfloat16" in str(tensor.dtype) or "float8" in str(tensor.dtype)
+        value = tensor.float() if is_short else tensor
     values = np.asarray(value, order="C")
     if values.dtype.kind == "V" and values.dtype.name.startswith(("bfloat16", "float8")):
         return values.astype(np.float32)

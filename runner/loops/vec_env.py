@@ -33,14 +33,14 @@ class VecEnvVector(AnyVectorEnv):
         self.render_mode = base.render_mode
         self.mode = _MODES.get(type(base).__name__, "custom")
         """How the environments are put together, as in `VectorMaker`."""
-        self.envs: list[Any] = base.envs if self.mode == "sync" else []
+        self.envs: list[object] = base.envs if self.mode == "sync" else []
         self.spec = base.get_attr("spec", indices=[0])[0] if self.mode == "async" else None
         self.step_async, self._step_wait = base.step_async, base.step_wait
         self._reset, self._close = base.reset, base.close
         self._rewards_dtype = base.buf_rews.dtype if self.mode == "sync" else None
         if self.mode == "sync":
             base.buf_rews = np.zeros(self.num_envs)
-        self.native: Any = None
+        self.native: object = None
         """What the `VecEnv` returned last, for those who use it as such."""
 
     def step(self, actions: object) -> VectorStepResult:  # noqa: ARG002
@@ -62,7 +62,7 @@ class VecEnvVector(AnyVectorEnv):
         """Return a picture of each environment."""
         return self.base.get_images()
 
-    def get_attr(self, name: str) -> Any:
+    def get_attr(self, name: str) -> object:
         """Return an attribute of each environment."""
         return self.base.get_attr(name)
 

@@ -29,7 +29,7 @@ from runner.recording.spaces import Value
 from runner.replay.stepping_vector import final_observations, spaces_of_one
 
 if TYPE_CHECKING:
-    _Wrapper = VectorWrapper[Any, Any, Any, Any, Any]
+    _Wrapper = VectorWrapper[object, object, object, object, object]
 else:
     _Wrapper = VectorWrapper  # it takes no parameters before Gymnasium 1.3
 
@@ -60,7 +60,7 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
             self._rows.over = over  # the environments are the same ones
             self._watch.phase_began()
 
-    def step(self, actions: Any, extras: Mapping[str, object] | None = None) -> VectorStepResult:
+    def step(self, actions: object, extras: Mapping[str, object] | None = None) -> VectorStepResult:
         """Take a step in every environment, and record it, with arrays [N, ...] of your own by name."""
         watch, frames_every = self._watch, self._options.frames_every
         watch.steps += 1
@@ -151,7 +151,7 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
     def record_reset(
         self,
         observations: object,
-        infos: object,
+        infos: Info | Sequence[Info],
         seeds: Sequence[int | None] = (),
         which: NDArray[np.bool_] | None = None,
         states: States | None = None,
@@ -284,7 +284,7 @@ def first_of(envs: AnyVectorEnv) -> Iterator[object]:
         yield envs
 
 
-def _by_environment(infos: Any) -> Mapping[str, Value]:
+def _by_environment(infos: Info | Sequence[Info]) -> Mapping[str, Value]:
     """Return infos by field; SuperSuit returns a list of them, one for each environment."""
     if isinstance(infos, Mapping):
         return infos

@@ -8,7 +8,7 @@ episodes, the resets that environments do by themselves) is computed for a block
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +76,7 @@ class VectorRows:
         self._state = np.full(n, -self._state_start)
         """The states before the first row, where both spaces are discrete."""
         self._block_resets: list[ResetsBetween] = []
-        self._finals: list[tuple[Any, NDArray[np.intp], Array]] = []
+        self._finals: list[tuple[int | NDArray[np.intp], NDArray[np.intp], Array]] = []
         """Rows whose observations are of the next episodes; environments, and the last ones of the ended."""
         self._autoreset_states: dict[int, States] = {}
         """Rows with resets in place of steps, and what those depended on."""

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Final
+from typing import Final
 
 from runner.errors import StorageError
 from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD, MAX_CODE_BYTES, MAX_FILES, Code, patch_parts
@@ -348,9 +348,8 @@ def _is_source(path: str) -> bool:
 
 def _cells() -> str:
     """Return the cells that a notebook executed so far; empty elsewhere."""
-    ipython: Any = sys.modules.get("IPython")
-    with contextlib.suppress(Exception):  # other versions of IPython may have no such history
-        cells = ipython.get_ipython().history_manager.input_hist_raw
+    with contextlib.suppress(Exception):  # it is not loaded, or of a version without such a history
+        cells = sys.modules["IPython"].get_ipython().history_manager.input_hist_raw
         text = "".join(f"# %% [{number}]\n{cell}\n" for number, cell in enumerate(cells) if cell)
         return text[-_MAX_CELL_BYTES:]
     return ""

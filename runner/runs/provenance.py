@@ -18,7 +18,8 @@ from collections.abc import Iterator, Mapping
 from functools import cache, lru_cache
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import Any, Final
+from types import ModuleType
+from typing import Final
 
 import numpy as np
 from blake3 import blake3
@@ -161,7 +162,7 @@ def _settings(with_command: bool) -> dict[str, str]:
         facts["processors.usable"] = str(len(os.sched_getaffinity(0)))
     facts["random.state"] = _random_digest(random.getstate()[1])
     if "numpy.random" in sys.modules:
-        state: Any = np.random.get_state(legacy=False)["state"]
+        state = np.random.get_state(legacy=False)["state"]
         if "key" in state:  # otherwise the user chose another generator
             facts["numpy.random.state"] = _digest(state["key"].tobytes() + state["pos"].to_bytes(4))
     for name, read in (("torch", _torch), ("jax", _jax)):
@@ -196,7 +197,7 @@ def _random_digest(state: tuple[int, ...]) -> str:
     return _digest(np.array(state, np.int64).tobytes())
 
 
-def _torch(torch: Any) -> Iterator[tuple[str, str]]:
+def _torch(torch: ModuleType) -> Iterator[tuple[str, str]]:
     """Yield the flags and seeds of PyTorch; CUDA is not initialised for this."""
     for key, name in _TORCH_FLAGS.items():
         yield f"torch.{key}", str(getattr(torch, name)())
@@ -209,7 +210,7 @@ def _torch(torch: Any) -> Iterator[tuple[str, str]]:
             yield f"gpu.{number}", str(torch.cuda.get_device_name(number))
 
 
-def _jax(jax: Any) -> Iterator[tuple[str, str]]:
+def _jax(jax: ModuleType) -> Iterator[tuple[str, str]]:
     """Yield the settings of JAX; no backend is initialised for this."""
     for name in _JAX_FLAGS:
         if hasattr(jax.config, name):

@@ -19,7 +19,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from peewee import Value, fn
 
@@ -42,7 +42,7 @@ _PLACE: Final = re.compile(
 )
 _MISTAKEN: Final = {"and": "AND", "or": "OR", "not": "NOT", "&&": "AND", "||": "OR", "&": "AND", "|": "OR"}
 _COMPARISON: Final = re.compile(r"([A-Za-z_][\w.-]*)\s*([<>]=?|!=|==?)(.*)", re.DOTALL)
-_OPERATORS: Final[dict[str, Callable[[Expression, Any], Expression]]] = {
+_OPERATORS: Final[dict[str, Callable[[Expression, Expression], Expression]]] = {
     **{"=": operator.eq, "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 }
 _OPPOSITE: Final = {"<": ">", "<=": ">=", ">": "<", ">=": "<="}

@@ -171,9 +171,9 @@ def text(value: object, max_length: int = _TEXT) -> str | None:
     return value[:max_length].encode(errors="replace").decode()
 
 
-def number(value: Any) -> float | None:
+def number(value: object) -> float | None:
     """Return a finite number; None for any other value."""
-    if type(value) not in (int, float):
+    if not isinstance(value, int | float) or isinstance(value, bool):
         return None
     try:
         return float(value) if math.isfinite(value) else None
