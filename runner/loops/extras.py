@@ -6,9 +6,8 @@ row waits for `note_step` until the next step is taken.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Mapping
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAME_LENGTH, MAX_NAMES,
 from runner.recording.gym_values import SCALARS
 from runner.recording.messages import encode
 from runner.recording.recorder import Recorder
+from runner.recording.spaces import Value
 from runner.util.arrays import Array
 from runner.util.values import is_utf8
 
@@ -29,12 +29,19 @@ _MAX_BYTES: Final = 4 << 20
 """The most rows, and bytes of them, that wait for the recorder."""
 _MAX_DIMENSIONS: Final = 8
 _PYTHON: Final = {bool: "?", int: "<i8", float: "<f8"}
-_CODES: Final = {"b": "?", "i": "bhiq", "u": "BHIQ", "f": " efd"}
-"""The codes of `struct` by the kind of a dtype, from 1 byte to 8."""
 TOPICS: Final = {"train": schema.TRAIN_EXTRA, "eval": schema.EVAL_EXTRA}
 
-Put = Callable[[object], None]
-"""Adds a value to its column, or raises `ConfigError`."""
+
+class _Column(NamedTuple):
+    """The values of one name that the recorder does not have yet."""
+
+    dtype: np.dtype[np.generic]
+    shape: tuple[int, ...]
+    """Of a row: [*batch, ...]."""
+    scalars: frozenset[type]
+    """The classes of single numbers that it holds exactly."""
+    values: Array
+    """[rows, *shape]."""
 
 
 class Extras:
@@ -49,12 +56,10 @@ class Extras:
         self._n = batch[0] if batch else 1
         self._taken = recorder.steps
         self._dtypes: dict[str, np.dtype[np.generic]] = {}
+        """The dtype of each name's values of one environment, with their shape."""
         self._is_described = False
         """Whether the recording has the names and dtypes."""
-        self._columns: dict[str, list[bytes]] = {}
-        """By name, the bytes of [*batch, *shape] in each row; zeros where there is no value."""
-        self._fast: dict[str, tuple[np.dtype[np.generic], tuple[int, ...], Callable[[bytes], None], Put]] = {}
-        """By name, dtype and shape of the usual values, which are appended, and what takes all others."""
+        self._columns: dict[str, _Column] = {}
         self._max_rows = 0
         self._phase = ""
         self._steps: list[int] = []
@@ -69,34 +74,30 @@ class Extras:
 
         It is called with each step, so it has what it needs at hand.
         """
-        steps, fast, taken, n, array = self._steps, self._fast, self._taken, self._n, np.ndarray
+        steps, columns, taken, n, array = self._steps, self._columns, self._taken, self._n, np.ndarray
 
-        def take(values: Mapping[str, object]) -> None:
+        def take(values: Mapping[str, Value]) -> None:
             if not values:
                 return
             row = len(steps)
             try:
                 for name, value in values.items():
-                    dtype, shape, append, put = fast[name]
-                    if value.__class__ is array and value.dtype is dtype and value.shape == shape:
-                        append(value.tobytes())
-                    else:
-                        put(value)
+                    dtype, shape, scalars, cells = columns[name]
+                    is_fitting = value.__class__ in scalars or (
+                        value.__class__ is array and value.dtype is dtype and value.shape == shape
+                    )
+                    cells[row] = value if is_fitting else _fitting(name, value, dtype, shape)
             except (AttributeError, KeyError):  # no mapping, or a new name
-                self._cut(row)
                 self._grow(row, values)
                 take(values)
                 return
-            except ConfigError:
-                self._cut(row)
-                raise
+            except OverflowError as error:
+                raise ConfigError(f"extras: found {value} for {name!r}, which {dtype} cannot hold") from error
             if not row:
                 self._phase = phase
             steps.append(taken[phase] + rows.filled - n)
-            if len(values) != len(fast):
+            if len(values) != len(columns):
                 self._partial[row] = set(values)
-                for name in self._columns.keys() - values.keys():
-                    self._columns[name].append(self._zeros(name))
             if row >= self._max_rows:
                 self._write(row)
 
@@ -118,17 +119,13 @@ class Extras:
             self.taker(phase, rows)(values)
             return
         self._grow(len(self._steps) - 1, values)
-        n = len(self._steps)
-        try:
-            for name, value in values.items():
-                self._fast[name][-1](value)
-        except ConfigError:
-            self._cut(n)
-            raise
-        for name in values:
-            del self._columns[name][-2]
-        if n - 1 in self._partial:
-            self._partial[n - 1].update(values)
+        row = len(self._steps) - 1
+        columns = {name: self._columns[name] for name in values}
+        fitting = {name: _fitting(name, values[name], own.dtype, own.shape) for name, own in columns.items()}
+        for name, value in fitting.items():
+            columns[name].values[row] = value
+        if row in self._partial:
+            self._partial[row].update(values)
 
     def checked_batch(self, values: Mapping[str, object], shape: tuple[int, ...]) -> dict[str, Array]:
         """Return the values of T steps of N environments, by name, as `put_batch` takes them.
@@ -149,9 +146,8 @@ class Extras:
                     f"extras: found shape {array.shape} for {name!r}, expected {(*shape, '...')}"
                 )
         self._grow(len(self._steps), {name: array[0] for name, array in arrays.items()})
-        fast = self._fast
         return {
-            name: _fitting(name, array, fast[name][0], shape[:1] + fast[name][1])
+            name: _fitting(name, array, self._columns[name].dtype, shape[:1] + self._columns[name].shape)
             for name, array in arrays.items()
         }
 
@@ -172,20 +168,12 @@ class Extras:
         given = {name: np.full(count, name in values) for name in self._dtypes}
         self._send(np.arange(first, first + count), columns, given)
 
-    def _cut(self, rows: int) -> None:
-        """Remove what was put down of a row after these."""
-        for column in self._columns.values():
-            del column[rows:]
-
-    def _zeros(self, name: str) -> bytes:
-        return bytes(self._dtypes[name].itemsize * self._n)
-
     def _grow(self, row: int, values: Mapping[str, object]) -> None:
         """Add the names that are new, of which rows before this one have no values."""
         if not isinstance(values, Mapping):
             raise ConfigError(f"extras: found {type(values).__name__}, expected values by name")
         fresh = {
-            name: self._dtype_of(name, value) for name, value in values.items() if name not in self._fast
+            name: self._dtype_of(name, value) for name, value in values.items() if name not in self._columns
         }
         if not fresh:
             return
@@ -200,12 +188,15 @@ class Extras:
         self._write(row)
         if self._steps:
             self._partial.setdefault(0, set(self._dtypes))
-        self._max_rows = min(_MAX_ROWS, _MAX_BYTES // (size * self._n))
+        self._max_rows = max(1, min(_MAX_ROWS, _MAX_BYTES // (size * self._n)))
         self._dtypes, self._is_described = dtypes, False
-        for name, dtype in fresh.items():
-            self._columns[name] = column = [self._zeros(name)] * len(self._steps)
+        left = len(self._steps)
+        for name, dtype in dtypes.items():
+            own = self._columns.get(name)
             base, shape = np.dtype(dtype.base.str), (*self._batch, *dtype.shape)
-            self._fast[name] = base, shape, column.append, _putter(name, base, shape, column)
+            self._columns[name] = column = _column(base, shape, self._max_rows + 1)
+            if own is not None:
+                column.values[:left] = own.values[:left]
 
     def _dtype_of(self, name: object, value: object) -> np.dtype[np.generic]:
         """Return the dtype, with the shape, that a name gets by its first value."""
@@ -240,15 +231,17 @@ class Extras:
         """Hand the first n rows to the recorder."""
         if n <= 0:
             return
+        given = self._given(n)
         columns = {
-            name: np.frombuffer(b"".join(column[:n]), self._dtypes[name])
+            name: column.values[:n].reshape(-1, *self._dtypes[name].shape)
             for name, column in self._columns.items()
         }
         steps = np.add.outer(np.array(self._steps[:n]), np.arange(self._n)).ravel()
-        self._send(steps, columns, self._given(n))
+        self._send(steps, columns, given)
         del self._steps[:n]
+        left = len(self._steps)
         for column in self._columns.values():
-            del column[:n]
+            column.values[:left] = column.values[n : n + left]
         self._partial = {row - n: names for row, names in self._partial.items() if row >= n}
 
     def _send(
@@ -270,11 +263,12 @@ class Extras:
         self._final[self._phase] = int(steps[-1])
 
     def _given(self, n: int) -> dict[str, NDArray[np.bool_]]:
-        """Return whether each environment's step has a value, by name, in n rows."""
+        """Return whether each environment's step has a value, by name, in n rows; zero those without one."""
         given = {name: np.ones(n, np.bool_) for name in self._dtypes}
         for row, names in self._partial.items():
             for name in given.keys() - names if row < n else ():
                 given[name][row] = False
+                self._columns[name].values[row] = 0
         return {name: np.repeat(flags, self._n) for name, flags in given.items()}
 
 
@@ -286,25 +280,13 @@ def begin_layout(recorder: Recorder, layout: ExtraLayout, position: int) -> None
     recorder.resize(dict.fromkeys(TOPICS.values(), layout.sizes))
 
 
-def _putter(name: str, base: np.dtype[np.generic], shape: tuple[int, ...], column: list[bytes]) -> Put:
-    """Return a function that adds a value of a name to its column, which is of this dtype and shape."""
-    exact = {
+def _column(base: np.dtype[np.generic], shape: tuple[int, ...], rows: int) -> _Column:
+    """Return a column for values of a dtype and a shape."""
+    exact: set[type] = {
         kind for kind in SCALARS if np.can_cast(kind, base) and (kind is not np.bool_ or base.kind == "b")
     }
     exact |= {kind for kind, held in _PYTHON.items() if np.dtype(held) == base}
-    scalars = frozenset(() if shape else exact)
-    pack, append = struct.Struct("<" + _CODES[base.kind][base.itemsize.bit_length() - 1]).pack, column.append
-
-    def put(value: object) -> None:
-        if value.__class__ not in scalars:
-            append(_fitting(name, value, base, shape).astype(base).tobytes())
-            return
-        try:
-            append(pack(value))
-        except struct.error as error:
-            raise ConfigError(f"extras: found {value} for {name!r}, which {base} cannot hold") from error
-
-    return put
+    return _Column(base, shape, frozenset(() if shape else exact), np.zeros((rows, *shape), base))
 
 
 def _fitting(name: str, value: object, base: np.dtype[np.generic], shape: tuple[int, ...]) -> Array:
