@@ -24,7 +24,6 @@ from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import actions_in_words, agent_of, joint_action, own_action, states_in_words
 from runner.export.contents import ending_of, require_steps
 from runner.export.episodes import EpisodePlace, no_step, place_of
-from runner.export.reports.episode import episode_of
 from runner.export.reports.playback import tabular_playback
 from runner.export.reports.player_data import Playback
 from runner.planning.evaluation import action_values, policy_values
@@ -116,8 +115,7 @@ def branch_playback(
     if not len(shown):
         raise no_step(recording, f"this branch of {found.place.title}", len(found.steps), first)
     values = tuple(table[shown["state"]] for table in found.tables)
-    episode = episode_of(found.place, recording.mdp, found.steps, found.outcome.end, values, first, limit)
-    return tabular_playback(recording, episode)
+    return tabular_playback(recording, found.place, found.steps, found.outcome.end, values, first, limit)
 
 
 class _Branches:

@@ -13,6 +13,7 @@ from runner.errors import NotInRecording, RecordingError
 from runner.export.contents import require_steps
 from runner.recording import schema
 from runner.recording.reader import Recording
+from runner.replay.steps import check_steps, steps_of
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,15 @@ def place_of(recording: Recording, which: tuple[int, ...]) -> EpisodePlace:
     evaluation = evaluation_after(evaluations_of(recording), after, where)
     title = trial_in_words(after, number)
     return EpisodePlace("eval", evaluation.trial(number, where), title, evaluation.train_step)
+
+
+def first_state(recording: Recording, which: tuple[int, ...]) -> int:
+    """Return the state in which an episode of a tabular environment begins; `which` is as for `place_of`."""
+    require_steps(recording, "show", may_redo=True)
+    place = place_of(recording, which)
+    steps = steps_of(recording, place.phase, place.number)[:1]
+    check_steps(steps, recording.mdp, str(recording.path))
+    return int(steps["state"][0])
 
 
 def no_step(recording: Recording, title: str, steps: int, t: int) -> NotInRecording:

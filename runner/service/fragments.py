@@ -27,14 +27,13 @@ from runner.drawing import svg
 from runner.environments.naming import actions_in_words, joint_action
 from runner.errors import RecordingError
 from runner.export.encoded import picture_note
-from runner.export.episodes import last_episode, last_whole_evaluation, typical_trial
+from runner.export.episodes import first_state, last_episode, last_whole_evaluation, typical_trial
 from runner.export.plots.curves import Plot
 from runner.export.plots.heatmaps import EXPLANATION, heatmap_plots
 from runner.export.plots.machine import machine_facts, machine_plots
 from runner.export.plots.tasks import task_charts
 from runner.export.reports.compare import tasks_legend
 from runner.export.reports.diff import ShownDivergence, difference_view
-from runner.export.reports.episode import trial
 from runner.export.reports.maps import maps_of, stages_of
 from runner.export.reports.playback import playback_of
 from runner.export.reports.rendering import Link, partials
@@ -170,7 +169,7 @@ def tasks(paths: Sequence[Path], axis: str, scores: str) -> bytes:
 
 def _typical_start(recording: Recording) -> int:
     try:
-        return int(trial(recording, *typical_trial(recording)).states[0])
+        return first_state(recording, typical_trial(recording))
     except RecordingError:
         return int(recording.mdp.start.argmax())
 

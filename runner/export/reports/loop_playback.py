@@ -17,13 +17,13 @@ from runner.environments.naming import spoken
 from runner.errors import RecordingError, shortened
 from runner.export.contents import ENDINGS, ending_of
 from runner.export.episodes import EpisodePlace, no_step
-from runner.export.reports.episode import outcome_in_words
 from runner.export.reports.player_data import (
     Playback,
     Series,
     Words,
     frame_times,
     logged_near,
+    outcome_in_words,
     short,
     short_rows,
     words,

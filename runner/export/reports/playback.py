@@ -1,4 +1,8 @@
-"""What a page plays of an episode of any recording."""
+"""What a page plays of an episode of any recording.
+
+Frame k is the state after k steps, with the step that led there and the Q-values of the next choice. So an
+episode of T steps has T + 1 frames.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.drawing import svg
+from runner.environments.mdp import events_of
 from runner.environments.naming import (
     actions_in_words,
     agent_actions,
@@ -19,9 +24,9 @@ from runner.environments.naming import (
     spoken,
     states_in_words,
 )
-from runner.export.contents import ENDINGS, require_steps
-from runner.export.episodes import place_of
-from runner.export.reports.episode import MAX_STEPS, Episode, episode_at, outcome_in_words
+from runner.errors import RecordingError
+from runner.export.contents import ENDINGS, ending_of, require_steps
+from runner.export.episodes import EpisodePlace, no_step, place_of
 from runner.export.reports.loop_playback import loop_playback
 from runner.export.reports.player_data import (
     Grid,
@@ -29,29 +34,45 @@ from runner.export.reports.player_data import (
     Words,
     frame_times,
     logged_near,
+    outcome_in_words,
     short,
     short_rows,
     words,
 )
+from runner.recording import schema
 from runner.recording.reader import Recording
+from runner.replay.steps import check_steps, steps_of
+from runner.replay.tables import TableReplay, tables_at
 
+MAX_STEPS: Final = 1000
+"""Steps of an episode that a page shows; the page says so where an episode has more."""
 MAX_VALUES: Final = 6
 """Q-values of a state that a page shows: the highest, and that of the action taken."""
+
+QValues = tuple[NDArray[np.float64], ...]
+"""For each learner the Q-values in the states of T steps, [T, actions]; empty if they are unknown."""
 
 
 def playback_of(
     recording: Recording, which: tuple[int, ...], limit: int = MAX_STEPS, first: int = 0
 ) -> Playback:
-    """Return what a page plays of an episode: at most `limit` steps from step `first` on.
+    """Return what a page plays of an episode, ended or not: at most `limit` steps from step `first` on.
 
     Which episode is given as for `place_of`.
     """
     require_steps(recording, "show", may_redo=True)
     place = place_of(recording, which)
     with np.errstate(over="ignore", invalid="ignore"):  # rewards may be infinite
-        if recording.tabular:
-            return tabular_playback(recording, episode_at(recording, place, limit, first))
-        return loop_playback(recording, place, limit, first)
+        if not recording.tabular:
+            return loop_playback(recording, place, limit, first)
+        steps = steps_of(recording, place.phase, place.number)
+        shown = steps[first : first + limit]
+        if not len(shown):
+            raise no_step(recording, place.title, len(steps), first)
+        check_steps(shown, recording.mdp, str(recording.path))
+        values = _values(recording, shown, place.table_step)
+        ended = ending_of(recording, place.phase, place.number)
+        return tabular_playback(recording, place, steps, ended, values, first, limit)
 
 
 def titled(playback: Playback, names: Sequence[str]) -> Playback:
@@ -69,42 +90,69 @@ def titled(playback: Playback, names: Sequence[str]) -> Playback:
     )
 
 
-def tabular_playback(recording: Recording, episode: Episode) -> Playback:
-    """Return what a page plays of an episode whose states and actions the environment's table names."""
+def tabular_playback(
+    recording: Recording,
+    place: EpisodePlace,
+    steps: NDArray[np.void],
+    ended: str,
+    values: QValues,
+    first: int = 0,
+    limit: int = MAX_STEPS,
+) -> Playback:
+    """Return what a page plays of an episode whose states and actions the environment's table names.
+
+    Of all its `steps`, which the environment can have, at most `limit` are shown, from step `first` on; the
+    values are those of the steps shown. `ended` is a key of `ENDINGS`.
+    """
     mdp, agents, drawing = recording.mdp, recording.agents, svg.drawing_of(recording.mdp)
-    distinct, at = np.unique(episode.states, return_inverse=True)
+    shown = steps[first : first + limit]
+    distinct, at = np.unique(np.append(shown["state"], shown["next_state"][-1]), return_inverse=True)
     grid = None
     if drawing is not None:
         grid = Grid(drawing.places(mdp, distinct).reshape(len(distinct), -1).tolist(), at.tolist())
     states = [str(word) for word in states_in_words(mdp)[distinct]]
-    deeds = deeds_in_words(mdp)
-    chosen = [agent_actions(mdp, action) for action in episode.actions.tolist()]
-    time = frame_times(episode.times)
+    deeds, actions = deeds_in_words(mdp), shown["action"].tolist()
+    taken = [actions] * len(values)
+    if len(values) > 1:  # each learner has a table of its own actions
+        taken = [list(own) for own in zip(*(agent_actions(mdp, action) for action in actions), strict=True)]
+    time = frame_times((shown["log_time"] // schema.STEP_NANOSECONDS).astype(np.int64))
+    before = steps["rewards"][:first].sum(axis=0).tolist() if first else []
     return Playback(
-        title=episode.title[0].upper() + episode.title[1:],
-        description=outcome_in_words(episode.length, episode.ended, episode.total),
-        length=episode.length,
-        first=episode.first,
-        end=ENDINGS[episode.ended],
+        title=place.title[0].upper() + place.title[1:],
+        description=outcome_in_words(len(steps), ended, float(steps["rewards"].sum())),
+        length=len(steps),
+        first=first,
+        end=ENDINGS[ended],
         agents=[spoken(agent) for agent in agents],
-        before=[short(value) for value in episode.before],
-        reward=short_rows(episode.rewards),
-        actions=[words("", "action", [deeds[action] for action in episode.actions.tolist()])],
+        before=[short(value) for value in before],
+        reward=short_rows(shown["rewards"]),
+        actions=[words("", "action", [deeds[action] for action in actions])],
         texts=[Words("", "state", states, at.tolist())],
         time=time,
-        logged=logged_near(recording, episode.phase, time),
+        logged=logged_near(recording, place.phase, time),
         events=[event_in_words(name) for name in mdp.event_names],
-        event=episode.events.tolist(),
-        explored=episode.explored.tolist(),
+        event=events_of(mdp, shown).tolist(),
+        explored=shown["explored"].tolist(),
         choices=[actions_in_words(mdp).tolist()] if len(agents) == 1 else numbered_actions(mdp),
-        values=[
-            _highest(
-                values, [own[i] for own in chosen] if len(episode.values) > 1 else episode.actions.tolist()
-            )
-            for i, values in enumerate(episode.values)
-        ],
+        values=[_highest(own, which) for own, which in zip(values, taken, strict=True)],
         grid=grid,
     )
+
+
+def _values(recording: Recording, steps: NDArray[np.void], table_step: int) -> QValues:
+    """Return each learner's Q-values in the states of steps; a trial has those after `table_step` steps."""
+    if not recording.has_tables:
+        return ()
+    try:
+        if table_step >= 0:
+            return tuple(table[steps["state"]] for table in tables_at(recording, table_step))
+        first = int(steps["step"][0])
+        replay = TableReplay(recording, first)
+        widths = [table.shape[1] for table in replay.tables]
+        rows = replay.rows(first + len(steps))
+    except RecordingError:
+        return ()
+    return tuple(rows[:, i, :width] for i, width in enumerate(widths))
 
 
 def _highest(values: NDArray[np.float64], taken: list[int]) -> dict[str, object]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.drawing import svg
+from runner.export.contents import ENDINGS
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.util.arrays import Array
@@ -122,6 +123,12 @@ def words(agent: str, name: str, texts: Iterable[str]) -> Words:
     numbers: dict[str, int] = {}
     at = [numbers.setdefault(text, len(numbers)) for text in texts]
     return Words(agent, name, list(numbers), at)
+
+
+def outcome_in_words(length: int, ended: str, total: float | None) -> str:
+    """Return length, end and return of an episode as text; a return of None is unknown."""
+    rewards = "" if total is None else f" Rewards sum to {total:g}."
+    return f"{length:,} step{'s' if length != 1 else ''}, {ENDINGS[ended]}.{rewards}"
 
 
 def frame_times(after: NDArray[np.int64]) -> list[int]:

@@ -22,10 +22,9 @@ from runner.environments.naming import spoken
 from runner.errors import RecordingError
 from runner.export.contents import flat_text, shortcomings, why_no_steps
 from runner.export.encoded import picture_note
-from runner.export.episodes import last_whole_evaluation, place_of, ranked, ranked_trials
+from runner.export.episodes import first_state, last_whole_evaluation, place_of, ranked, ranked_trials
 from runner.export.plots.curves import Plot, plots_of
 from runner.export.plots.metrics import PLAIN, CurveStyle
-from runner.export.reports.episode import episode_at
 from runner.export.reports.evaluations import EvaluationTable, evaluation_table
 from runner.export.reports.maps import MapRow, maps_of, stages_of
 from runner.export.reports.playback import MAX_VALUES, playback_of, titled
@@ -260,7 +259,7 @@ def _maps(recording: Recording, episode: tuple[int, ...] | None) -> list[MapRow]
     start = int(mdp.start.argmax())
     try:
         if episode is not None:
-            start = int(episode_at(recording, place_of(recording, episode), 1).states[0])
+            start = first_state(recording, episode)
         return maps_of(mdp, recording.agents, stages_of(recording), start)
     except RecordingError:
         return []
