@@ -6,10 +6,14 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Final
 
+import numpy as np
+
 from runner.errors import NotInRecording, RecordingError
 from runner.recording import schema
+from runner.recording.messages import Message
 from runner.recording.metadata import RECORDING_STOPPED
 from runner.recording.reader import Recording
+from runner.util.arrays import Records
 from runner.util.values import flatten, is_whole
 
 ENDINGS: Final = {
@@ -22,6 +26,10 @@ ENDINGS: Final = {
 }
 """How an episode may end, and its description."""
 
+Step = np.void | Message
+"""A step: a record, or the fields of a message where values vary in size."""
+Steps = Records | list[Message]
+"""Consecutive steps."""
 Ranges = tuple[tuple[int, int | None], ...]
 """Ranges of episodes: the first, and the one after the last or None for the end."""
 

@@ -10,7 +10,7 @@ Where the environment must be made again, that is done in a child process, which
 from __future__ import annotations
 
 import io
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from contextlib import closing
 from pathlib import Path
 from typing import Final
@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import CannotRedo
-from runner.export.painting import EnvironmentDiffers, Painted, paint_observation, paint_redrawn
-from runner.export.pictures import Source, source_of, source_of_recorded
+from runner.export.pictures import Source, paint, source_of
 from runner.export.reports.rendering import sentence
 from runner.recording.reader import Recording, open_recording
 from runner.replay.steps import recorded_frames
@@ -55,40 +54,19 @@ def encoded_pictures(
             recording has no pictures of its own.
     """
     with open_recording(path) as recording:
-        source, reason = source_of(recording, phase, episode=episode)
+        source, reason, has_failed, painted = paint(recording, phase, episode, first=start)
         if source is Source.VALUES:
             raise CannotRedo(f"There is no picture. {reason}")
-        if source is Source.REDRAWN:
-            has_begun = False
-            try:
-                for data in _painted(paint_redrawn(recording, phase, episode, first=start)):
-                    has_begun = True
-                    yield data
-            except (CannotRedo, EnvironmentDiffers) as error:
-                source = source_of_recorded(recording, phase, episode)
-                if has_begun or source is Source.VALUES:
-                    raise CannotRedo(str(error)) from error
-                yield f"These are the {source}. {error}"
+        if has_failed:
+            yield f"These are the {source}. {reason}"
         if source is Source.RECORDED:
-            yield from _recorded(recording, phase, episode, start)
-        elif source is Source.OBSERVATION:
-            yield from _painted(paint_observation(recording, phase, episode), start)
-
-
-def _painted(painted: Painted, start: int = 0) -> Iterator[bytes]:
-    """Yield pictures as files, from number `start` on."""
-    with closing(painted):
-        for k, pixels in enumerate(painted):
-            if k >= start:
-                yield encoded_picture(pixels)
-
-
-def _recorded(recording: Recording, phase: str, episode: int, start: int) -> Iterator[bytes]:
-    """Yield the last frame at each step."""
-    shown = None
-    for frame in recorded_frames(recording, phase, episode, start):
-        yield b"" if frame is shown else frame["data"]
-        shown = frame
+            last = None
+            for frame in recorded_frames(recording, phase, episode, start):
+                yield b"" if frame is last else frame["data"]
+                last = frame
+        elif source is not Source.SCENE:
+            with closing(painted):
+                yield from map(encoded_picture, painted)
 
 
 def encoded_picture(pixels: NDArray[np.uint8]) -> bytes:

@@ -14,16 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.export.contents import Ranges
+from runner.export.contents import Ranges, Step, Steps
 from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.reader import Recording
 from runner.recording.spaces import Description, Value
+from runner.util.arrays import Array, Records
 
 MAX_EPISODE_BYTES: Final = 1 << 30
 """The limit of one episode, which Minari needs in memory."""
-Steps = NDArray[np.void] | list[Message]
-"""Records of one size, or mappings where values vary in size."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ def episodes_in(recording: Recording, phase: str, ranges: Ranges) -> Iterator[Ep
         seed, first = resets.before(environment, steps)
         resets.keep_last(environment, steps[-1])
         if lengths.get(int(steps[-1]["step"])) == len(steps):
-            if recording.kind == "step":
+            if isinstance(steps, np.ndarray) and recording.kind == "step":
                 yield _discrete_episode(recording, steps, seed)
             elif first is not None:
                 yield _episode(recording, steps, first, seed)
@@ -112,7 +111,7 @@ class _Resets:
         key = environment, int(steps[0]["episode"])
         return self._read.pop(key, (None, self._last.get(environment)))
 
-    def keep_last(self, environment: int, step: np.void | Message) -> None:
+    def keep_last(self, environment: int, step: Step) -> None:
         """Keep the last observation of an environment, since an episode may continue after its end."""
         if self._has_observations:
             self._last[environment] = _copy(step["next_observation"])
@@ -125,13 +124,13 @@ def _copy(value: Value) -> Value:
 
 def _fixed_steps(
     recording: Recording, phase: str, lengths: Mapping[int, int]
-) -> Iterator[tuple[int, NDArray[np.void]]]:
+) -> Iterator[tuple[int, Records]]:
     """Yield environment and steps of each episode; the last one of an environment may not have ended."""
     topic, n = recording.topic(f"/{phase}/step"), recording.environments
     first = max(min(last - (length - 1) * n for last, length in lengths.items()), 0)
-    open_parts: dict[int, list[NDArray[np.void]]] = {environment: [] for environment in range(n)}
+    open_parts: dict[int, list[Records]] = {environment: [] for environment in range(n)}
     for block in recording.blocks(topic, first, max(lengths) + 1):
-        ended: list[tuple[int, NDArray[np.void]]] = []
+        ended: list[tuple[int, Records]] = []
         for environment, parts in open_parts.items():
             rows = block[(environment - int(block["step"][0])) % n :: n]
             rows = rows[rows["t"] != schema.RESET_ONLY]
@@ -141,9 +140,7 @@ def _fixed_steps(
     yield from ((environment, np.concatenate(parts)) for environment, parts in open_parts.items() if parts)
 
 
-def _extend(
-    recording: Recording, parts: list[NDArray[np.void]], part: NDArray[np.void]
-) -> Iterator[NDArray[np.void]]:
+def _extend(recording: Recording, parts: list[Records], part: Records) -> Iterator[Records]:
     """Add steps to the parts of the current episode; yield it if they belong to another one, or end it."""
     if not len(part):
         return
@@ -172,7 +169,7 @@ def _variable_steps(
             return
 
 
-def _discrete_episode(recording: Recording, steps: Any, seed: int | None) -> Episode:
+def _discrete_episode(recording: Recording, steps: Records, seed: int | None) -> Episode:
     """Return an episode whose observations and actions are numbered from 0 in the recording."""
     observed, acted = recording.spaces["observation"], recording.spaces["action"]
     states = np.append(steps["state"], steps["next_state"][-1:]).astype(np.int64)
@@ -203,7 +200,7 @@ def _column(steps: Steps, name: str) -> Value:
     return steps[name] if name in (steps.dtype.names or ()) else np.ones(len(steps), np.uint32)
 
 
-def _split(description: Description, values: NDArray[Any]) -> Value:
+def _split(description: Description, values: Array) -> Value:
     """Return records as dictionaries and tuples of arrays."""
     if description["type"] == "Dict":
         return {name: _split(part, values[name]) for name, part in description["spaces"].items()}

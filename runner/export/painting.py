@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from runner.drawing import svg
 from runner.drawing.bars import BarRaster
 from runner.drawing.raster import Pixels, SceneRaster
-from runner.errors import RecordingError
+from runner.errors import CannotRedo, RecordingError
 from runner.export.values import Values
 from runner.recording import schema
 from runner.recording.messages import Message
@@ -30,10 +30,6 @@ MAX_PIXELS: Final = 4096 * 4096
 """The most pixels of a recorded frame."""
 
 Painted = Generator[Pixels, None, None]
-
-
-class EnvironmentDiffers(Exception):
-    """An environment that was made again does not do what was recorded; the message is where."""
 
 
 def paint_scene(recording: Recording, phase: str, episode: int) -> Painted:
@@ -110,8 +106,8 @@ def redrawn(
         the number of an episode, how many of its steps were taken, and the picture after them.
 
     Raises:
-        CannotRedo: the environment cannot be made again, or draws no pictures.
-        EnvironmentDiffers: it differs from the recording, of which no picture comes after that step.
+        CannotRedo: the environment cannot be made again, draws no pictures, or differs from the recording, of
+            which no picture comes after that step.
     """
     from runner.replay.environment import redo_in_child  # loads Gymnasium
 
@@ -132,9 +128,9 @@ def redrawn(
                 yield episode, t, frame
                 t += 1
             if differs is not None and (differs.phase, differs.episode) != (phase, episode):
-                raise EnvironmentDiffers(f"The environment differs from the recording before, at {differs}.")
+                raise CannotRedo(f"The environment differs from the recording before, at {differs}.")
             if differs is not None:
-                raise EnvironmentDiffers(
+                raise CannotRedo(
                     f"At step {differs.t + 1:,} the environment differs from the recording: {differs.field}: "
                     f"recorded {differs.recorded}, got {differs.got}."
                 )

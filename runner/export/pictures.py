@@ -11,10 +11,12 @@ observations that are images; or else the numbers of the observations as bars.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from itertools import chain, islice
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -23,9 +25,8 @@ from runner.drawing.raster import Pixels, require_packages
 from runner.environments.mdp import events_of
 from runner.environments.naming import deeds_in_words, events_in_words, exploration_in_words
 from runner.errors import CannotRedo
-from runner.export.contents import ENDINGS, ending_of, require_steps
+from runner.export.contents import ENDINGS, Step, ending_of, require_steps
 from runner.export.painting import (
-    EnvironmentDiffers,
     Painted,
     paint_observation,
     paint_recorded,
@@ -91,8 +92,7 @@ class Pictures:
         self._recording, self._phase, self._episode = recording, phase, episode
         self.learners = recording.agents
         self.steps = len(recording.episode_span(phase, episode))
-        self.source, self.reason = source_of(recording, phase, trust, episode)
-        self._painted = self._begin(trust)
+        self.source, self.reason, _, self._painted = paint(recording, phase, episode, trust)
         self._pictures = self._generate()
 
     def __iter__(self) -> Iterator[Picture]:
@@ -106,19 +106,6 @@ class Pictures:
         self._pictures.close()
         self._painted.close()
 
-    def _begin(self, trust: bool) -> Painted:
-        """Return the painted states; from something else where the environment turns out not to draw them."""
-        where = self._recording, self._phase, self._episode
-        if self.source is not Source.REDRAWN:
-            return _PAINTERS[self.source](*where)
-        painted = paint_redrawn(*where, trust)
-        try:
-            return _resumed(next(painted), painted)
-        except (CannotRedo, EnvironmentDiffers) as error:
-            painted.close()
-            self.source, self.reason = source_of_recorded(*where), str(error)
-        return _PAINTERS[self.source](*where)
-
     def _generate(self) -> Generator[Picture, None, None]:
         recording, phase, episode = self._recording, self._phase, self._episode
         describe, painted = describer(recording, phase), self._painted
@@ -130,7 +117,7 @@ class Pictures:
             note = ""
             try:
                 pixels = next(painted)
-            except (CannotRedo, EnvironmentDiffers) as error:
+            except CannotRedo as error:
                 note = str(error)
             action, events = describe(row)
             rewards = np.asarray(row["rewards"], np.float64)
@@ -190,7 +177,7 @@ def source_of_recorded(recording: Recording, phase: str, episode: int | None) ->
     return Source.VALUES
 
 
-_PAINTERS = {
+_PAINTERS: Final = {
     Source.SCENE: paint_scene,
     Source.RECORDED: paint_recorded,
     Source.OBSERVATION: paint_observation,
@@ -198,22 +185,46 @@ _PAINTERS = {
 }
 
 
-def _resumed(first: Pixels, painted: Painted) -> Painted:
-    """Yield a picture, and those that follow it."""
-    try:
-        yield first
-        yield from painted
-    finally:
-        painted.close()
+class Painting(NamedTuple):
+    """The painted states of an episode."""
+
+    source: Source
+    reason: str
+    """Why the environment does not draw them, as a sentence; empty if it does, or has no need to."""
+    has_failed: bool
+    """Whether it turned out not to draw them, although it could be made again."""
+    pictures: Painted
 
 
-def describer(recording: Recording, phase: str) -> Callable[[Any], tuple[str, str]]:
+def paint(recording: Recording, phase: str, episode: int, trust: bool = False, first: int = 0) -> Painting:
+    """Return the painted states of an episode from number `first` on, of the best source that works."""
+    source, reason = source_of(recording, phase, trust, episode)
+    has_failed = False
+    if source is Source.REDRAWN:
+        redrawn = paint_redrawn(recording, phase, episode, trust, first)
+        try:
+            begun = chain([next(redrawn)], redrawn)
+            return Painting(source, "", has_failed, _ending_with(redrawn, begun))
+        except CannotRedo as error:
+            redrawn.close()
+            source, reason, has_failed = source_of_recorded(recording, phase, episode), str(error), True
+    painted = _PAINTERS[source](recording, phase, episode)
+    return Painting(source, reason, has_failed, _ending_with(painted, islice(painted, first, None)))
+
+
+def _ending_with(painted: Painted, pictures: Iterable[Pixels]) -> Painted:
+    """Yield pictures taken from painted ones; closing them closes those too."""
+    with closing(painted):
+        yield from pictures
+
+
+def describer(recording: Recording, phase: str) -> Callable[[Step], tuple[str, str]]:
     """Return how to put a step's action, and what happened in it, in words."""
     if recording.tabular:
         mdp, learners = recording.mdp, recording.agents
         deeds = deeds_in_words(mdp)
 
-        def describe(row: Any) -> tuple[str, str]:
+        def describe(row: Step) -> tuple[str, str]:
             step = np.asarray(row).reshape(1)
             check_steps(step, mdp, str(recording.path))
             events = events_in_words(mdp, int(events_of(mdp, step)[0]))
@@ -224,7 +235,7 @@ def describer(recording: Recording, phase: str) -> Callable[[Any], tuple[str, st
     in_words = action_in_words(recording, phase)
     texts, agents = Values(recording.spaces["observation"], "observation"), recording.agents
 
-    def describe_values(row: Any) -> tuple[str, str]:
+    def describe_values(row: Step) -> tuple[str, str]:
         action = row["action"]
         if len(agents) > 1:
             action = {agent: action[agent] for i, agent in enumerate(agents) if int(row["acted"]) >> i & 1}

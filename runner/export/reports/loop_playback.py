@@ -6,16 +6,15 @@ Only what the page shows is kept in memory: not the other steps, and nothing of 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.environments.naming import spoken
 from runner.errors import RecordingError, shortened
-from runner.export.contents import ENDINGS, ending_of
+from runner.export.contents import ENDINGS, Step, Steps, ending_of
 from runner.export.episodes import EpisodePlace, no_step
 from runner.export.reports.player_data import (
     Playback,
@@ -31,9 +30,10 @@ from runner.export.reports.player_data import (
 from runner.export.values import action_in_words, is_image
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.recording.spaces import leaves_of
+from runner.recording.spaces import Value, leaves_of
 from runner.replay.steps import reset_of
 from runner.replay.whole_steps import whole_steps
+from runner.util.arrays import Array
 
 MAX_SERIES: Final = 32
 _LEAST_SERIES: Final = 20
@@ -41,7 +41,9 @@ _LEAST_SERIES: Final = 20
 _MAX_LETTERS: Final = 200
 """Letters of a text that are shown."""
 
-Column = NDArray[Any] | list[str]
+Values = Array | list[Value]
+"""Values of a space, of one size or not."""
+Column = Array | list[str]
 """A part of a value at each of T steps: numbers [T, n], or texts."""
 
 
@@ -56,13 +58,12 @@ class _ShownPart:
     path: tuple[str, ...]
     is_text: bool
 
-    def column(self, values: Any) -> Column:
-        """Return this part of T values: records, arrays, or decoded values."""
+    def column(self, values: Values) -> Column:
+        """Return this part of T values."""
         if not isinstance(values, list):
             for name in self.path:
                 values = values[name]
-            numbers: NDArray[Any] = values.reshape(len(values), -1)[:, : len(self.names)]
-            return numbers.copy()
+            return values.reshape(len(values), -1)[:, : len(self.names)].copy()
         for name in self.path:
             values = [each[int(name) if isinstance(each, tuple) else name] for each in values]
         if self.is_text:
@@ -70,34 +71,40 @@ class _ShownPart:
         return np.array(values).reshape(len(values), -1)[:, : len(self.names)]
 
 
-@dataclass(frozen=True)
-class _Steps:
-    """T consecutive steps of an episode; what is shown of the actions and of the observations after them."""
-
-    rewards: NDArray[np.float64]
-    """[T, agents]."""
-    log_time: NDArray[np.int64]
-    actions: dict[str, list[str]]
-    """Of each agent, or of the only one under an empty name."""
-    observations: list[Column]
-
-
 def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: int) -> Playback:
     """Return what a page plays of an episode: at most `limit` steps from step `first` on."""
     span = recording.episode_span(place.phase, place.number)
     if not 0 <= first < len(span):
         raise no_step(recording, place.title, len(span), first)
+    part = span[first : first + limit]
     observed, notes = _shown_parts(recording)
-    reader = _Reader(recording, place.phase, observed)
-    before, steps = reader.part(place.number, span, first, limit)
-    time = frame_times(steps.log_time // schema.STEP_NANOSECONDS)
+    in_words = _actions_in_words(recording, place.phase)
+    before = np.zeros(len(recording.agents))
+    rewards, log_times = [np.empty((0, len(before)))], [np.empty(0, np.int64)]
+    actions: dict[str, list[str]] = {agent: [] for agent in in_words}
+    observations = [_observations_before(recording, place, span, first, observed)]
+    for steps in _steps(recording, place, range(span.start, part[-1] + 1, span.step)):
+        paid = np.array([step["rewards"] for step in steps], np.float64)
+        earlier = int(np.searchsorted([step["step"] for step in steps], part.start))
+        before += paid[:earlier].sum(axis=0)
+        if earlier < len(steps):
+            shown = steps[earlier:]
+            rewards.append(paid[earlier:])
+            log_times.append(np.array([step["log_time"] for step in shown], np.int64))
+            for agent, text_of in in_words.items():
+                actions[agent] += [shortened(text_of(step), _MAX_LETTERS) for step in shown]
+            observations.append(_observations(recording, shown, observed))
+    reward, time = np.concatenate(rewards), np.concatenate(log_times)
+    if len(reward) != len(part):
+        raise RecordingError(f"{recording.path}: steps of this part of the episode were lost.")
+    frames = frame_times(time // schema.STEP_NANOSECONDS)
     ended = ending_of(recording, place.phase, place.number)
     total = None
     if ended != "cut off":
         total = float(recording.episodes(place.phase, place.number, place.number + 1)["returns"].sum())
     elif first + limit >= len(span):
-        total = float(before.sum() + steps.rewards.sum())
-    texts, series = _frames(observed, reader.before(place, span, first), steps.observations)
+        total = float(before.sum() + reward.sum())
+    texts, series = _frames(observed, observations)
     title = place.title[0].upper() + place.title[1:]
     return Playback(
         title=title if span.step == 1 else f"{title}, in environment {span.start % span.step}",
@@ -107,116 +114,72 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
         end=ENDINGS[ended],
         agents=[spoken(agent) for agent in recording.agents],
         before=[short(value) for value in before.tolist()] if first else [],
-        reward=short_rows(steps.rewards),
-        actions=[words(agent, "action", texts) for agent, texts in steps.actions.items()],
+        reward=short_rows(reward),
+        actions=[words(agent, "action", own) for agent, own in actions.items()],
         texts=texts,
-        time=time,
-        series=[*series, *_extras(recording, place.phase, span[first : first + limit], notes)],
+        time=frames,
+        series=[*series, *_extras(recording, place.phase, part, notes)],
         notes=notes,
-        logged=logged_near(recording, place.phase, time),
+        logged=logged_near(recording, place.phase, frames),
     )
 
 
-class _Reader:
-    """Reads steps of a phase."""
-
-    def __init__(self, recording: Recording, phase: str, observed: Sequence[_ShownPart]) -> None:
-        self._recording, self._phase, self._observed = recording, phase, observed
-
-    def part(self, episode: int, span: range, first: int, limit: int) -> tuple[NDArray[np.float64], _Steps]:
-        """Return the sum of each agent's rewards before a part of an episode, and the steps of the part."""
-        part = span[first : first + limit]
-        before, found = np.zeros(len(self._recording.agents)), []
-        for records in self._records(episode, range(span.start, part[-1] + 1, span.step)):
-            numbers = np.array([record["step"] for record in records])
-            rewards = np.array([record["rewards"] for record in records], np.float64)
-            earlier = int(np.searchsorted(numbers, part.start))
-            before += rewards[:earlier].sum(axis=0)
-            if earlier < len(records):
-                found.append(self._steps(records[earlier:], rewards[earlier:]))
-        if sum(len(steps.rewards) for steps in found) != len(part):
-            raise RecordingError(f"{self._recording.path}: steps of this part of the episode were lost.")
-        return before, _joined(found)
-
-    def before(self, place: EpisodePlace, span: range, first: int) -> list[Column]:
-        """Return the observation before a step of an episode, as columns of one value; empty if unknown."""
-        if first:
-            number = span[first - 1]
-            records = next(self._records(place.number, range(number, number + 1, span.step)), None)
-            return [] if records is None or not len(records) else self._observations(records)
-        reset = reset_of(self._recording, place.phase, place.number)
-        if reset is None:
-            return []
-        value = reset["observation"]
-        values = [value] if self._recording.kind == "variable" else np.array([value])
-        return [part.column(values) for part in self._observed]
-
-    def _records(self, episode: int, numbers: range) -> Iterator[Any]:
-        """Yield the steps of an episode with these numbers, some at a time."""
-        recording, phase = self._recording, self._phase
-        if recording.has_actions_alone(phase):
-            steps = whole_steps(recording, phase, episode)
-            yield steps[(steps["step"] >= numbers.start) & (steps["step"] < numbers.stop)]
-            return
-        if recording.kind != "variable":
-            for block in recording.blocks(recording.topic(f"/{phase}/step"), numbers.start, numbers.stop):
-                yield block[(numbers.start - int(block["step"][0])) % numbers.step :: numbers.step]
-            return
+def _steps(recording: Recording, place: EpisodePlace, numbers: range) -> Iterator[Steps]:
+    """Yield the steps of an episode with these numbers, some at a time."""
+    phase = place.phase
+    if recording.has_actions_alone(phase):
+        steps = whole_steps(recording, phase, place.number)
+        yield steps[(steps["step"] >= numbers.start) & (steps["step"] < numbers.stop)]
+    elif recording.kind != "variable":
+        for block in recording.blocks(recording.topic(f"/{phase}/step"), numbers.start, numbers.stop):
+            yield block[(numbers.start - int(block["step"][0])) % numbers.step :: numbers.step]
+    else:
         for step in recording.transitions(phase):
             if step["step"] >= numbers.stop:
                 return
             if step["step"] >= numbers.start:
                 yield [step]
 
-    def _steps(self, records: Any, rewards: NDArray[np.float64]) -> _Steps:
-        return _Steps(
-            rewards=rewards,
-            log_time=np.array([record["log_time"] for record in records], np.int64),
-            actions=self._actions(records),
-            observations=self._observations(records),
-        )
 
-    def _actions(self, records: Any) -> dict[str, list[str]]:
-        """Return the actions of each agent in words; a dash where it took no part."""
-        agents = self._recording.agents
-        if len(agents) == 1:
-            in_words = action_in_words(self._recording, self._phase)
-            return {"": [shortened(in_words(record["action"]), _MAX_LETTERS) for record in records]}
-        words_of = {agent: action_in_words(self._recording, self._phase, agent) for agent in agents}
-        return {
-            agent: [
-                shortened(words_of[agent](record["action"][agent]), _MAX_LETTERS)
-                if int(record["acted"]) >> i & 1
-                else "–"
-                for record in records
-            ]
-            for i, agent in enumerate(agents)
-        }
+def _actions_in_words(recording: Recording, phase: str) -> dict[str, Callable[[Step], str]]:
+    """Return by agent how to put its action of a step in words: a dash where it took no part."""
+    agents = recording.agents
+    if len(agents) == 1:
+        in_words = action_in_words(recording, phase)
+        return {"": lambda step: in_words(step["action"])}
 
-    def _observations(self, records: Any) -> list[Column]:
-        """Return what is shown of the observations after steps."""
-        if self._recording.kind == "step":
-            start = self._recording.spaces["observation"]["start"]
-            after = records["next_state"].astype(np.int64) + start
-        elif isinstance(records, list):
-            after = [record["next_observation"] for record in records]
-        else:
-            after = records["next_observation"]
-        return [part.column(after) for part in self._observed]
+    def text_of(number: int, agent: str) -> Callable[[Step], str]:
+        own = action_in_words(recording, phase, agent)
+        return lambda step: own(step["action"][agent]) if int(step["acted"]) >> number & 1 else "–"
+
+    return {agent: text_of(number, agent) for number, agent in enumerate(agents)}
 
 
-def _joined(found: Sequence[_Steps]) -> _Steps:
-    def join(columns: Sequence[Column]) -> Column:
-        if isinstance(columns[0], list):
-            return [text for column in columns for text in column]
-        return np.concatenate(columns)
+def _observations_before(
+    recording: Recording, place: EpisodePlace, span: range, first: int, observed: Sequence[_ShownPart]
+) -> list[Column]:
+    """Return the observation before a step of an episode, as columns of one value; empty if unknown."""
+    if first:
+        number = span[first - 1]
+        steps = next(_steps(recording, place, range(number, number + 1, span.step)), [])
+        return _observations(recording, steps, observed) if len(steps) else []
+    reset = reset_of(recording, place.phase, place.number)
+    if reset is None:
+        return []
+    value = reset["observation"]
+    return [part.column([value] if recording.kind == "variable" else np.array([value])) for part in observed]
 
-    return _Steps(
-        np.concatenate([steps.rewards for steps in found]),
-        np.concatenate([steps.log_time for steps in found]),
-        {agent: [text for steps in found for text in steps.actions[agent]] for agent in found[0].actions},
-        [join(columns) for columns in zip(*(steps.observations for steps in found), strict=True)],
-    )
+
+def _observations(recording: Recording, steps: Steps, observed: Sequence[_ShownPart]) -> list[Column]:
+    """Return what is shown of the observations after steps, as columns."""
+    after: Values
+    if isinstance(steps, list):
+        after = [step["next_observation"] for step in steps]
+    elif recording.kind == "step":
+        after = steps["next_state"].astype(np.int64) + recording.spaces["observation"]["start"]
+    else:
+        after = steps["next_observation"]
+    return [part.column(after) for part in observed]
 
 
 def _extras(recording: Recording, phase: str, part: range, notes: list[str]) -> list[Series]:
@@ -279,18 +242,22 @@ def _index(number: int, shape: tuple[int, ...]) -> str:
 
 
 def _frames(
-    parts: Sequence[_ShownPart], first: Sequence[Column], after: Sequence[Column]
+    parts: Sequence[_ShownPart], observations: Sequence[Sequence[Column]]
 ) -> tuple[list[Words], list[Series]]:
-    """Return the texts and the numbers of T + 1 frames from the first observation and those after steps."""
+    """Return the texts and the numbers of T + 1 frames.
+
+    The observations are columns of each part: at first those before the steps, none if unknown.
+    """
     texts, series = [], []
     for i, part in enumerate(parts):
-        own: Any = after[i]
-        start: Any = first[i] if first else None
+        columns = [each[i] for each in observations if each]
+        name = part.names[0] or "observation"
         if part.is_text:
-            texts.append(words(part.agent, part.names[0] or "observation", [*(start or [""]), *own]))
+            unknown = [] if observations[0] else [""]
+            texts.append(words(part.agent, name, [*unknown, *(text for each in columns for text in each)]))
             continue
-        for k, name in enumerate(part.names):
-            begin = [None] if start is None else [short(float(start[0, k]))]
-            numbers = [*begin, *(short(value) for value in own[:, k].astype(np.float64).tolist())]
-            series.append(Series(part.agent, "observation", name or "observation", numbers))
+        numbers = np.concatenate(columns).astype(np.float64)
+        for name, own in zip(part.names, numbers.T.tolist(), strict=True):
+            values = [*([] if observations[0] else [None]), *map(short, own)]
+            series.append(Series(part.agent, "observation", name or "observation", values))
     return texts, series

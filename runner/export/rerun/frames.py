@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 
 from runner.errors import CannotRedo
 from runner.export.encoded import encoded_picture
-from runner.export.painting import EnvironmentDiffers, redrawn
+from runner.export.painting import redrawn
 from runner.export.pictures import Source, source_of
 from runner.export.rerun.members import entity_name
 from runner.export.rerun.selection import MAX_MEMBERS
@@ -82,7 +82,7 @@ class FrameSender:
                 if t == len(times):  # nothing is shown until the next picture
                     self._stream.set_time("step", sequence=step + len(self._names))
                     self._stream.log(self._entity(phase, environment), rr.Clear(recursive=False))
-        except (CannotRedo, EnvironmentDiffers) as error:
+        except CannotRedo as error:
             yield f"No {phase} pictures from episode {number} on: {error}"
 
     def _send(self, phase: str, environment: int, step: int, data: bytes, is_each_step: bool) -> None:
