@@ -19,7 +19,7 @@ from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.reader import Recording
 from runner.recording.spaces import Description, Value
-from runner.util.arrays import Array, Records
+from runner.util.arrays import Records
 
 MAX_EPISODE_BYTES: Final = 1 << 30
 """The limit of one episode, which Minari needs in memory."""
@@ -200,7 +200,7 @@ def _column(steps: Steps, name: str) -> Value:
     return steps[name] if name in (steps.dtype.names or ()) else np.ones(len(steps), np.uint32)
 
 
-def _split(description: Description, values: Array) -> Value:
+def _split(description: Description, values: NDArray[Any]) -> Value:
     """Return records as dictionaries and tuples of arrays."""
     if description["type"] == "Dict":
         return {name: _split(part, values[name]) for name, part in description["spaces"].items()}

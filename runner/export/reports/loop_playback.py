@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runner.environments.naming import spoken
 from runner.errors import RecordingError, shortened
@@ -41,7 +42,7 @@ _LEAST_SERIES: Final = 20
 _MAX_LETTERS: Final = 200
 """Letters of a text that are shown."""
 
-Values = Array | list[Value]
+Values = NDArray[Any] | list[Value]
 """Values of a space, of one size or not."""
 Column = Array | list[str]
 """A part of a value at each of T steps: numbers [T, n], or texts."""
@@ -61,9 +62,10 @@ class _ShownPart:
     def column(self, values: Values) -> Column:
         """Return this part of T values."""
         if not isinstance(values, list):
+            part = values
             for name in self.path:
-                values = values[name]
-            return values.reshape(len(values), -1)[:, : len(self.names)].copy()
+                part = part[name]
+            return part.reshape(len(part), -1)[:, : len(self.names)].copy()
         for name in self.path:
             values = [each[int(name) if isinstance(each, tuple) else name] for each in values]
         if self.is_text:

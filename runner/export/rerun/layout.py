@@ -58,7 +58,7 @@ _AGENT_GAP: Final = 2.0
 
 @dataclass(frozen=True, eq=False)
 class RunView:
-    """The properties of a run that decide which views it has."""
+    """What decides which views a tabular run has, and what is sent for them."""
 
     root: str
     """Entity path of everything of the run; empty for the root."""
@@ -76,7 +76,9 @@ class RunView:
         if self.has_values:
             _draw_table(stream, f"{self.root}/table/words", self.mdp)
         if self.scene is not None:
-            draw_scene(stream, self.root, self.scene)
+            _draw_grid(stream, f"{self.root}/scene", self.scene)
+            if self.scene.placements is not None:
+                _draw_blocks(stream, f"{self.root}/frame", self.scene.placements)
 
     def grid_view(self) -> rrb.View:
         """Return the view of the grid; without a scene that of state and action as lines."""
@@ -85,7 +87,10 @@ class RunView:
             return self._view(
                 rrb.TimeSeriesView, f"{self.title}: state and action", entities, axis_x=whole_axis(self.last)
             )
-        bounds = grid_bounds(self.scene)
+        bounds = rrb.VisualBounds2D(
+            x_range=(-GRID_MARGIN, self.scene.columns + GRID_MARGIN),
+            y_range=(-GRID_MARGIN - 0.1, self.scene.rows + GRID_MARGIN + 0.1),
+        )
         entities = ["scene/**", "train/grid/**", "eval/grid/**", "notice/**"]
         return self._view(rrb.Spatial2DView, self.title, entities, visual_bounds=bounds)
 
@@ -193,21 +198,6 @@ def bar_rows(mdp: Mdp) -> list[NDArray[np.float64]]:
         rows.append(np.arange(count, dtype=np.float64) + top)
         top += count + _AGENT_GAP
     return rows
-
-
-def grid_bounds(scene: Scene) -> rrb.VisualBounds2D:
-    """Return the part of the plane that a view of the grid shows."""
-    return rrb.VisualBounds2D(
-        x_range=(-GRID_MARGIN, scene.columns + GRID_MARGIN),
-        y_range=(-GRID_MARGIN - 0.1, scene.rows + GRID_MARGIN + 0.1),
-    )
-
-
-def draw_scene(stream: rr.RecordingStream, root: str, scene: Scene) -> None:
-    """Log what never changes in the scene of a run: cells, walls and landmarks, and the frames of maps."""
-    _draw_grid(stream, f"{root}/scene", scene)
-    if scene.placements is not None:
-        _draw_blocks(stream, f"{root}/frame", scene.placements)
 
 
 def _draw_table(stream: rr.RecordingStream, path: str, mdp: Mdp) -> None:

@@ -34,9 +34,7 @@ class LiveStream:
         labels.log(stream, "")
         view.draw_background(stream)
         self._metrics = MetricWriter(stream, "", learners, mdp.event_names)
-        self._steps = {
-            phase: StepWriter(stream, "", phase, mdp, view.scene, labels) for phase in schema.PHASES
-        }
+        self._steps = {phase: StepWriter(stream, view, phase, labels) for phase in schema.PHASES}
         self._rewards = set(np.unique(mdp.rewards_of(len(learners))).tolist())
         self._rewards |= set(np.unique(mdp.summed_rewards).tolist())
         self._phase = "train"

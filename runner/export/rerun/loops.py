@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from runner.export.rerun.columns import MAX_ROWS, Batch, Sender, scalars
 from runner.export.rerun.frames import FrameSender
 from runner.export.rerun.labels import Labels
-from runner.export.rerun.layout import draw_scene, grid_bounds, whole_axis
+from runner.export.rerun.layout import RunView, whole_axis
 from runner.export.rerun.members import Member, entity_name, members_of, numbers_in
 from runner.export.rerun.metrics import line_colours, phase_colours, series_lines
 from runner.export.rerun.runs import Source
@@ -47,9 +47,14 @@ class LoopExporter:
         self._recording = recording
         self._selection = selection
         self._root, self._title = root, source.title
-        self._scene = scene_of(recording.mdp) if recording.tabular else None
+        scene = scene_of(recording.mdp) if recording.tabular else None
+        self._grid: tuple[RunView, Labels] | None = None
+        """The view of its grid, and the labels there; None where the states have no scene."""
+        if scene is not None:
+            view = RunView(root, source.title, recording.mdp, scene, recording.agents)
+            self._grid = view, Labels(recording.mdp, scene, recording.agents)
         self._is_game = len(recording.agents) > 1
-        self._members = members_of(recording, self._scene is not None)
+        self._members = members_of(recording, scene is not None)
         self._plots: dict[str, dict[str, list[str]]] = {_OVERVIEW: {}}
         """The entities that views show as lines, by tab and title."""
         self._drawn: set[str] = set()
@@ -69,11 +74,8 @@ class LoopExporter:
         """Return the arrangement of what `export` has sent."""
         root, title = self._root, self._title
         left: list[tuple[Any, int]] = []  # views and their shares of the height
-        if self._scene is not None:
-            contents = [f"{root}/scene/**", *(f"{root}/{phase}/grid/**" for phase in schema.PHASES)]
-            bounds = grid_bounds(self._scene)
-            grid = rrb.Spatial2DView(origin=f"{root}/", contents=contents, visual_bounds=bounds, name=title)
-            left.append((grid, 4))
+        if self._grid is not None:
+            left.append((self._grid[0].grid_view(), 4))
         left += [(view, 3) for view in self._frames.views()]
         left += [
             (rrb.TensorView(origin=f"{root}/array/{name}", name=name), 2)
@@ -109,18 +111,16 @@ class LoopExporter:
         self._send_logged()
         self._send_texts()
         self._send_arrays()
-        if self._scene is not None:
-            labels = Labels(recording.mdp, self._scene, recording.agents)
+        if self._grid is not None:
+            view, labels = self._grid
             labels.log(self._stream, self._root)
-            draw_scene(self._stream, self._root, self._scene)
-        else:
-            labels = None
+            view.draw_background(self._stream)
         spans = {"train": self._selection.train, "eval": [span for _, span in self._selection.evaluations]}
         for phase in schema.PHASES:
             if recording.kind == "variable":
                 self._send_rewards(phase, spans[phase])
             else:
-                self._send_steps(phase, spans[phase], labels)
+                self._send_steps(phase, spans[phase])
 
     def draw_frames(self, trust: bool, stage: Callable[[str], None]) -> None:
         """Send pictures of the chosen episodes that the environment draws; report what is missing."""
@@ -179,11 +179,11 @@ class LoopExporter:
             self._arrays[name] = None
             self._log(time, f"array/{name}", rr.Tensor(np.atleast_1d(array.values)))
 
-    def _send_steps(self, phase: str, spans: Sequence[Span], labels: Labels | None) -> None:
+    def _send_steps(self, phase: str, spans: Sequence[Span]) -> None:
         """Send steps of every environment and agent, in all their views."""
         recording = self._recording
         grid: StepWriter | None = None
-        training_ends = self._training_ends() if labels is not None and phase == "eval" else None
+        training_ends = self._training_ends() if self._grid is not None and phase == "eval" else None
         for steps in self._batches(recording.topic(f"/{phase}/step"), spans):
             extras = recording.extras(phase).at(steps["step"])
             for member in self._members:
@@ -204,8 +204,9 @@ class LoopExporter:
                     self._send_lines(phase, member, quantity, times, np.concatenate(numbers, axis=1), names)
                 values = {name: each[is_own] for name, each in extras.items()}
                 self._send_extras(phase, member, values, own["log_time"], times)
-            if labels is not None:
-                grid = grid or StepWriter(self._stream, self._root, phase, recording.mdp, self._scene, labels)
+            if self._grid is not None:
+                view, labels = self._grid
+                grid = grid or StepWriter(self._stream, view, phase, labels)
                 episode = steps["episode"].astype(np.int64)
                 if training_ends is not None:  # evaluation is shown by the training episodes before it
                     episode = np.searchsorted(training_ends, steps["log_time"])
@@ -283,7 +284,7 @@ class LoopExporter:
                 steps = steps[steps["t"] != schema.RESET_ONLY]
                 if not len(steps):
                     continue
-                if self._scene is not None:
+                if self._grid is not None:
                     check_steps(steps, recording.mdp, str(recording.path), "recorded")
                 yield steps
 

@@ -10,7 +10,6 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from runner.drawing import palette
-from runner.environments.mdp import Mdp
 from runner.environments.naming import numbered_actions, spoken
 from runner.export.rerun.columns import (
     Batch,
@@ -34,10 +33,11 @@ from runner.export.rerun.layout import (
     LABEL_RISE,
     MAP_LABEL_Y,
     NUMBER_X,
+    RunView,
     bar_rows,
 )
 from runner.export.rerun.metrics import series_lines
-from runner.export.rerun.scene import Placements, Scene
+from runner.export.rerun.scene import Scene
 from runner.export.rerun.step_values import StepValues
 
 _BAR_FRACTION: Final = 64
@@ -52,17 +52,16 @@ _ARROW_SCALE: Final = 1.2
 class TableWriter(Sender):
     """Sends the table of values of one phase; its numbers as text are rounded, its scalars exact."""
 
-    def __init__(
-        self, stream: rr.RecordingStream, path: str, mdp: Mdp, labels: Labels, learners: int
-    ) -> None:
+    def __init__(self, stream: rr.RecordingStream, path: str, view: RunView, labels: Labels) -> None:
         super().__init__(stream, path)
+        mdp = view.mdp
         self._labels = labels
         self._own = mdp.own_actions
         self._y = np.concatenate(bar_rows(mdp))
         agents, counts = len(mdp.agents), mdp.action_counts
         self._bounds = np.cumsum((0, *counts))
         """The first value of each agent, and the number of values."""
-        self._explored_bit = np.arange(agents) if learners == agents else np.zeros(agents, np.int64)
+        self._explored_bit = np.arange(agents) if len(view.learners) == agents else np.zeros(agents, np.int64)
         height = self._y - LABEL_RISE
         columns = [
             np.stack((np.full_like(height, x), height), axis=1) for x in (NUMBER_X, GREEDY_X, CHOSEN_X)
@@ -100,24 +99,22 @@ class TableWriter(Sender):
 
 
 class MapWriter(Sender):
-    """Sends a learner's map in one phase: the greatest value and the greedy moves of every placement."""
+    """Sends a learner's map in one phase: the greatest value and the greedy moves of every placement.
+
+    The scene of the view has placements.
+    """
 
     def __init__(
-        self,
-        stream: rr.RecordingStream,
-        path: str,
-        scene: Scene,
-        placements: Placements,
-        labels: Labels,
-        learners: tuple[str, ...],
-        learner: int,
+        self, stream: rr.RecordingStream, path: str, view: RunView, labels: Labels, learner: int
     ) -> None:
         super().__init__(stream, f"{path}/map")
-        mdp = scene.mdp
+        assert view.scene is not None
+        assert view.scene.placements is not None
+        mdp, scene, placements = view.mdp, view.scene, view.scene.placements
         self._learner = learner
-        self._name = learners[learner]
+        self._name = view.learners[learner]
         self._placements = placements
-        is_joint = len(learners) != len(mdp.agents)
+        is_joint = len(view.learners) != len(mdp.agents)
         agents = list(range(len(mdp.agents))) if is_joint else [learner]
         movers = [
             scene.mover_agents.index(mdp.agents[agent]) if mdp.agents[agent] in scene.mover_agents else 0

@@ -114,15 +114,11 @@ class RunExporter:
         are_values_shown = False
         for batch in _prefetched(_batches(pieces, trials)):
             if writer is None:
-                writer = StepWriter(stream, view.root, phase, view.mdp, view.scene, labels, view.learners)
-                table = TableWriter(stream, writer.path, view.mdp, labels, len(view.learners))
-                maps = [
-                    MapWriter(
-                        stream, writer.path, view.scene, view.scene.placements, labels, view.learners, i
-                    )
-                    for i in range(len(view.learners))
-                    if view.scene and view.scene.placements
-                ]
+                writer = StepWriter(stream, view, phase, labels, with_rewards=True)
+                table = TableWriter(stream, writer.path, view, labels)
+                has_maps = view.scene is not None and view.scene.placements is not None
+                count = len(view.learners) if has_maps else 0
+                maps = [MapWriter(stream, writer.path, view, labels, i) for i in range(count)]
             writer.write(batch)
             if batch.values is not None:
                 table.write(batch, batch.values)

@@ -18,6 +18,7 @@ from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import events_in_words, spoken, states_in_words
 from runner.export.rerun.columns import Batch, Sender, instances, repeated_point, rgba, scalars, strips, texts
 from runner.export.rerun.labels import Labels
+from runner.export.rerun.layout import RunView
 from runner.export.rerun.metrics import phase_colours, series_lines
 from runner.export.rerun.scene import Scene
 
@@ -32,40 +33,35 @@ PASSENGER_LABEL_Y: Final = 0.12
 
 
 class StepWriter(Sender):
-    """Sends the steps of a phase of a tabular run: the grid, or without a scene states and actions as lines.
-
-    The learners are those whose rewards are sent.
-    """
+    """Sends a phase of a tabular run: the grid, or without a scene states and actions as lines."""
 
     def __init__(
         self,
         stream: rr.RecordingStream,
-        root: str,
+        view: RunView,
         phase: str,
-        mdp: Mdp,
-        scene: Scene | None,
         labels: Labels,
-        learners: Sequence[str] = (),
+        with_rewards: bool = False,
     ) -> None:
-        super().__init__(stream, f"{root}/{phase}")
+        super().__init__(stream, f"{view.root}/{phase}")
         self._phase = phase
-        self._mdp = mdp
-        self._sends_rewards = bool(learners)
-        self._events = _EventLog(mdp, phase)
-        self._grid = _Grid(stream, self.path, phase, scene, labels) if scene else None
+        self._mdp = view.mdp
+        self._with_rewards = with_rewards
+        self._events = _EventLog(view.mdp, phase)
+        self._grid = _Grid(stream, self.path, phase, view.scene, labels) if view.scene else None
         self.covered: list[tuple[int, int]] = []
         """The stretches of time whose steps were sent: the first, and the one after the last."""
-        if learners:
-            names = [f"reward {spoken(learner)}" for learner in learners]
+        if with_rewards:
+            names = [f"reward {spoken(learner)}" for learner in view.learners]
             self.send_static("reward", series_lines(names, phase_colours(phase, len(names))))
-        if not scene:
+        if not view.scene:
             for name, colour in zip(("state", "action"), phase_colours(phase, 2), strict=True):
                 self.send_static(name, series_lines([f"{name} ({phase})"], [colour]))
 
     def write(self, batch: Batch) -> None:
         """Send a batch of steps."""
         records = batch.records
-        if self._sends_rewards:
+        if self._with_rewards:
             self.send("reward", batch.times, scalars(records["rewards"]))
         events = events_of(self._mdp, records)
         rows, columns = self._events.columns(batch, events)
