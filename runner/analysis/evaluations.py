@@ -9,12 +9,15 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.sections import Grid, Section
+from runner.environments.naming import event_in_words, spoken
 from runner.errors import NotInRecording
 from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.metrics import METRICS, defined_metrics, finite_mean, is_usable
 from runner.recording.reader import Recording
 from runner.recording.run_file import EvaluationMetrics, RecentTraining, Summary
+from runner.util import humanize
 from runner.util.values import finite
 
 RECENT_EPISODES: Final = 100
@@ -268,3 +271,39 @@ def loop_summary(recording: Recording) -> Summary:
         ),
         logged=logged,
     )
+
+
+def evaluations_section(recording: Recording, records: Sequence[EvaluationRecord]) -> Section:
+    """Return evaluations of a recording, one at least, as a table; a loop's leaves out unknown metrics."""
+    agents, has_reports = recording.agents, recording.has_reports
+    metrics = [
+        metric
+        for metric in METRICS
+        if has_reports or any(record.value(metric.name) is not None for record in records)
+    ]
+    headings = ["episode"] if has_reports else ["episode", "trials"]
+    for metric in metrics:
+        whose = [f" {spoken(agent)}" for agent in agents] if metric.per_agent and len(agents) > 1 else [""]
+        headings += [f"{metric.heading}{agent}" for agent in whose]
+    for name in recording.event_names:
+        agent, dot, _ = name.rpartition(".")
+        words = event_in_words(name)
+        headings.append(f"{words[: len(agent)]}\n{words[len(agent) + 1 :]}" if dot else words)
+    rows = []
+    for record in records:
+        cells = [f"{record.episode:,}"] if has_reports else [f"{record.episode:,}", f"{record.trials:,}"]
+        for metric in metrics:
+            cells += map(humanize.number, record.values[metric.name].values())
+        cells += [f"{count:,}" for count in record.events.values()]
+        if record.training:
+            cells.append("/".join(map(humanize.number, record.training.percent_filled.values())))
+        rows.append(tuple(cells))
+    explanation = (
+        f"Each row: {records[0].trials} trials with the greedy policy after that number of training "
+        "episodes. Events are counted over all trials."
+        if has_reports
+        else "Each row: the evaluation episodes of the loop after that number of training episodes. Events "
+        "are counted over all of them."
+    )
+    grid = Grid((*headings, *(["filled %"] if has_reports else [])), rows)
+    return Section("Evaluations", [explanation], [grid])

@@ -17,25 +17,15 @@ from runner.analysis.sections import Grid, Section
 from runner.export.plots.comparisons import intervals_svg, letter, profile_svg
 from runner.export.plots.curves import Plot, plots_of
 from runner.export.plots.tasks import task_charts
-from runner.export.reports.rendering import LegendEntry, View, render
+from runner.export.reports.rendering import Figure, LegendEntry, View, render
 from runner.util.humanize import UNKNOWN
 
 
-class Figure(NamedTuple):
-    """A plot with its caption."""
-
-    svg: str
-    caption: str
-
-
-@dataclass(frozen=True)
-class ComparedMetric:
+class ComparedMetric(NamedTuple):
     """A metric on the page."""
 
     id: str
-    title: str
-    sentences: list[str]
-    grids: list[Grid]
+    section: Section
     figures: list[Figure]
 
 
@@ -92,8 +82,7 @@ def _metric(metric: MetricResult, labels: list[str]) -> ComparedMetric:
     figures = [Figure(intervals_svg(metric, labels), "Values")] if metric.groups else []
     if metric.groups and len(metric.thresholds) > 1:
         figures.append(Figure(profile_svg(metric, labels), "Performance profile"))
-    anchor = "metric-" + re.sub(r"\W+", "-", metric.name)
-    return ComparedMetric(anchor, section.title, section.sentences, section.grids, figures)
+    return ComparedMetric("metric-" + re.sub(r"\W+", "-", metric.name), section, figures)
 
 
 @dataclass(frozen=True)

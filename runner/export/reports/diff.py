@@ -31,7 +31,7 @@ from runner.environments.naming import deeds_in_words, exploration_in_words, spo
 from runner.export.plots.comparisons import tables_svg
 from runner.export.plots.curves import Plot, plots_of
 from runner.export.reports.maps import situation, situation_in_words
-from runner.export.reports.rendering import LegendEntry, Link, View, render
+from runner.export.reports.rendering import Figure, LegendEntry, Link, View, render
 from runner.recording.reader import Recording
 from runner.recording.run_file import run_title
 
@@ -65,15 +65,6 @@ class ShownDivergence:
     links: Sequence[Link] = ()
 
 
-class TableFigure(NamedTuple):
-    """A picture of the difference of Q-tables."""
-
-    svg: str
-    caption: str
-    high: float | None = None
-    """The value of the lightest colour of a map."""
-
-
 @dataclass(frozen=True)
 class DifferenceView(View):
     """The page of a difference."""
@@ -89,7 +80,7 @@ class DifferenceView(View):
     plots: list[Plot]
     metrics_section: Section
     tables: Section
-    table_figures: list[TableFigure]
+    table_figures: list[Figure]
     others: list[Section]
     runs: Section
 
@@ -206,11 +197,11 @@ def _values(row: Row) -> Grid:
     return Grid((f"Q-values of {spoken(row.agent)} there{of}", "A", "B"), rows)
 
 
-def _table_figures(difference: RunDiff, a: Recording, b: Recording) -> Iterator[TableFigure]:
+def _table_figures(difference: RunDiff, a: Recording, b: Recording) -> Iterator[Figure]:
     """Yield the plot of the difference over episodes, and a map of the last difference of each agent."""
     if not any(table.largest > 0 for table in difference.tables):
         return
-    yield TableFigure(tables_svg(difference.tables), "Difference of the tables over training")
+    yield Figure(tables_svg(difference.tables), "Difference of the tables over training")
     last: dict[int, NDArray[np.float64]] = {}
     for ours, theirs in common_snapshots(a, b):
         last[ours.table] = np.abs(ours.values - theirs.values).max(axis=1)
@@ -219,7 +210,7 @@ def _table_figures(difference: RunDiff, a: Recording, b: Recording) -> Iterator[
         yield from _map(a.mdp, distances, spoken(agents[number]))
 
 
-def _map(mdp: Mdp, distances: NDArray[np.float64], agent: str) -> Iterator[TableFigure]:
+def _map(mdp: Mdp, distances: NDArray[np.float64], agent: str) -> Iterator[Figure]:
     """Yield the map of the largest difference in each state, in the situation where it is largest."""
     if mdp.scene is None or mdp.scene_cells is None or not distances.max() > 0:
         return
@@ -241,4 +232,4 @@ def _map(mdp: Mdp, distances: NDArray[np.float64], agent: str) -> Iterator[Table
         picture = svg_maps.pair_map(mdp.scene, values, bounds, title)
     else:
         picture = svg_maps.policy_map(mdp.scene, values, [None] * cells, bounds, title)
-    yield TableFigure(picture, caption, bounds[1])
+    yield Figure(picture, caption, bounds[1])

@@ -38,6 +38,15 @@ class LegendEntry(NamedTuple):
     text: str
 
 
+class Figure(NamedTuple):
+    """A picture with its caption."""
+
+    svg: str
+    caption: str
+    high: float | None = None
+    """The value of the lightest colour of a map whose darkest is 0."""
+
+
 class Link(NamedTuple):
     """A link of a page."""
 

@@ -13,8 +13,9 @@ from typing import ClassVar
 import numpy as np
 
 from runner.analysis.axes import EPISODES, Axis
-from runner.analysis.evaluations import EvaluationRecord, evaluation_records
+from runner.analysis.evaluations import EvaluationRecord, evaluation_records, evaluations_section
 from runner.analysis.groups import groups_of
+from runner.analysis.sections import Section
 from runner.analysis.series import RunSeries, read_series, values_left_out
 from runner.analysis.summary import brief_provenance, random_policy_sentence
 from runner.drawing import svg
@@ -25,7 +26,6 @@ from runner.export.encoded import picture_note
 from runner.export.episodes import first_state, last_whole_evaluation, place_of, ranked, ranked_trials
 from runner.export.plots.curves import Plot, plots_of
 from runner.export.plots.metrics import PLAIN, CurveStyle
-from runner.export.reports.evaluations import EvaluationTable, evaluation_table
 from runner.export.reports.maps import MapRow, maps_of, stages_of
 from runner.export.reports.playback import MAX_VALUES, playback_of, titled
 from runner.export.reports.rendering import LegendEntry, View, embedded, render, templates
@@ -72,7 +72,7 @@ class ReportedRun:
     random_policy: str
     """A sentence on what a random policy achieves; empty if unknown."""
     has_steps: bool
-    evaluations: EvaluationTable | None
+    evaluations: Section | None
     broad: bool
     facts: Mapping[str, str]
     config: Mapping[str, str]
@@ -156,8 +156,6 @@ def _run(
     episodes = _episodes(recording, chosen)
     replay = _replay(recording, episodes, progress)
     drawing = None if environment["scene"] is None else svg.Drawing(environment["scene"])
-    events, has_reports = environment["event_names"], recording.has_reports
-    table = evaluation_table(evaluations, recording.agents, events, has_reports) if evaluations else None
     return ReportedRun(
         number=number,
         id=recording.run_id,
@@ -172,7 +170,7 @@ def _run(
         last=evaluations[-1] if evaluations else None,
         random_policy=random_policy_sentence(recording),
         has_steps=recording.has_steps,
-        evaluations=table,
+        evaluations=evaluations_section(recording, evaluations) if evaluations else None,
         broad=drawing is not None and drawing.width > svg.BROAD,
         facts=_facts(recording),
         config=flat_text(recording.config),

@@ -16,10 +16,10 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.axes import EPISODES
-from runner.analysis.evaluations import evaluation_record, evaluation_records
+from runner.analysis.evaluations import evaluation_record, evaluation_records, evaluations_section
+from runner.analysis.sections import Section
 from runner.client.jobs import RunProgress
 from runner.errors import RecordingError, RunnerError
-from runner.export.reports.evaluations import EvaluationTable, evaluation_table
 from runner.export.reports.rendering import View
 from runner.recording.labels import MAX_NOTE
 from runner.recording.metrics import METRICS
@@ -95,7 +95,7 @@ class _StatusView(View):
 @dataclass(frozen=True)
 class _EvaluationsView(RunView):
     TEMPLATE: ClassVar = "run_evaluations.html"
-    table: EvaluationTable | None
+    section: Section | None
     links: list[str]
     """Address of the first trial of each evaluation."""
     total: int
@@ -194,8 +194,8 @@ def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) ->
         every = evaluation_records(recording)
         records, total = every[-MAX_EVALUATIONS:], len(every)
     links = [f"/runs/{run.run_id}/replay/eval/{record.episode}/0" for record in records]
-    table = evaluation_table(records, agents, events, recording.has_reports) if records else None
-    return page(request, _EvaluationsView(head_of(run), "evaluations", table, links, total))
+    section = evaluations_section(recording, records) if records else None
+    return page(request, _EvaluationsView(head_of(run), "evaluations", section, links, total))
 
 
 @router.get("/learned")
