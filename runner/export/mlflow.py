@@ -13,13 +13,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain, count, islice
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
 from runner.errors import RunnerError, shortened
 from runner.export.contents import flat_text
 from runner.export.scalars import created, episodes, measures, times
 from runner.recording.reader import Recording
 from runner.util.extras import require
+
+if TYPE_CHECKING:
+    from mlflow.tracking import MlflowClient
 
 RUN_TAG: Final = "dualtaxi.run_id"
 DIGEST_TAG: Final = "dualtaxi.content_digest"
@@ -124,7 +127,7 @@ def _export(
     return MlflowExport(run_id, metrics, notes=tuple(notes))
 
 
-def _log_params(client: Any, run_id: str, recording: Recording, names: dict[str, str]) -> list[str]:
+def _log_params(client: MlflowClient, run_id: str, recording: Recording, names: dict[str, str]) -> list[str]:
     """Log the configuration; return a note about each value that is too long."""
     from mlflow.entities import Param
 
@@ -139,7 +142,9 @@ def _log_params(client: Any, run_id: str, recording: Recording, names: dict[str,
     ]
 
 
-def _log_metrics(client: Any, run_id: str, recording: Recording, names: dict[str, str]) -> tuple[int, float]:
+def _log_metrics(
+    client: MlflowClient, run_id: str, recording: Recording, names: dict[str, str]
+) -> tuple[int, float]:
     """Log all metrics, of a loop also length and return of its episodes; return their number, and the end."""
     from mlflow.entities import Metric
 

@@ -19,8 +19,7 @@ from runner.errors import RunnerError
 from runner.export.plots.curves import footnote, panel_plots
 from runner.export.reports.rendering import partials
 from runner.service.settings import without_folders
-from runner.sweep.charts import learning, picture_of, picture_plots
-from runner.sweep.page import sweep_legend
+from runner.sweep.charts import learning, picture_of, picture_plots, sweep_legend
 from runner.sweep.results import Results, effects_sections, ranking_sections, results_of
 from runner.sweep.state import read_sweep
 

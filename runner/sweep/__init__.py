@@ -6,15 +6,13 @@ search      the values to try next, by Optuna
 objective   readings of a metric during a run, and what a run is worth
 task        one run, as a worker does it
 local       worker processes on this machine
-cluster     the same on Ray
-pool        the workers that a command uses, of either kind
+cluster     the same on Ray, and the workers that a command uses, of either kind
 state       a sweep on disk: its resolved file, and locks; progress follows from its runs
 trials      trials, and what is recorded of them
 running     the loop that gives batches of runs to workers
 plan        disk and runs that a sweep will take
 results     ranking, importance, the best configuration
-charts      charts of the trials, and one sheet with all of them
-page        the sweep as one self-contained page
+charts      charts of the trials, one sheet with all of them, and the sweep as a page
 
 This module loads nothing heavy, so that commands can look for sweeps first.
 """

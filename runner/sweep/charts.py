@@ -1,4 +1,4 @@
-"""The trials of a sweep as charts: along each parameter, in parallel coordinates, and all on one sheet."""
+"""The trials of a sweep as charts: along each parameter, in parallel coordinates, on a sheet, in a page."""
 
 from __future__ import annotations
 
@@ -7,24 +7,27 @@ import math
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.groups import Group
+from runner.analysis.sections import Section
 from runner.analysis.series import series_of
 from runner.archive.places import at_hand
 from runner.drawing import palette
 from runner.errors import RunnerError
 from runner.export.plots.chart import SMALL, Canvas, Chart, Scale, labelled, series_colour
-from runner.export.plots.curves import HEIGHT, WIDTH, Plot, panel_chart
+from runner.export.plots.curves import HEIGHT, WIDTH, Plot, footnote, panel_chart, panel_plots
 from runner.export.plots.metrics import Panel, panels_of
+from runner.export.reports.rendering import LegendEntry, View, render
 from runner.runs.resolve import find_run
 from runner.sweep.model import Range
-from runner.sweep.results import Ranked, Results, value_text, values_text
+from runner.sweep.results import Ranked, Results, sections, value_text, values_text
 
 Values = NDArray[np.float64]
 
@@ -262,3 +265,47 @@ def _unit(values: Values, log: bool, choices: tuple[str, ...]) -> Values:
     scaled = np.log(values) if log else values
     width = scaled.max() - scaled.min()
     return np.asarray((scaled - scaled.min()) / width) if width else np.full(len(values), 0.5)
+
+
+# --- the page -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _SweepView(View):
+    TEMPLATE: ClassVar = "sweep.html"
+    title: str
+    lead: list[str]
+    sections: list[Section]
+    parameters: list[Plot]
+    note: str
+    best: str | None
+    legend: list[LegendEntry]
+    plots: list[Plot]
+    footnote: str
+    moment: str
+
+
+def render_sweep(results: Results, recordings: Path) -> str:
+    """Return the page of a sweep whose runs are in a recordings folder."""
+    picture = picture_of(results)
+    groups, panels = learning(results, recordings)
+    ranking, *others = sections(results)
+    view = _SweepView(
+        title=ranking.title,
+        lead=ranking.sentences,
+        sections=[Section("Ranking", grids=ranking.grids), *others],
+        parameters=picture_plots(picture),
+        note=picture.footnote,
+        best=results.best_yaml,
+        legend=sweep_legend(groups),
+        plots=panel_plots(panels, len(groups)),
+        footnote=footnote(groups, panels),
+        moment=f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+    )
+    return render(view)
+
+
+def sweep_legend(groups: list[Group]) -> list[LegendEntry]:
+    """Return which trial each group of runs belongs to."""
+    parts = (group.described.partition(", ") for group in groups)
+    return [LegendEntry(trial, rest) for trial, _, rest in parts]

@@ -11,6 +11,7 @@ import socket
 import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from types import ModuleType
 from typing import Any, Concatenate, Final, Generic, ParamSpec, Self, TypeVar
 
 from runner.errors import RunnerError
@@ -23,12 +24,13 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def require_ray() -> Any:
+def require_ray() -> ModuleType:
     """Return the module `ray`."""
-    return require("ray", extra="ray", purpose="a sweep on Ray")
+    ray: ModuleType = require("ray", extra="ray", purpose="a sweep on Ray")
+    return ray
 
 
-def connect(address: str | None, processors: int | None = None) -> Any:
+def connect(address: str | None, processors: int | None = None) -> ModuleType:
     """Return the module `ray`, connected to a cluster.
 
     The address is that of the cluster, or `auto`; None starts Ray on this machine, which may
@@ -87,12 +89,12 @@ class RayActor:
         return messages
 
 
-def start_actor(ray: Any) -> Any:
+def start_actor(ray: ModuleType) -> Any:
     """Return the handle of a new `RayActor`; its function and two other calls run at the same time."""
     return ray.remote(RayActor).options(num_cpus=1, max_concurrency=3, max_restarts=0).remote()
 
 
-def _run(actor: RayActor, task: Work) -> Any:
+def _run(actor: RayActor, task: Work) -> object:
     return task.run(actor.stop)
 
 

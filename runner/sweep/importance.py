@@ -13,7 +13,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final, SupportsFloat, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,7 @@ def effects_of(
 
     The parameters are the values tried, by path; the values are the objective of each trial, finite.
     """
-    require("sklearn.tree", extra="sweep", purpose="the importance of a sweep's parameters")
+    ensemble = require("sklearn.ensemble", extra="sweep", purpose="the importance of a sweep's parameters")
     names = list(parameters)
     if len(trials) < MIN_TRIALS or len(set(values)) < 2 or 2 ** len(names) > MAX_POINTS:
         return []
@@ -64,37 +64,12 @@ def effects_of(
     all_shares: list[dict[tuple[int, ...], float]] = []
     for forest in range(FORESTS):
         drawn = rng.integers(0, len(trials), len(trials))
-        predicted = forest_prediction(tried[drawn], objective[drawn], coded, forest)
+        trees = ensemble.RandomForestRegressor(TREES, random_state=forest)
+        predicted = trees.fit(tried[drawn], objective[drawn]).predict(coded)
         shares = shares_of_variance(predicted.reshape(shape))
         if shares:
             all_shares.append(shares)
     return _effects(names, all_shares)
-
-
-def forest_prediction(
-    x: NDArray[np.float64], y: NDArray[np.float64], points: NDArray[np.float64], seed: int
-) -> NDArray[np.float64]:
-    """Return the predictions, [points], of a random forest of `TREES` trees.
-
-    They equal those of `sklearn.ensemble.RandomForestRegressor` to the last bit, in two thirds of its time:
-    with the few trials of a sweep, its overhead takes longer than its trees. `x` is [trials, columns], `y`
-    [trials], `points` [points, columns].
-    """
-    import sklearn
-    from sklearn.tree import DecisionTreeRegressor
-
-    features, target = x.astype(np.float32), y[:, np.newaxis]
-    grid, count = points.astype(np.float32), len(y)
-    total = np.zeros(len(points))
-    tree_seeds = np.random.RandomState(seed)  # as scikit-learn makes of an integer
-    with sklearn.config_context(assume_finite=True, skip_parameter_validation=True):
-        for tree_seed in [tree_seeds.randint(np.iinfo(np.int32).max) for _ in range(TREES)]:
-            drawn = np.random.RandomState(tree_seed).randint(0, count, count, dtype=np.int32)
-            weights = np.bincount(drawn, minlength=count).astype(np.float64)
-            tree = DecisionTreeRegressor(random_state=tree_seed)
-            tree.fit(features, target, sample_weight=weights, check_input=False)
-            total += tree.tree_.predict(grid)[:, 0]
-    return total / TREES
 
 
 def effects_of_grid(
@@ -166,13 +141,13 @@ def _levels(parameter: Range | list[object], parameters: int) -> list[object]:
 
 
 def _coded(
-    parameters: Mapping[str, Range | list[Any]], points: Sequence[Mapping[str, Any]]
+    parameters: Mapping[str, Range | list[object]], points: Sequence[Mapping[str, object]]
 ) -> NDArray[np.float64]:
     """Return points as columns of numbers: one for a range, or one for each choice."""
     columns = []
     for name, parameter in parameters.items():
         if isinstance(parameter, Range):
-            numbers = [float(point[name]) for point in points]
+            numbers = [float(cast("SupportsFloat", point[name])) for point in points]
             columns.append([math.log(number) for number in numbers] if parameter.log else numbers)
         else:
             texts = [json.dumps(point[name], sort_keys=True) for point in points]

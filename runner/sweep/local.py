@@ -9,8 +9,9 @@ import signal
 from collections.abc import Callable
 from multiprocessing import connection
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnContext
 from multiprocessing.synchronize import Event
-from typing import Any, Final, Generic, Protocol, Self, TypeVar
+from typing import Final, Generic, Protocol, Self, TypeVar
 
 CLOSE_SECONDS: Final = 30.0
 """The time that a worker has to close its recording before it is killed."""
@@ -22,7 +23,7 @@ class Work(Protocol):
     def placed(self, threads: bool, on_own_disk: bool = False) -> Self:
         """Return the task for a worker with several processors, or with a disk of its own."""
 
-    def run(self, stop: Callable[[], bool]) -> Any:
+    def run(self, stop: Callable[[], bool]) -> object:
         """Return the result; `stop` is called every few milliseconds, and returns whether to stop."""
 
 
@@ -56,7 +57,7 @@ class LocalWorkers(Generic[T, R]):
         self._context = multiprocessing.get_context("spawn")
         self._stopping = self._context.Event()
         self._idle: list[_Worker[R]] = []
-        self._busy: dict[Any, tuple[_Worker[R], T]] = {}
+        self._busy: dict[object, tuple[_Worker[R], T]] = {}
 
     @property
     def idle(self) -> int:
@@ -79,7 +80,9 @@ class LocalWorkers(Generic[T, R]):
     def collect(self, seconds: float) -> list[tuple[T, R | None]]:
         """Wait up to this time for tasks to end; return them with their results (None if the worker died)."""
         done: list[tuple[T, R | None]] = []
-        for pipe in connection.wait(list(self._busy), seconds) if self._busy else ():
+        for pipe in (
+            connection.wait([worker.pipe for worker, _ in self._busy.values()], seconds) if self._busy else ()
+        ):
             worker, task = self._busy.pop(pipe)
             result = worker.receive()
             done.append((task, result))
@@ -103,7 +106,7 @@ class LocalWorkers(Generic[T, R]):
 class _Worker(Generic[R]):
     """A process and the pipe to it."""
 
-    def __init__(self, context: Any, stopping: Event) -> None:
+    def __init__(self, context: SpawnContext, stopping: Event) -> None:
         self.pipe, theirs = context.Pipe()
         self._process = context.Process(
             target=serve, args=(theirs, stopping), name="sweep-worker", daemon=True

@@ -68,10 +68,10 @@ def run_sweep(
     a task may not be started, empty if it may. Runs that other code started are resumed only if the changes
     are accepted.
     """
-    runner = _Runner(sweep, recordings, workers, stop=stop, report=report, limit=limit)
+    runner = _Runner(sweep, recordings, workers, stop, report, limit, accept_changes)
     trials, status = runner.trials, runner.status
     while batch := trials.ask():
-        runner.prepare(batch, trials.bounds(), accept_changes)
+        runner.prepare(batch, trials.bounds())
         runner.run(batch)
         if status.stopped:
             break
@@ -81,36 +81,35 @@ def run_sweep(
     return trials, status
 
 
+@dataclass(eq=False)
 class _Runner:
-    """The runs of a sweep's batches: each job once, also if several trials need it."""
+    """The runs of a sweep's batches: each job once, also if several trials need it. See `run_sweep`."""
 
-    def __init__(
-        self,
-        sweep: Sweep,
-        recordings: Path,
-        workers: Workers[Task, Result],
-        *,
-        stop: Callable[[], bool],
-        report: Callable[[SweepStatus], None],
-        limit: Limit,
-    ) -> None:
-        self._sweep, self._recordings, self._workers = sweep, recordings, workers
-        self._stop, self._report, self._limit = stop, report, limit
-        self.trials = Trials(sweep)
-        self.status = SweepStatus(self.trials.search.trials * len(sweep.seeds), self.trials.search.trials)
-        self._results = JobResults(sweep, recordings)
+    sweep: Sweep
+    recordings: Path
+    workers: Workers[Task, Result]
+    stop: Callable[[], bool]
+    report: Callable[[SweepStatus], None]
+    limit: Limit
+    accept_changes: bool
+
+    def __post_init__(self) -> None:
+        self.trials = Trials(self.sweep)
+        count = self.trials.search.trials
+        self.status = SweepStatus(count * len(self.sweep.seeds), count)
+        self._results = JobResults(self.sweep, self.recordings)
         self._counted: set[str] = set()
         """Ids of the runs whose bytes are counted."""
         self._retried: set[str] = set()
         self._waiting: deque[Task] = deque()
 
-    def prepare(self, batch: list[Trial], bounds: Curve, accept_changes: bool) -> None:
+    def prepare(self, batch: list[Trial], bounds: Curve) -> None:
         """Add the results of runs that are over, and queue the others: those that can be resumed first."""
         tasks: dict[str, Task] = {}
         for trial in batch:
             if trial.error:
                 self.status.excluded += 1
-                self.status.runs -= len(self._sweep.seeds)
+                self.status.runs -= len(self.sweep.seeds)
             for seed, identity in trial.identities.items():
                 result = self._results.get(identity)
                 if result is not None:
@@ -121,11 +120,11 @@ class _Runner:
                         seed=seed,
                         config=trial.config,
                         trial=trial.number,
-                        recordings=str(self._recordings),
-                        objective=self._sweep.objective,
+                        recordings=str(self.recordings),
+                        objective=self.sweep.objective,
                         bounds=bounds,
                         run_id=self._results.run_id(identity),
-                        accept_changes=accept_changes,
+                        accept_changes=self.accept_changes,
                     )
         self._waiting = deque(sorted(tasks.values(), key=lambda task: not task.run_id))
 
@@ -133,13 +132,13 @@ class _Runner:
         """Finish every queued run, or, when stopped, only those in progress."""
         began, before, status = time.monotonic(), self.status.seconds, self.status
         while status.running or (self._waiting and not status.stopped):
-            if not status.stopped and self._stop():
+            if not status.stopped and self.stop():
                 status.stopped = INTERRUPTED
-                self._workers.stop()
+                self.workers.stop()
             self._start_tasks()
             status.seconds = before + time.monotonic() - began
-            self._report(status)
-            for task, received in self._workers.collect(_WAIT_SECONDS):
+            self.report(status)
+            for task, received in self.workers.collect(_WAIT_SECONDS):
                 status.running -= 1
                 if received is None and task.identity not in self._retried:  # its worker died
                     self._retried.add(task.identity)
@@ -156,12 +155,12 @@ class _Runner:
 
     def _start_tasks(self) -> None:
         status = self.status
-        while self._waiting and self._workers.idle and not status.stopped:
+        while self._waiting and self.workers.idle and not status.stopped:
             task = self._waiting[0]
-            status.stopped = self._limit(status, task)
+            status.stopped = self.limit(status, task)
             if not status.stopped:
                 self._waiting.popleft()
-                self._workers.submit(replace(task, run_id=task.run_id or self._created(task)))
+                self.workers.submit(replace(task, run_id=task.run_id or self._created(task)))
                 status.running += 1
                 if task.identity not in self._retried:
                     status.started += 1
@@ -172,13 +171,13 @@ class _Runner:
 
         A worker could be killed between creating a run and telling the sweep, and its run would be lost.
         """
-        labels = Labels(tags=tuple(sorted((tag_of(self._sweep.name), f"trial={task.trial}"))))
-        facts = task.config, task.seed, self._sweep.name
-        return new_run(self._recordings, *facts, labels=labels, status="interrupted").run_id
+        labels = Labels(tags=tuple(sorted((tag_of(self.sweep.name), f"trial={task.trial}"))))
+        facts = task.config, task.seed, self.sweep.name
+        return new_run(self.recordings, *facts, labels=labels, status="interrupted").run_id
 
     def _died_twice(self, task: Task) -> Result:
         """Return the result of a task whose worker died twice; remove its run if it has no recording."""
-        folder = self._recordings / task.run_id
+        folder = self.recordings / task.run_id
         run = run_in(folder)
         if run is not None and run.recording.exists():
             return Result("failed", task.run_id, error="its worker died twice")
@@ -187,7 +186,7 @@ class _Runner:
 
     def _add(self, trial: Trial, seed: int, result: Result) -> None:
         """Add a result to a trial and to the status."""
-        trial.add(seed, result, self._sweep)
+        trial.add(seed, result, self.sweep)
         status = self.status
         if result.run_id not in self._counted:
             self._counted.add(result.run_id)

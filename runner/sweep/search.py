@@ -8,18 +8,24 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Any, Final
+from types import ModuleType
+from typing import TYPE_CHECKING, Final
 
 from runner.sweep.model import Parameter, Range, SweepFile
 from runner.util.extras import require
+
+if TYPE_CHECKING:
+    from optuna.distributions import BaseDistribution
+    from optuna.samplers import BaseSampler
+    from optuna.trial import Trial
 
 _MAX_DRAWS: Final = 20
 """Draws to find values that were not suggested before; all values of a small space may have been."""
 
 
-def require_optuna() -> Any:
+def require_optuna() -> ModuleType:
     """Return the module `optuna`, which logs errors only."""
-    optuna = require("optuna", extra="sweep", purpose="a sweep")
+    optuna: ModuleType = require("optuna", extra="sweep", purpose="a sweep")
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     return optuna
 
@@ -32,7 +38,7 @@ class Search:
         self._file = file
         self._space = {path: self._distribution(parameter) for path, parameter in file.parameters.items()}
         self._study = self._optuna.create_study(sampler=self._sampler(), direction=file.objective.direction)
-        self._asked_trials: list[Any] = []
+        self._asked_trials: list[Trial] = []
         self._suggested: set[str] = set()
         self.trials = file.trials or file.grid_points
         """The number of trials of the whole search."""
@@ -69,7 +75,7 @@ class Search:
         else:
             self._study.tell(trial, value)
 
-    def _draw(self) -> tuple[object, dict[str, object]]:
+    def _draw(self) -> tuple[Trial, dict[str, object]]:
         """Return the next trial of Optuna and its values; choices are JSON there."""
         trial = self._study.ask(self._space)
         return trial, {
@@ -89,7 +95,7 @@ class Search:
                 point[path] = json.dumps(parameter[at])
         return point
 
-    def _distribution(self, parameter: Parameter) -> Any:
+    def _distribution(self, parameter: Parameter) -> BaseDistribution:
         kinds = self._optuna.distributions
         if not isinstance(parameter, Range):
             return kinds.CategoricalDistribution([json.dumps(choice) for choice in parameter])
@@ -102,7 +108,7 @@ class Search:
             float(parameter.low), float(parameter.last), log=parameter.log, step=parameter.step
         )
 
-    def _sampler(self) -> Any:
+    def _sampler(self) -> BaseSampler:
         samplers, batch, seed = self._optuna.samplers, self._file.batch, self._file.search_seed % 2**32
         match self._file.strategy:
             case "tpe":

@@ -10,11 +10,12 @@ import numpy as np
 
 from runner.analysis.compare import Comparison, GroupResult, MetricResult, PairResult
 from runner.analysis.compare.statistics import FEWEST_TOGETHER, Estimate
+from runner.analysis.compare.tasks import AlgorithmResult
 from runner.analysis.sections import Grid, Section
 from runner.util.humanize import listed
 
 _MAX_LEVELS: Final = 5
-"""Points of a performance profile that are printed."""
+"""Points of a performance profile, or of a curve, that are printed."""
 EXPLANATION: Final = (
     "IQM: interquartile mean, of the middle half of the seeds. In brackets: 95 % percentile bootstrap "
     "intervals (Agarwal et al. 2021). Differences are taken seed by seed, as runs of one seed share their "
@@ -82,7 +83,8 @@ def metric_section(metric: MetricResult, profile: bool = True) -> Section:
         )
         grids.append(Grid(headings, [_pair(pair, together) for pair in metric.pairs]))
     if profile and len(metric.thresholds) > 1:
-        grids.append(_profile(metric))
+        sign = "at most" if metric.higher_is_better is False else "at least"
+        grids.append(profile_grid(metric.groups, metric.thresholds, sign))
     sentences = [f"{metric.name}, in {metric.unit}; {better[metric.higher_is_better]}."]
     sentences += [f"Note: {note}." for note in (*metric.notes, *unpaired(metric.pairs))]
     return Section(metric.title + line, sentences, grids)
@@ -125,12 +127,19 @@ def _pair(pair: PairResult, together: bool) -> tuple[str, ...]:
     )
 
 
-def _profile(metric: MetricResult) -> Grid:
-    """Return a few points of the performance profile."""
-    at = np.unique(np.linspace(0, len(metric.thresholds) - 1, _MAX_LEVELS).round().astype(int)).tolist()
-    sign = "at most" if metric.higher_is_better is False else "at least"
-    rows = [(group.label, *(f"{100 * group.profile[k]:.0f} %" for k in at)) for group in metric.groups]
-    return Grid((f"share of runs {sign}", *(number(metric.thresholds[k]) for k in at)), rows)
+def profile_grid(
+    results: Sequence[GroupResult] | Sequence[AlgorithmResult], thresholds: Sequence[float], sign: str
+) -> Grid:
+    """Return a few points of performance profiles; the sign is `at least` or `at most`."""
+    at = spread_over(len(thresholds))
+    rows = [(result.label, *(f"{100 * result.profile[k]:.0f} %" for k in at)) for result in results]
+    return Grid((f"share of runs {sign}", *(number(thresholds[k]) for k in at)), rows)
+
+
+def spread_over(count: int) -> list[int]:
+    """Return a few of this number of points, evenly spread from the first to the last."""
+    points: list[int] = np.unique(np.linspace(0, count - 1, _MAX_LEVELS).round().astype(int)).tolist()
+    return points
 
 
 def number(value: float, signed: bool = False) -> str:

@@ -14,7 +14,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Final
+from types import ModuleType
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,9 +55,10 @@ class Estimate:
         return self.low > 0 or self.high < 0
 
 
-def require_scipy() -> Any:
+def require_scipy() -> ModuleType:
     """Return the module `scipy.stats`."""
-    return require("scipy.stats", extra="stats", purpose="a comparison")
+    stats: ModuleType = require("scipy.stats", extra="stats", purpose="a comparison")
+    return stats
 
 
 def median(values: Values) -> float:

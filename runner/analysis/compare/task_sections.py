@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from runner.analysis.compare.sections import interval, number
+from runner.analysis.compare.sections import interval, number, profile_grid, spread_over
 from runner.analysis.compare.statistics import Estimate
 from runner.analysis.compare.tasks import AlgorithmResult, TaskComparison
 from runner.analysis.sections import Grid, Section
@@ -18,8 +18,6 @@ AGGREGATES: Final[tuple[tuple[str, Callable[[AlgorithmResult], Estimate]], ...]]
     ("mean", lambda result: result.mean),
     ("optimality gap", lambda result: result.optimality_gap),
 )
-_SHOWN: Final = 5
-"""Levels of a profile, and positions of a curve, that are printed."""
 EXPLANATION: Final = (
     "IQM: mean of the middle half of all runs of all environments. Median and mean: over the mean scores of "
     "the environments. Optimality gap: by how much scores fall short of 1; lower is better. P: the chance "
@@ -72,15 +70,9 @@ def grids(comparison: TaskComparison) -> list[Grid]:
         ]
         found.append(Grid(("A", "B", "P(A higher)", "95 %"), pairs))
     if len(comparison.thresholds) > 1:
-        at = _spread(len(comparison.thresholds))
-        profiles = [
-            (result.label, *(f"{100 * result.profile[k]:.0f} %" for k in at))
-            for result in comparison.algorithms
-        ]
-        levels = (number(comparison.thresholds[k]) for k in at)
-        found.append(Grid(("share of runs at least", *levels), profiles))
+        found.append(profile_grid(comparison.algorithms, comparison.thresholds, "at least"))
     if len(comparison.positions) > 1:
-        at = _spread(len(comparison.positions))
+        at = spread_over(len(comparison.positions))
         curves = [(result.label, *(number(result.curve[k]) for k in at)) for result in comparison.algorithms]
         places = (f"{comparison.positions[k]:,.6g}" for k in at)
         found.append(Grid((f"IQM after {comparison.axis}", *places), curves))
@@ -102,8 +94,3 @@ def _tasks(comparison: TaskComparison) -> Grid:
     ]
     labels = [f"{result.label}, mean (seeds)" for result in comparison.algorithms]
     return Grid(("environment", "score 0 at", "score 1 at", *labels), rows)
-
-
-def _spread(count: int) -> list[int]:
-    found: list[int] = np.unique(np.linspace(0, count - 1, _SHOWN).round().astype(int)).tolist()
-    return found

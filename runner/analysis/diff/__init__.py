@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, TypedDict
 
-from runner.analysis.diff.causes import Cause, Row, branch_relation, find_cause, find_kind, with_branch
+from runner.analysis.diff.causes import Cause, branch_relation, find_cause, find_kind, with_branch
 from runner.analysis.diff.code import FileChange, code_changes
 from runner.analysis.diff.divergence import (
     Divergence,
@@ -24,43 +24,20 @@ from runner.analysis.diff.divergence import (
     unbroken,
 )
 from runner.analysis.diff.metrics import MetricDiff, loop_means, metric_diffs
-from runner.analysis.diff.overlap import Overlap, StateVisits, VisitsDiff, training_overlap, visits_diff
+from runner.analysis.diff.overlap import Overlap, VisitsDiff, training_overlap, visits_diff
 from runner.analysis.diff.settings import (
     Change,
     EnvironmentDiff,
-    TransitionChange,
     changes_in,
     environment_diff,
     equal_values,
     loop_environment_diff,
 )
-from runner.analysis.diff.tables import Cell, TableDiff, table_diffs
+from runner.analysis.diff.tables import TableDiff, table_diffs
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.runs.branches import BranchOrigin, origin_in, training_branches
 from runner.runs.run import Run
-
-__all__ = [
-    "Cause",
-    "Cell",
-    "Change",
-    "Divergence",
-    "EnvironmentDiff",
-    "FileChange",
-    "MetricDiff",
-    "Overlap",
-    "Row",
-    "RunDiff",
-    "StateVisits",
-    "TableDiff",
-    "TransitionChange",
-    "VisitsDiff",
-    "as_json",
-    "can_compare_steps",
-    "diff",
-    "with_seconds",
-    "without_ignored",
-]
 
 NOT_CONTENT: Final = ("name", "recording")
 """Keys of the configuration whose difference alone leaves the content the same."""

@@ -261,32 +261,23 @@ def _first_in_phase(a: Recording, b: Recording, phase: str) -> Divergence | None
     topics = [recording.topic(f"/{phase}/step") for recording in (a, b)]
     if topics[0] not in a.dtypes:
         return _message_divergence(a, b, phase)
-    if any(recording.has_actions_alone(phase) for recording in (a, b)):
-        return _action_divergence(a, b, phase)
-    fields = FIELDS if a.kind in ("job", "step") else _TRANSITION_FIELDS
-    streams = [recording.blocks(topic) for recording, topic in zip((a, b), topics, strict=True)]
-    found = _divergence(phase, first_difference(streams[0], streams[1], fields), fields)
-    if fields is FIELDS:
-        return found  # a step has the state before it
-    return _reset_divergence(a, b, phase, math.inf if found is None else found.step) or found
-
-
-def _action_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None:
-    """Return where the actions or the episodes of two loops diverge, of which one has its actions alone."""
     alone = [recording.has_actions_alone(phase) for recording in (a, b)]
-    topics = [recording.topic(f"/{phase}/step") for recording in (a, b)]
+    is_tabular = a.kind in ("job", "step")
+    fields = FIELDS if is_tabular else _TRANSITION_FIELDS
+    if any(alone):
+        dtypes = [recording.dtypes[topic] for recording, topic in zip((a, b), topics, strict=True)]
+        names = set.intersection(*(set(kept_dtype(dtype).names or ()) for dtype in dtypes))
+        digest = ("digest",) if all(alone) else ()
+        fields = (*(name for name in _TRANSITION_FIELDS if name in names), *digest)
     streams = [
         recording.actions(phase) if is_alone else recording.blocks(topic)
         for recording, topic, is_alone in zip((a, b), topics, alone, strict=True)
     ]
-    dtypes = [recording.dtypes[topic] for recording, topic in zip((a, b), topics, strict=True)]
-    names = set.intersection(*(set(kept_dtype(dtype).names or ()) for dtype in dtypes))
-    fields = (*(name for name in _TRANSITION_FIELDS if name in names), *(["digest"] if all(alone) else []))
     found = _divergence(phase, first_difference(streams[0], streams[1], fields), fields)
-    if a.kind not in ("job", "step"):
+    if not is_tabular:  # else a step has the state before it
         found = _reset_divergence(a, b, phase, math.inf if found is None else found.step) or found
-    if found is None:
-        return None
+    if found is None or not any(alone):
+        return found
     if found.field == "digest":
         found = replace(found, a=found.a.hex(), b=found.b.hex())
     return replace(found, a_step=None, b_step=None, actions_alone=True)

@@ -6,9 +6,11 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from runner.analysis.diff import NOT_CONTENT, Cause, Change, Divergence, RunDiff
+from runner.analysis.diff import NOT_CONTENT, RunDiff
+from runner.analysis.diff.causes import Cause
 from runner.analysis.diff.code import FileChange, code_changes, made_in_words
-from runner.analysis.diff.settings import changes_in
+from runner.analysis.diff.divergence import Divergence
+from runner.analysis.diff.settings import Change, changes_in
 from runner.analysis.sections import Grid, Section
 from runner.environments.naming import spoken
 from runner.recording.reader import Recording
@@ -108,17 +110,21 @@ def _amount(value: object) -> str:
 def _values(title: str, difference: RunDiff, field: str, text: Callable[[object], str] = _text) -> Section:
     """Return the values by path of a field: those that differ, then those that are alike."""
     changes: list[Change] = getattr(difference, field)
-    differ = [(change.path, text(change.a), text(change.b)) for change in changes]
     alike = [(path, text(value)) for path, value in difference.alike.get(field, {}).items()]
-    grids = [Grid(("", "A", "B"), differ)] if differ else []
-    return Section(title, grids=[*grids, *([Grid(("", "A and B"), alike)] if alike else [])])
+    same = [Grid(("", "A and B"), alike)] if alike else []
+    return Section(title, grids=[*_changes_grid(changes, text), *same])
+
+
+def _changes_grid(changes: Sequence[Change], text: Callable[[object], str] = _text) -> list[Grid]:
+    """Return a table of values by path in both runs; none without any."""
+    rows = [(change.path, text(change.a), text(change.b)) for change in changes]
+    return [Grid(("", "A", "B"), rows)] if rows else []
 
 
 def made_sections(a: Recording, b: Recording) -> tuple[str, Section, Section]:
     """Return how differently two runs were made: in a sentence, the code, and all of the provenance."""
     files, changes = code_changes(a, b), changes_in(a.provenance, b.provenance)
-    rows = [(change.path, _text(change.a), _text(change.b)) for change in changes]
-    provenance = Section("Provenance", grids=[Grid(("", "A", "B"), rows)] if rows else [])
+    provenance = Section("Provenance", grids=_changes_grid(changes))
     missing = [f"{name} has no recorded code." for name, one in (("A", a), ("B", b)) if not one.code.files]
     code = _code(files)
     if not code.sentences:
@@ -140,7 +146,7 @@ def _code(files: Sequence[FileChange]) -> Section:
 
 def _environment(difference: RunDiff) -> Section:
     environment = difference.environment
-    sentences, grids = [], []
+    sentences, grids = [], _changes_grid(environment.description)
     if environment.transitions:
         share = environment.transitions / environment.of
         sentences.append(
@@ -149,9 +155,6 @@ def _environment(difference: RunDiff) -> Section:
         )
     if environment.other_starts:
         sentences.append("Episodes start in other states, or with other probabilities.")
-    if environment.description:
-        rows = [(change.path, _text(change.a), _text(change.b)) for change in environment.description]
-        grids.append(Grid(("", "A", "B"), rows))
     if environment.examples:
         rows = [(f"{change.state}: {change.action}", change.a, change.b) for change in environment.examples]
         grids.append(Grid(("state: action", "A", "B"), rows))

@@ -209,7 +209,7 @@ def report_command(
 
 
 def _report_sweep(name: str, recordings: Path, to: Writing) -> None:
-    from runner.sweep.page import render_sweep
+    from runner.sweep.charts import render_sweep
     from runner.sweep.results import results_of
     from runner.sweep.state import read_sweep
 

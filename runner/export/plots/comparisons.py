@@ -13,7 +13,7 @@ import numpy as np
 
 from runner.analysis.compare import GroupResult, MetricResult
 from runner.analysis.compare.tasks import AlgorithmResult
-from runner.analysis.diff import TableDiff
+from runner.analysis.diff.tables import TableDiff
 from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.export.plots.chart import Canvas, Chart, Scale, labelled, series_colour, series_marker

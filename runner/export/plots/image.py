@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import IO, Any, Final
+from types import ModuleType
+from typing import IO, TYPE_CHECKING, Final
 
 from runner.drawing import palette
 from runner.errors import RunnerError
 from runner.export.plots.chart import DASHES, MARKERS, Canvas, Cells, Mark, Shape, Text
 from runner.util.extras import require
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from matplotlib.transforms import Transform
 
 SUFFIXES: Final = (".png", ".svg", ".pdf")
 _DPI: Final = 160
@@ -50,7 +55,7 @@ def write_image(canvas: Canvas, target: Path | IO[bytes], form: str, dpi: int = 
         figure.savefig(target, format=form, dpi=dpi, metadata=metadata)
 
 
-def _add_to_figure(mpl: Any, figure: Any, mark: Mark, transform: Any) -> None:
+def _add_to_figure(mpl: ModuleType, figure: Figure, mark: Mark, transform: Transform) -> None:
     if isinstance(mark, Text):
         halo = mpl.patheffects.withStroke(linewidth=3, foreground=palette.WHITE)
         figure.text(

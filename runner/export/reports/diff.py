@@ -9,7 +9,9 @@ from typing import ClassVar, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.diff import Cause, Divergence, Row, RunDiff
+from runner.analysis.diff import RunDiff
+from runner.analysis.diff.causes import Cause, Row
+from runner.analysis.diff.divergence import Divergence
 from runner.analysis.diff.sections import (
     evaluation_updates,
     loop_divergence_in_words,

@@ -102,11 +102,10 @@ def locate_divergence(runs: Sequence[Run]) -> tuple[StepRef | None, str]:
 
 
 def _default_time(recording: Recording, request: Request) -> int:
-    selection = select(recording, request)
-    spans = {"eval": [span for _, span in selection.evaluations], "train": selection.train}
-    for phase, of_phase in spans.items():
-        if of_phase and recording.kind != "variable":
-            return _time(recording, phase, of_phase[-1].start)
+    selected = select(recording, request).by_phase
+    for phase in ("eval", "train"):
+        if selected[phase] and recording.kind != "variable":
+            return _time(recording, phase, selected[phase][-1].start)
     return 0
 
 

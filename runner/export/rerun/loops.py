@@ -22,7 +22,7 @@ from runner.export.rerun.members import Member, entity_name, members_of, numbers
 from runner.export.rerun.metrics import line_colours, phase_colours, series_lines
 from runner.export.rerun.runs import Source
 from runner.export.rerun.scene import scene_of
-from runner.export.rerun.selection import MAX_MEMBERS, Selection, Span
+from runner.export.rerun.selection import MAX_MEMBERS, Selection
 from runner.export.rerun.steps import StepWriter
 from runner.export.values import FEW
 from runner.recording import schema
@@ -70,10 +70,10 @@ class LoopExporter:
         self._last = 0
         """The last step for which anything was sent."""
 
-    def view(self) -> Any:
+    def view(self) -> rrb.Container:
         """Return the arrangement of what `export` has sent."""
         root, title = self._root, self._title
-        left: list[tuple[Any, int]] = []  # views and their shares of the height
+        left: list[tuple[rrb.View | rrb.Container, int]] = []  # views and their shares of the height
         if self._grid is not None:
             left.append((self._grid[0].grid_view(), 4))
         left += [(view, 3) for view in self._frames.views()]
@@ -115,12 +115,11 @@ class LoopExporter:
             view, labels = self._grid
             labels.log(self._stream, self._root)
             view.draw_background(self._stream)
-        spans = {"train": self._selection.train, "eval": [span for _, span in self._selection.evaluations]}
-        for phase in schema.PHASES:
+        for phase, spans in self._selection.by_phase.items():
             if recording.kind == "variable":
-                self._send_rewards(phase, spans[phase])
+                self._send_rewards(phase, spans)
             else:
-                self._send_steps(phase, spans[phase])
+                self._send_steps(phase, spans)
 
     def draw_frames(self, trust: bool, stage: Callable[[str], None]) -> None:
         """Send pictures of the chosen episodes that the environment draws; report what is missing."""
@@ -179,7 +178,7 @@ class LoopExporter:
             self._arrays[name] = None
             self._log(time, f"array/{name}", rr.Tensor(np.atleast_1d(array.values)))
 
-    def _send_steps(self, phase: str, spans: Sequence[Span]) -> None:
+    def _send_steps(self, phase: str, spans: Sequence[range]) -> None:
         """Send steps of every environment and agent, in all their views."""
         recording = self._recording
         grid: StepWriter | None = None
@@ -224,7 +223,7 @@ class LoopExporter:
         ends = [block["log_time"] for block in self._recording.blocks(schema.TRAIN_EPISODE)]
         return np.concatenate([np.empty(0, np.uint64), *ends])
 
-    def _send_rewards(self, phase: str, spans: Sequence[Span]) -> None:
+    def _send_rewards(self, phase: str, spans: Sequence[range]) -> None:
         """Send the rewards of a loop whose steps vary in size."""
         (member,) = self._members
         for span in spans:
@@ -268,7 +267,7 @@ class LoopExporter:
             names = [f"{own}[{i}]" for i in range(numbers.shape[1])]
             self._send_lines(phase, member, quantity, times, numbers, names)
 
-    def _batches(self, topic: schema.Topic, spans: Sequence[Span]) -> Iterator[NDArray[np.void]]:
+    def _batches(self, topic: schema.Topic, spans: Sequence[range]) -> Iterator[NDArray[np.void]]:
         """Yield the steps of all environments, at most a batch of each at a time."""
         recording = self._recording
         size = recording.dtypes[topic].itemsize
@@ -329,7 +328,7 @@ class LoopExporter:
     def _sender(self, part: str) -> Sender:
         return Sender(self._stream, f"{self._root}/{part}" if part else self._root)
 
-    def _plot(self, name: str, entities: Sequence[str]) -> Any:
+    def _plot(self, name: str, entities: Sequence[str]) -> rrb.View:
         contents = [f"{self._root}/{entity}" for entity in entities]
         return rrb.TimeSeriesView(
             origin=f"{self._root}/",

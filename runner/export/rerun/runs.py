@@ -18,7 +18,7 @@ from runner.export.rerun.layout import RunView
 from runner.export.rerun.metrics import MetricWriter
 from runner.export.rerun.q_values import MapWriter, TableWriter
 from runner.export.rerun.scene import scene_of
-from runner.export.rerun.selection import Selection, Span
+from runner.export.rerun.selection import Selection
 from runner.export.rerun.step_values import StepValueReader, StepValues
 from runner.export.rerun.steps import StepWriter
 from runner.recording import schema
@@ -148,7 +148,7 @@ class RunExporter:
                 after = np.full(len(block), evaluation.after, np.int64)
                 yield Piece(block, reader.evaluation(block, evaluation.train_step), after)
 
-    def _blocks(self, phase: str, span: Span) -> Iterator[NDArray[np.void]]:
+    def _blocks(self, phase: str, span: range) -> Iterator[NDArray[np.void]]:
         """Yield the steps of a span, at most a batch at a time, after checking them."""
         recording, topic = self._recording, schema.PHASES[phase][0]
         for block in recording.blocks(topic, span.start, span.stop):

@@ -66,29 +66,21 @@ class Episodes:
         """The number of episodes with steps."""
         return len(self.first_step) - 1
 
-    def spans(self, numbers: NDArray[np.int64]) -> list[Span]:
-        """Return the spans of these episodes, which ascend; neighbours form one span."""
+    def steps_of(self, numbers: NDArray[np.int64]) -> list[range]:
+        """Return the steps of these episodes, which ascend; those of neighbours are one range."""
         groups = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
         first = self.first_step
-        return [Span(int(first[g[0]]), int(first[g[-1] + 1]), int(g[0])) for g in groups if len(g)]
-
-
-@dataclass(frozen=True)
-class Span:
-    """Steps `start` up to `stop` of a phase, of successive whole episodes."""
-
-    start: int
-    stop: int
-    episode: int
-    """The first of these episodes."""
+        return [range(int(first[g[0]]), int(first[g[-1] + 1])) for g in groups if len(g)]
 
 
 @dataclass
 class Selection:
     """The selected steps, and the messages for the user about them."""
 
-    train: list[Span] = field(default_factory=list)
-    evaluations: list[tuple[Evaluation, Span]] = field(default_factory=list)
+    train: list[range] = field(default_factory=list)
+    """The numbers of the steps of successive whole episodes."""
+    evaluations: list[tuple[Evaluation, range]] = field(default_factory=list)
+    """Evaluations of a job, each with its steps; for a loop stands one that has no meaning."""
     drawn: dict[str, list[int]] = field(default_factory=dict)
     """Episodes of a loop of which pictures are drawn, by phase."""
     exported: list[str] = field(default_factory=list)
@@ -96,9 +88,14 @@ class Selection:
     warnings: list[str] = field(default_factory=list)
 
     @property
+    def by_phase(self) -> dict[str, list[range]]:
+        """The selected steps of each phase."""
+        return {"train": self.train, "eval": [steps for _, steps in self.evaluations]}
+
+    @property
     def steps(self) -> int:
         """The number of selected steps."""
-        return _count([*self.train, *(span for _, span in self.evaluations)])
+        return sum(len(steps) for of_phase in self.by_phase.values() for steps in of_phase)
 
 
 def select(recording: Recording, request: Request) -> Selection:
@@ -120,13 +117,13 @@ def select(recording: Recording, request: Request) -> Selection:
     train, evals = episodes_of(recording, "train"), episodes_of(recording, "eval")
     available = evaluations_with_steps(recording, train, evals)
     numbers = _training_episodes(recording, request, np.diff(train.first_step))
-    selection.train = train.spans(numbers)
+    selection.train = train.steps_of(numbers)
     where = str(recording.path)
     chosen = {evaluation_after(available, after, where) for after in request.evaluations}
     chosen |= set(available if request.everything else available[-1:] if request.is_default else ())
     evaluations = sorted(chosen, key=lambda one: one.after)
     selection.evaluations = [
-        (one, span) for one in evaluations for span in evals.spans(np.arange(one.start, one.stop))
+        (one, steps) for one in evaluations for steps in evals.steps_of(np.arange(one.start, one.stop))
     ]
     _describe_training(selection, request, train, numbers)
     _describe_evaluations(selection, available, evaluations)
@@ -195,15 +192,15 @@ def _default_episodes(lengths: NDArray[np.int64], limit: int = DEFAULT_STEPS) ->
     return np.unique([0, len(lengths) - 1]).astype(np.int64)
 
 
-def _steps_without_values(recording: Recording, spans: Sequence[Span]) -> int:
-    """Return how many of the training steps in these spans have unknown Q-values."""
+def _steps_without_values(recording: Recording, ranges: Sequence[range]) -> int:
+    """Return how many of the training steps in these ranges have unknown Q-values."""
     if not recording.lost and next((one.step for one in recording.snapshots()), -1) == 0:
         return 0
     from runner.replay.tables import known_steps  # loads Numba
 
     known, unknown = known_steps(recording), 0
-    for span in spans:
-        for block in recording.blocks(schema.TRAIN_STEP, span.start, span.stop):
+    for steps in ranges:
+        for block in recording.blocks(schema.TRAIN_STEP, steps.start, steps.stop):
             inside = [(block["step"] >= first) & (block["step"] <= last) for first, last in known]
             unknown += len(block) - int(np.any(inside, axis=0).sum())
     return unknown
@@ -214,9 +211,9 @@ def _describe_training(
 ) -> None:
     is_spread = request.is_default and len(numbers)
     spread = f", evenly spread from {numbers[0]} to {numbers[-1]:,}" if is_spread else ""
+    steps = sum(map(len, selection.train))
     selection.exported.append(
-        f"the {_count(selection.train):,} steps of {len(numbers):,} of {train.count:,} training episodes"
-        + spread
+        f"the {steps:,} steps of {len(numbers):,} of {train.count:,} training episodes{spread}"
     )
     if len(numbers) < train.count:
         selection.left_out.append(
@@ -228,7 +225,7 @@ def _describe_training(
 def _describe_evaluations(
     selection: Selection, available: Sequence[Evaluation], evaluations: Sequence[Evaluation]
 ) -> None:
-    steps = _count([span for _, span in selection.evaluations])
+    steps = sum(map(len, selection.by_phase["eval"]))
     named = f" (after {', '.join(f'{one.after:,}' for one in evaluations)} episodes)"
     selection.exported.append(
         f"the {steps:,} steps of {len(evaluations):,} of {len(available):,} evaluations"
@@ -258,20 +255,20 @@ def _select_loop(recording: Recording, request: Request, selection: Selection) -
     is_short = total <= DEFAULT_STEPS or recording.kind == "variable"
     if request.everything or (request.is_default and is_short):
         stop = total if request.everything else min(total, DEFAULT_STEPS)
-        selection.train = [Span(0, stop, 0)] if stop else []
+        selection.train = [range(stop)] if stop else []
     elif n > 1:
         lengths = recording.episodes("train")["length"].astype(np.int64) * n
         numbers = _training_episodes(recording, request, lengths)
         selection.train = _joined([recording.episode_span("train", int(number)) for number in numbers])
     else:
         train = episodes_of(recording, "train")
-        selection.train = train.spans(_training_episodes(recording, request, np.diff(train.first_step)))
+        selection.train = train.steps_of(_training_episodes(recording, request, np.diff(train.first_step)))
     if request.frames:
         _select_drawn(recording, request, selection)
     first = 0 if request.everything else max(0, tested - DEFAULT_STEPS)
     if tested:
-        selection.evaluations = [(Evaluation(0, 0, 0, 0), Span(first, tested, 0))]
-    shown = _count(selection.train)
+        selection.evaluations = [(Evaluation(0, 0, 0, 0), range(first, tested))]
+    shown = sum(map(len, selection.train))
     evaluated = f", {tested - first:,} of {tested:,} of evaluation" if tested else ""
     environments = f" in {n} environments" if n > 1 else ""
     selection.exported.append(f"{shown:,} of {total:,} training steps{evaluated}{environments}")
@@ -320,18 +317,14 @@ def _select_drawn(recording: Recording, request: Request, selection: Selection) 
         )
 
 
-def _joined(episodes: Sequence[range]) -> list[Span]:
-    """Return the steps of episodes of a vector, and of its other environments meanwhile, as few spans."""
-    spans: list[Span] = []
+def _joined(episodes: Sequence[range]) -> list[range]:
+    """Return the steps of episodes of a vector, and of its other environments meanwhile, as few ranges."""
+    joined: list[range] = []
     for steps in sorted(episodes, key=lambda steps: steps.start):
         start = steps.start // steps.step * steps.step
         stop = steps.stop + -steps.stop % steps.step
-        if spans and start <= spans[-1].stop:
-            spans[-1] = dataclasses.replace(spans[-1], stop=max(stop, spans[-1].stop))
+        if joined and start <= joined[-1].stop:
+            joined[-1] = range(joined[-1].start, max(stop, joined[-1].stop))
         else:
-            spans.append(Span(start, stop, 0))
-    return spans
-
-
-def _count(spans: Sequence[Span]) -> int:
-    return sum(span.stop - span.start for span in spans)
+            joined.append(range(start, stop))
+    return joined

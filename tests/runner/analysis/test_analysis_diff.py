@@ -12,10 +12,10 @@ from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from runner.analysis.diff import Change, RunDiff, diff
+from runner.analysis.diff import RunDiff, diff
 from runner.analysis.diff.divergence import FIELDS, first_difference
 from runner.analysis.diff.sections import sections
-from runner.analysis.diff.settings import changes_in
+from runner.analysis.diff.settings import Change, changes_in
 from runner.analysis.sections import markdown
 from runner.cli import cli
 from runner.config import from_mapping

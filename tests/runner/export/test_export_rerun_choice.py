@@ -37,8 +37,7 @@ class TestSelection:
 
     def test_default_is_a_spread_and_the_last_evaluation(self, rivals):
         selection = select(rivals, Request())
-        episodes = [span.episode for span in selection.train]
-        assert episodes[0] == 0
+        assert selection.train[0].start == 0
         last = selection.train[-1]
         assert last.stop == rivals.count(schema.TRAIN_STEP)
         assert [one.after for one, _ in selection.evaluations] == [40]

@@ -7,13 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from runner.sweep.importance import (
-    TREES,
-    effects_of,
-    effects_of_grid,
-    forest_prediction,
-    shares_of_variance,
-)
+from runner.sweep.importance import effects_of, effects_of_grid, shares_of_variance
 from runner.sweep.model import Range
 
 
@@ -69,13 +63,3 @@ def test_the_variance_of_a_whole_grid_is_decomposed_exactly():
     assert effects["x", "y"].share == pytest.approx(1.0)
     assert effects["x",].share == effects["y",].share == 0.0
     assert effects["x", "y"].low <= 1.0
-
-
-def test_a_forest_equals_that_of_scikit_learn():
-    from sklearn.ensemble import RandomForestRegressor
-
-    rng = np.random.default_rng(3)
-    x, points = rng.random((25, 3)), rng.random((50, 3))
-    y = x[:, 0] + 2 * x[:, 1] * x[:, 2]
-    forest = RandomForestRegressor(n_estimators=TREES, random_state=7).fit(x, y)
-    np.testing.assert_array_equal(forest_prediction(x, y, points, 7), forest.predict(points))
