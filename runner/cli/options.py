@@ -26,6 +26,7 @@ from runner.cli.parameter_types import (
     Ranges,
     RunName,
 )
+from runner.runs.run import recordings_folder
 
 if TYPE_CHECKING:
     from runner.export.episodes import EpisodePlace
@@ -51,7 +52,6 @@ recordings_option: Final = option(
 
 
 def _folders(_ctx: click.Context, _param: click.Parameter, value: tuple[Path, ...]) -> tuple[Path, ...]:
-    from runner.runs.run import recordings_folder
 
     return value or (recordings_folder(),)
 

@@ -154,14 +154,15 @@ def _table(columns: Sequence[tuple[str, bool, bool]], rows: Iterable[Iterable[st
 
 
 def facts(pairs: Mapping[str, str]) -> Table:
-    """Return a table of names and values."""
+    """Return a table of names and values, without those that are empty."""
     from rich.table import Table
 
     grid = Table.grid(padding=(0, 2, 0, 0))
     grid.add_column(style="bold", no_wrap=True)
     grid.add_column(overflow="fold")
     for name, text in pairs.items():
-        grid.add_row(name, text)
+        if text:
+            grid.add_row(name, text)
     return grid
 
 

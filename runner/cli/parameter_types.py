@@ -10,6 +10,9 @@ import click
 from click.shell_completion import CompletionItem
 
 from runner.errors import RunnerError
+from runner.runs.catalogue import columns
+from runner.runs.resolve import completions
+from runner.runs.run import recordings_folder
 from runner.util.values import Json
 
 if TYPE_CHECKING:
@@ -71,8 +74,6 @@ class RunName(Completed):
 
 
 def _runs(ctx: click.Context, incomplete: str) -> Mapping[str, str]:
-    from runner.runs.resolve import completions
-    from runner.runs.run import recordings_folder
 
     try:
         return completions(incomplete, recordings_folder(ctx.params.get("recordings")))
@@ -105,12 +106,11 @@ def _shipped(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
 
 
 def _filter_words(_ctx: click.Context, incomplete: str) -> Mapping[str, str]:
-    from runner.runs.catalogue.columns import FIELDS, SETTING, STATUSES
 
     if incomplete.startswith("status:"):
-        return {f"status:{status}": "" for status in STATUSES}
-    words = {f"{name}:": field.meaning for name, field in FIELDS.items()}
-    return words | {SETTING: "a value of the configuration, such as config.discount"}
+        return {f"status:{status}": "" for status in columns.STATUSES}
+    words = {f"{name}:": field.meaning for name, field in columns.FIELDS.items()}
+    return words | {columns.SETTING: "a value of the configuration, such as config.discount"}
 
 
 def _settings(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:

@@ -15,7 +15,8 @@ from runner.cli.output import draw, facts, print_json, say
 from runner.cli.progress import progress_line, steps_line
 from runner.errors import RecordingError, RunnerError, RunNotFound
 from runner.runs.resolve import find_run, find_runs
-from runner.runs.run import RECORDING_FILE, RUN_FILE, SHARDS_FOLDER, recordings_folder
+from runner.runs.run import RECORDING_FILE, RUN_FILE, SHARDS_FOLDER, Run, recordings_folder
+from runner.runs.shards import are_over, shards_in_words
 from runner.util.humanize import UNKNOWN, duration, size
 from runner.util.values import Json, JsonView
 
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from runner.api import Interrupt
     from runner.execution.session import Report
     from runner.recording.reader import Recording
-    from runner.runs.run import Run
 
 # --- finding ----------------------------------------------------------------------------------------------
 
@@ -52,7 +52,6 @@ def folded(run: Run) -> Run:
     if not (run.folder / SHARDS_FOLDER).is_dir():
         return run
     from runner.loops.folding import fold_if_over
-    from runner.runs.shards import are_over, shards_in_words
 
     what = shards_in_words(run)
     if not are_over(run):

@@ -9,10 +9,10 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +30,6 @@ from runner.analysis.groups import grouped, groups_of, metrics_of, require_two
 from runner.analysis.histograms import histograms
 from runner.analysis.qtable import describe_tables, one_array, replay_at
 from runner.analysis.series import parse_target, read_series, series_of
-from runner.analysis.step_reference import StepRef
-from runner.debugging.q_value import why_body
-from runner.debugging.what_if import what_if_in
-from runner.debugging.when import section_of, when_in
-from runner.debugging.why import why_in
 from runner.export.plots.curves import curves_sheet
 from runner.export.plots.image import check_suffix, save
 from runner.export.plots.metrics import Curve, CurveStyle, NoMetrics, Panel, panels_of, smoothed
@@ -50,6 +45,14 @@ from runner.util.values import Json, finite
 TABLE_NAME: Final = "scores.csv"
 """Stands for a table of scores in messages."""
 RecordKind = Literal["evaluations", "training", "optimality"]
+
+
+class Answer(Protocol):
+    """What a question about a recording returns."""
+
+    def as_json(self) -> Json:
+        """Return it as JSON can hold it."""
+        ...
 
 
 def curves(
@@ -184,35 +187,10 @@ def q_table(path: Path, step: int | None, episode: int | None, state: int | None
         return stream.getvalue()
 
 
-def when(path: Path, expression: str, every: bool, first: str | None, last: str | None) -> bytes:
-    """Return when an expression held in training, as `dualtaxi when --json` prints it."""
+def answer(path: Path, question: Callable[..., Answer], *args: object) -> bytes:
+    """Return the answer to a question about a recording, as the command prints it with --json."""
     with open_recording(path) as recording:
-        return as_json(when_in(recording, expression, every, first, last).as_json())
-
-
-def when_section(
-    path: Path, expression: str, every: bool, first: str | None, last: str | None, intervals: int
-) -> bytes:
-    """Return the result of `when` as sentences and tables for a page, as JSON with addresses of replays."""
-    with open_recording(path) as recording:
-        found = when_in(recording, expression, every, first, last, limit=intervals)
-    moments = [each.start.at.replay_address(found.run_id) for each in found.intervals]
-    return as_json({"section": dataclasses.asdict(section_of(found)), "replays": moments})
-
-
-def why(
-    path: Path,
-    form: str,
-    state: str | None,
-    action: str | None,
-    agent: str | None,
-    at: str | None,
-    limit: int,
-) -> bytes:
-    """Return where a Q-value comes from, as `dualtaxi why --json` prints it, or as `html` for a page."""
-    with open_recording(path) as recording:
-        found = why_in(recording, state, action, agent, at, limit)
-    return why_body(found, linked=True).encode() if form == "html" else as_json(found.as_json())
+        return as_json(question(recording, *args).as_json())
 
 
 def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:
@@ -278,12 +256,6 @@ def comparison(
     groups, notes = grouped(series, by)
     require_two(groups, by)
     return as_json(dataclasses.asdict(compare(groups, metrics_of(groups, names), chosen, notes)))
-
-
-def where_actions_lead(path: Path, at: StepRef, actions: tuple[str, ...]) -> bytes:
-    """Return where joint actions at a step lead as JSON, as `dualtaxi branch --json` prints it."""
-    with open_recording(path) as recording:
-        return as_json(what_if_in(recording, at, actions).as_json())
 
 
 def replay(runs: Sequence[Run], request: Request) -> bytes:

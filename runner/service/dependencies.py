@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, TypeVar
 
 from anyio import CapacityLimiter
 from fastapi import Depends, Request, Response
 from fastapi import Path as InPath
+from pydantic import TypeAdapter
 
 from runner.archive.places import at_hand
 from runner.errors import RecordingError
@@ -22,6 +23,8 @@ from runner.service.processes import ProcessPool
 from runner.service.response_cache import ALWAYS, ResponseCache
 from runner.service.settings import Settings
 from runner.service.uploads import Uploads
+
+Shown = TypeVar("Shown")
 
 
 def _state(name: str) -> object:
@@ -124,6 +127,10 @@ class Computation:
                 return await self._processes(function, *args)
 
         return await self._cache.get_or_await((function, *map(_state_of, args)), call, ALWAYS)
+
+    async def shown(self, kind: type[Shown], function: Callable[..., bytes], *args: object) -> Shown:
+        """Return the dataclass whose fields a function returns as JSON."""
+        return TypeAdapter(kind).validate_json(await self(function, *args))
 
     async def json(self, function: Callable[..., bytes], *args: object, alone: bool = False) -> Response:
         """Return the JSON that a function returns as a response."""

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import base64
-import json
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -19,10 +18,14 @@ from runner.analysis.compare.task_sections import task_sections
 from runner.analysis.compare.tasks import compare_algorithms
 from runner.analysis.diff import diff, with_seconds, without_ignored
 from runner.analysis.histograms import histograms
+from runner.analysis.sections import Grid, Section
 from runner.analysis.series import series_of
 from runner.analysis.step_reference import StepRef
 from runner.analysis.summary import random_policy_sentence
+from runner.debugging.q_value import why_body
 from runner.debugging.what_if import branch_playback, what_if_in
+from runner.debugging.when import section_of, when_in
+from runner.debugging.why import why_in
 from runner.drawing import svg
 from runner.environments.naming import actions_in_words, joint_action
 from runner.errors import RecordingError
@@ -47,7 +50,8 @@ from runner.recording.messages import media_type
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.addresses import link, places_in
-from runner.service.computed import TABLE_NAME
+from runner.service.computed import TABLE_NAME, as_json
+from runner.util.values import Json
 
 MAX_OUTPUT_LINES: Final = 1000
 """Lines of output that a page shows."""
@@ -58,6 +62,58 @@ _STEPS_BEFORE: Final = 1
 """Steps before the first one of a part, so that it includes the step that led there."""
 
 
+@dataclass(frozen=True)
+class ShownBranches:
+    """Where each joint action at a step leads, and a part of the episode to which one of them leads."""
+
+    facts: dict[str, str]
+    notes: Sequence[str]
+    action: int
+    """The action whose branch is shown, and its name."""
+    name: str
+    picture: str
+    """The grid in the state of the step, as SVG; empty without a scene."""
+    matrix: str
+    """The actions of two agents, as SVG; empty for other environments."""
+    grid: Grid
+    addresses: list[str]
+    """The page of each action's branch."""
+    part: Json
+    """As for `episode_part`."""
+
+
+@dataclass(frozen=True)
+class ShownWhen:
+    """When an expression held."""
+
+    section: Section
+    replays: list[str]
+    """Address of the replay of each interval's first step."""
+
+
+@dataclass(frozen=True)
+class ShownDifference:
+    """The difference of two runs."""
+
+    lead: str
+    notes: Sequence[str]
+    first_frame: str | None
+    """The first frame of the replays that differs; None if there is none."""
+    body: str
+    tables: str
+    """Their Q-tables, as HTML as the body is."""
+
+
+@dataclass(frozen=True)
+class Output:
+    """Lines of output."""
+
+    lines: list[tuple[float, int, str, str]]
+    """Seconds, number of steps, stream and text of the last lines that were found."""
+    found: int
+    total: int
+
+
 def episode_part(path: Path, which: tuple[int, ...], start: int, steps: int) -> bytes:
     """Return a part of an episode as JSON for `replay.js`; `which` as for `place_of`."""
     with open_recording(path) as recording:
@@ -65,21 +121,17 @@ def episode_part(path: Path, which: tuple[int, ...], start: int, steps: int) -> 
         scene = recording.environment["scene"] if episode.grid else None
         has_pictures, note = picture_note(recording, "train" if len(which) == 1 else "eval")
         data = {"episode": asdict(episode), "scene": scene}
-        data |= {"has_pictures": has_pictures, "picture_note": note}
-        return json.dumps(data, separators=(",", ":"), ensure_ascii=False).encode(errors="replace")
+        return as_json(data | {"has_pictures": has_pictures, "picture_note": note})
 
 
 def branch_part(path: Path, at: StepRef, action: str, start: int, steps: int) -> bytes:
     """Return a part of the episode to which a joint action leads, as `episode_part` does."""
     with open_recording(path) as recording:
-        return _branch_part(recording, at, action, start, steps)
+        return as_json(_branch_part(recording, at, action, start, steps))
 
 
 def what_if_page(run: Run, at: StepRef, action: str | None, start: int, steps: int) -> bytes:
-    """Return where each joint action at a step leads, as JSON for its page, and a part of one branch.
-
-    The branch is that of `action`, None for the recorded one.
-    """
+    """Return `ShownBranches` as JSON; the branch shown is that of `action`, None for the recorded one."""
 
     def address(number: int) -> str:
         return f"/runs/{run.run_id}/what-if/{at}/{number}"
@@ -89,27 +141,43 @@ def what_if_page(run: Run, at: StepRef, action: str | None, start: int, steps: i
         number = next(row.action for row in found.actions if row.is_recorded)
         if action is not None:
             number = joint_action(recording.mdp, action)
-        part = _branch_part(recording, at, str(number), start, steps)
-        shown = {
-            "facts": found.facts,
-            "notes": found.notes,
-            "action": number,
-            "name": str(actions_in_words(recording.mdp)[number]),
-            "picture": found.picture(style=""),
-            "matrix": found.matrix(address),
-            "grid": asdict(found.grid),
-            "addresses": [address(row.action) for row in found.actions],
-            "part": json.loads(part),
-        }
-        return json.dumps(shown, ensure_ascii=False).encode(errors="replace")
+        shown = ShownBranches(
+            facts=found.facts,
+            notes=found.notes,
+            action=number,
+            name=str(actions_in_words(recording.mdp)[number]),
+            picture=found.picture(style=""),
+            matrix=found.matrix(address),
+            grid=found.grid,
+            addresses=[address(row.action) for row in found.actions],
+            part=_branch_part(recording, at, str(number), start, steps),
+        )
+        return as_json(asdict(shown))
 
 
-def _branch_part(recording: Recording, at: StepRef, action: str, start: int, steps: int) -> bytes:
+def when(
+    path: Path, expression: str, every: bool, first: str | None, last: str | None, intervals: int
+) -> bytes:
+    """Return `ShownWhen` as JSON, with at most some intervals."""
+    with open_recording(path) as recording:
+        found = when_in(recording, expression, every, first, last, limit=intervals)
+    replays = [each.start.at.replay_address(found.run_id) for each in found.intervals]
+    return as_json(asdict(ShownWhen(section_of(found), replays)))
+
+
+def why(
+    path: Path, state: str | None, action: str | None, agent: str | None, at: str | None, limit: int
+) -> bytes:
+    """Return where a Q-value comes from, as HTML."""
+    with open_recording(path) as recording:
+        return why_body(why_in(recording, state, action, agent, at, limit), linked=True).encode()
+
+
+def _branch_part(recording: Recording, at: StepRef, action: str, start: int, steps: int) -> Json:
     episode = branch_playback(recording, at, action, steps, max(0, start - _STEPS_BEFORE))
     scene = recording.environment["scene"] if episode.grid else None
     note = "" if scene else "The environment has no scene to draw."
-    data = {"episode": asdict(episode), "scene": scene, "has_pictures": False, "picture_note": note}
-    return json.dumps(data, separators=(",", ":"), ensure_ascii=False).encode(errors="replace")
+    return {"episode": asdict(episode), "scene": scene, "has_pictures": False, "picture_note": note}
 
 
 def random_policy(path: Path) -> bytes:
@@ -214,9 +282,9 @@ def pictures(path: Path) -> bytes:
 
 
 def console(path: Path, sought: str, stream: str) -> bytes:
-    """Return the output of a run as JSON: `total` lines, those `found`, and the last of them, `lines`.
+    """Return `Output` as JSON: the lines with the text that is sought, in any case.
 
-    Lines must have the text that is sought, in any case; `stream` is `stdout`, `stderr`, or empty for both.
+    `stream` is `stdout`, `stderr`, or empty for both.
     """
     with open_recording(path) as recording:
         clock = read_clock(recording)
@@ -225,14 +293,11 @@ def console(path: Path, sought: str, stream: str) -> bytes:
         line for line in every if sought.casefold() in line.text.casefold() and stream in ("", line.stream)
     ]
     lines = [(line.seconds, line.position, line.stream, line.text) for line in found[-MAX_OUTPUT_LINES:]]
-    return json.dumps({"lines": lines, "found": len(found), "total": len(every)}).encode()
+    return as_json(asdict(Output(lines, len(found), len(every))))
 
 
 def difference(a: Run, b: Run) -> bytes:
-    """Return the difference of two runs as JSON.
-
-    Its keys: `lead`, `notes`, `first_frame` (of the replays, that differs; may be null), `body` and `tables`.
-    """
+    """Return `ShownDifference` as JSON."""
     with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
         view = difference_view(without_ignored(with_seconds(diff(ours, theirs), a, b), ()), ours, theirs)
 
@@ -248,14 +313,14 @@ def difference(a: Run, b: Run) -> bytes:
     shown = partials()
     body = [shown.divergences(list(map(linked, view.divergences)), view.training, view.visits)]
     body += [shown.section(other.title.lower(), other.title, other) for other in view.others]
-    found = {
-        "lead": view.lead,
-        "notes": view.notes,
-        "first_frame": str(view.divergences[0].frame) if view.divergences else None,
-        "body": "".join(body),
-        "tables": shown.tables(view.tables, view.table_figures),
-    }
-    return json.dumps(found).encode()
+    found = ShownDifference(
+        lead=view.lead,
+        notes=view.notes,
+        first_frame=str(view.divergences[0].frame) if view.divergences else None,
+        body="".join(body),
+        tables=shown.tables(view.tables, view.table_figures),
+    )
+    return as_json(asdict(found))
 
 
 def timeline_step(run: Run, at: StepRef | None) -> bytes:

@@ -19,13 +19,13 @@ from runner.cli.parameter_types import COUNT, INDEX, PLACE
 from runner.cli.progress import steps_line
 from runner.cli.runs import command_for, compilation_notice, find_recorded, run_as_json, run_facts
 from runner.errors import ExitCode
+from runner.runs.run import Run
 from runner.util.humanize import counted, number
 
 if TYPE_CHECKING:
     from runner.analysis.step_reference import StepRef
     from runner.execution.branching import TrainingBranch
     from runner.loops.branch import Branch
-    from runner.runs.run import Run
 
 
 @click.command("branch", cls=Command)

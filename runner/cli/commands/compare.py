@@ -28,7 +28,7 @@ from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_all_recorded, find_recorded
 from runner.errors import ExitCode
 from runner.export.places import write_text_new
-from runner.util.humanize import size
+from runner.util.humanize import counted, size
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -158,7 +158,7 @@ def _compare_groups(
 
         page = render_comparison(comparison, groups)
     count = sum(len(group.runs) for group in groups)
-    named = "1 metric" if len(comparison.metrics) == 1 else f"{len(comparison.metrics)} metrics"
+    named = counted(len(comparison.metrics), "metric")
     return _Made(comparison, sections(comparison), f"{named} of {count} runs in {len(groups)} groups", page)
 
 

@@ -21,6 +21,7 @@ from runner.cli.parameter_types import GRID
 from runner.cli.progress import count_line
 from runner.cli.runs import opened_run
 from runner.errors import ExitCode
+from runner.export.places import require_new, write_new
 from runner.util.humanize import size
 
 if TYPE_CHECKING:
@@ -83,7 +84,6 @@ def command(
     from runner.export import film
     from runner.export.encoder import format_of
     from runner.export.pictures import Source, pictures, source_of
-    from runner.export.places import require_new, write_new
 
     with opened_run(run_name, to.recordings) as (run, recording):
         path = to.path(run.file_stem)

@@ -18,15 +18,14 @@ from runner.cli.parameter_types import FILE, ConfigName, RunName
 from runner.cli.progress import bytes_line
 from runner.cli.runs import find_recorded, print_received
 from runner.errors import ExitCode, RunnerError
-from runner.runs.run import recordings_folder
-from runner.util.humanize import UNKNOWN, size
+from runner.runs.run import Run, recordings_folder
+from runner.util.humanize import UNKNOWN, counted, size
 from runner.util.values import Json
 
 if TYPE_CHECKING:
     from runner.client.client import Client, UploadStatus
     from runner.client.connection import Report
     from runner.client.jobs import RemoteJob
-    from runner.runs.run import Run
 
     Upload = Callable[[Report], dict[str, object]]
 
@@ -223,7 +222,7 @@ def submit(
     with server.client() as client:
         file = config_path(file)
         job = client.submit(self_contained_text(file), file.name)
-        runs = "1 run" if job.runs == 1 else f"{job.runs:,} runs"
+        runs = counted(job.runs, "run")
         say(f"Job {job.number}: {job.name}, {runs}; {client.url}/queue/{job.number}")
         if is_watched:
             job = _watched(client, job.number)
@@ -326,8 +325,8 @@ def _print_job(job: RemoteJob, as_json: bool) -> None:
         print_json(_job_as_json(job))
         return
     runs = "\n".join(f"{run_id}  seed {seed}" for seed, run_id in job.begun.items())
-    rows = {"job": f"{job.number}  {job.name}, {job.state}", "runs": runs or UNKNOWN, "error": job.error}
-    draw(facts({key: text for key, text in rows.items() if text}))
+    title = f"{job.number}  {job.name}, {job.state}"
+    draw(facts({"job": title, "runs": runs or UNKNOWN, "error": job.error}))
 
 
 def _job_as_json(job: RemoteJob) -> dict[str, object]:

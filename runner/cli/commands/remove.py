@@ -20,12 +20,11 @@ from runner.cli.runs import find
 from runner.errors import RunnerError
 from runner.runs.catalogue.columns import STATUSES
 from runner.runs.listing import run_in
-from runner.runs.run import recordings_folder
+from runner.runs.run import Run, recordings_folder
 from runner.util.humanize import UNKNOWN, age, counted, number, size
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.removal import Removal
-    from runner.runs.run import Run
 
 _MAX_DRAWN: Final = 1000
 """Rows that are fitted to a terminal; more are printed as in a file, which is far quicker."""
@@ -213,9 +212,7 @@ def _carry_out(
     elif dry_run:
         say(f"Nothing was removed; it would free {size(freed)}.")
     else:
-        click.echo(
-            f"Removed {'1 run' if len(removals) == 1 else f'{len(removals):,} runs'}, freed {size(freed)}."
-        )
+        click.echo(f"Removed {counted(len(removals), 'run')}, freed {size(freed)}.")
 
 
 def _as_json(removal: Removal) -> dict[str, object]:

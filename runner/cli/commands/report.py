@@ -24,7 +24,7 @@ from runner.cli.runs import find_all_recorded
 from runner.export.places import write_new, write_text_new
 from runner.runs.run import recordings_folder
 from runner.sweep import is_sweep
-from runner.util.humanize import size
+from runner.util.humanize import counted, size
 
 if TYPE_CHECKING:
     from runner.analysis.axes import Axis
@@ -100,7 +100,7 @@ def plot_command(
     with stage_line("drawing"):
         write_new(output, to.force, lambda path: save(curves_sheet(groups, panels, style), path))
     count = sum(len(group.runs) for group in groups)
-    text = f"{output}: {len(panels)} metric{'s' if len(panels) != 1 else ''} of {_runs(count)}"
+    text = f"{output}: {counted(len(panels), 'metric')} of {counted(count, 'run')}"
     to.report(text, output, metrics=len(panels), runs=count)
 
 
@@ -204,7 +204,7 @@ def report_command(
         )
     for note in notes:
         say(note)
-    text = f"{output}: {size(output.stat().st_size)}, {_runs(len(paths))}"
+    text = f"{output}: {size(output.stat().st_size)}, {counted(len(paths), 'run')}"
     to.report(text, output, runs=len(paths))
 
 
@@ -218,7 +218,3 @@ def _report_sweep(name: str, recordings: Path, to: Writing) -> None:
         write_text_new(to.path(), to.force, render_sweep(results, recordings))
     output = to.path()
     to.report(f"{output}: {size(output.stat().st_size)}, the sweep {name}", output, sweep=name)
-
-
-def _runs(count: int) -> str:
-    return "1 run" if count == 1 else f"{count} runs"

@@ -30,12 +30,11 @@ from runner.cli.runs import (
     run_facts,
 )
 from runner.errors import ExitCode
-from runner.runs.run import recordings_folder
+from runner.runs.run import Run, recordings_folder
 from runner.util.humanize import number
 
 if TYPE_CHECKING:
     from runner.execution.rerecord import Start
-    from runner.runs.run import Run
 
 
 @click.command("resume", cls=Command)

@@ -18,7 +18,7 @@ from runner.cli.parameter_types import COUNT, INDEX
 from runner.cli.progress import count_line, progress_line
 from runner.cli.runs import command_for, compilation_notice, run_as_json, run_facts
 from runner.errors import ExitCode
-from runner.runs.run import create_run, recordings_folder, unless_empty
+from runner.runs.run import Run, create_run, recordings_folder, unless_empty
 from runner.util.humanize import amount, size
 from runner.util.values import checked_name
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:  # a run is written to disk before heavy packages are imported
     from runner.config import ExperimentConfig
     from runner.config.job import Job
     from runner.export.rerun.live import LiveView
-    from runner.runs.run import Run
 
     Watch = Callable[[Run], LiveView]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
+from click.shell_completion import get_completion_class
 
 from runner.cli.command import Command, Group, argument
 from runner.cli.options import config_argument, json_option, output_option, set_option
@@ -151,8 +152,6 @@ def completion_command(
       dualtaxi completion bash >> ~/.bashrc                    from now on
       dualtaxi completion fish > ~/.config/fish/completions/dualtaxi.fish
     """
-    from click.shell_completion import get_completion_class
-
     from runner.cli import cli
 
     kind = get_completion_class(shell)

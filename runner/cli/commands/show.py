@@ -15,6 +15,8 @@ from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import console, draw, facts, patch_text, print_json, printable, say, title
 from runner.cli.progress import stage_line
 from runner.cli.runs import command_for, find, restored
+from runner.runs.branches import Origin, origin_in
+from runner.runs.run import Run
 from runner.util.humanize import UNKNOWN, age, counted, duration, number, size
 from runner.util.values import JsonView
 
@@ -25,8 +27,6 @@ if TYPE_CHECKING:
     from runner.recording.maker import Shard
     from runner.recording.reader import Recording
     from runner.recording.run_file import Summary
-    from runner.runs.branches import Origin
-    from runner.runs.run import Run
 
 MAX_PROCESSES: Final = 16
 """Names of processes shown."""
@@ -63,7 +63,6 @@ def show_command(
       dualtaxi show k3v9m2xq --code | git apply
     """
     from runner.analysis.summary import describe_run
-    from runner.runs.branches import origin_in
     from runner.runs.catalogue.index import look
 
     run = restored(find(run_name, recordings))
@@ -158,7 +157,6 @@ def _parts(details: RunDetails, branches: Mapping[str, Origin]) -> list[Renderab
 
 
 def _head(details: RunDetails) -> dict[str, str]:
-    from runner.runs.branches import origin_in
 
     run, summary, origin = details.run, details.run.summary, origin_in(details.config)
     ago = age((datetime.now(UTC) - run.created).total_seconds())
@@ -172,7 +170,7 @@ def _head(details: RunDetails) -> dict[str, str]:
         time = f"{duration(clock.duration)} recorded"
         if details.train_steps or details.eval_steps:
             time += f", {clock.steps_a_second:,.0f} steps a second"
-    head = {
+    return {
         "run": f"{run.run_id}  {run.title}",
         "status": f"{run.status}, begun {ago} ago{took}",
         "damage": run.problem,
@@ -184,7 +182,6 @@ def _head(details: RunDetails) -> dict[str, str]:
         "digest": summary.content_digest or f"{UNKNOWN} (written when a run ends properly)",
         "file": f"{run.recording}  {size(details.bytes)}" if details.bytes else "no recording",
     }
-    return {key: text for key, text in head.items() if text}
 
 
 def _processes(shards: Sequence[Shard]) -> str:

@@ -16,13 +16,13 @@ from runner.cli.progress import bytes_line, count_line
 from runner.cli.runs import command_for, find_recording, job_progress, require_over
 from runner.errors import Diverged, ExitCode
 from runner.runs.locking import locked
+from runner.runs.run import Run
 from runner.util.humanize import UNKNOWN, counted, size
 
 if TYPE_CHECKING:
     from runner.execution.redo import Redone
     from runner.execution.verification import Verification
     from runner.recording.repair import Repair
-    from runner.runs.run import Run
 
 
 @click.command("verify", cls=Command)
@@ -125,7 +125,7 @@ def _redone(redone: Redone) -> dict[str, str]:
         )
         if redone.verdict == "differs" and not redone.versions:
             rows["differs"] = "no version: the same packages and platform as recorded"
-    return {key: text for key, text in rows.items() if text}
+    return rows
 
 
 def _redone_as_json(redone: Redone) -> dict[str, object]:
@@ -162,7 +162,7 @@ def _verification(found: Verification, rerun: bool) -> dict[str, str]:
     )
     if rerun and not found.provenance:
         rows["differs"] = "nothing: the same code, packages and processor"
-    return {key: text for key, text in rows.items() if text}
+    return rows
 
 
 def _verification_as_json(found: Verification, rerun: bool) -> dict[str, object]:

@@ -16,6 +16,7 @@ from runner.cli.output import say
 from runner.cli.parameter_types import PICTURE_SIZE, STEP, RunName
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_recorded
+from runner.export.places import require_new
 
 if TYPE_CHECKING:
     from runner.analysis.step_reference import StepRef
@@ -75,7 +76,6 @@ def view_command(
     """
     if len(run_names) > 2:
         raise click.UsageError(f"found {len(run_names)} runs, expected one or two.")
-    from runner.export.places import require_new
     from runner.export.rerun.viewer import require_rerun
 
     require_rerun("view")

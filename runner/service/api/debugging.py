@@ -11,7 +11,9 @@ from pydantic import BaseModel
 from runner.analysis.step_reference import EXPECTED, StepRef
 from runner.debugging.action_outcomes import ActionOutcome, Outcome
 from runner.debugging.expressions import MAX_CHARACTERS
-from runner.debugging.why import LIMIT, MAX_LIMIT
+from runner.debugging.what_if import what_if_in
+from runner.debugging.when import when_in
+from runner.debugging.why import LIMIT, MAX_LIMIT, why_in
 from runner.service import computed, fragments
 from runner.service.api.replay import STEPS, Part, Start, Steps
 from runner.service.dependencies import RunComputationOf
@@ -78,7 +80,7 @@ async def what_if(
     ] = None,
 ) -> Response:
     """Return what `dualtaxi branch --action all --json` prints; of a run that was trained here."""
-    return await compute.json(computed.where_actions_lead, StepRef.parse(at), tuple(action or ()))
+    return await compute.json(computed.answer, what_if_in, StepRef.parse(at), tuple(action or ()))
 
 
 @router.get(
@@ -104,7 +106,7 @@ async def when(
     last: Annotated[StepText, Query(alias="to")] = None,
 ) -> Response:
     """Return what `dualtaxi when --json` prints; of a run that was trained here."""
-    return await compute.json(computed.when, expression, every, first, last)
+    return await compute.json(computed.answer, when_in, expression, every, first, last)
 
 
 @router.get(
@@ -121,4 +123,4 @@ async def why(
     limit: Annotated[int, Query(ge=0, le=MAX_LIMIT, description="Most steps, 0 for all.")] = LIMIT,
 ) -> Response:
     """Return where a Q-value comes from, as `dualtaxi why --json` prints it; of a run trained here."""
-    return await compute.json(computed.why, "json", state, action, agent, at, limit, alone=True)
+    return await compute.json(computed.answer, why_in, state, action, agent, at, limit, alone=True)

@@ -27,11 +27,11 @@ from runner.service.addresses import link, places_in
 from runner.service.api.comparing import MAX_SCORES, found_runs
 from runner.service.api.reading import AxisName
 from runner.service.dependencies import CatalogueOf, ComputationOf
+from runner.service.fragments import ShownDifference
 from runner.service.pages.frame import RunHead, has_tables, head_of, last_evaluation
 from runner.service.pages.panels import Panel, panel_of
 from runner.service.pages.rendering import page
 from runner.util import humanize
-from runner.util.values import Json
 
 router = APIRouter(prefix="/compare", include_in_schema=False)
 
@@ -114,9 +114,7 @@ class _OverviewView(CompareView):
 @dataclass(frozen=True)
 class _DivergenceView(CompareView):
     TEMPLATE: ClassVar = "compare_divergence.html"
-    lead: str
-    notes: list[str]
-    body: str
+    found: ShownDifference
 
 
 @dataclass(frozen=True)
@@ -200,9 +198,9 @@ async def divergence(
 ) -> Response:
     """Show the first step at which two runs differ, and the cause."""
     runs = _two(await _chosen(catalogue, run))
-    found = await _difference(runs, compute)
+    found = await compute.shown(ShownDifference, fragments.difference, *runs)
     compared = _compared(runs, "/divergence")
-    view = _DivergenceView(compared, found["lead"], found["notes"], found["body"])
+    view = _DivergenceView(compared, found)
     return await run_in_threadpool(page, request, view)
 
 
@@ -212,7 +210,7 @@ async def tables(
 ) -> Response:
     """Show the difference of the Q-tables of two runs."""
     runs = _two(await _chosen(catalogue, run))
-    body = (await _difference(runs, compute))["tables"]
+    body = (await compute.shown(ShownDifference, fragments.difference, *runs)).tables
     return await run_in_threadpool(page, request, _TablesView(_compared(runs, "/tables"), body))
 
 
@@ -242,7 +240,7 @@ async def replay(
     if at:
         step = StepRef.parse(at)
     else:
-        first = (await _difference(runs, compute))["first_frame"]
+        first = (await compute.shown(ShownDifference, fragments.difference, *runs)).first_frame
         step = StepRef.parse(first) if first else StepRef(0)
     names, places = [each.run_id for each in runs], places_in(runs, step)
 
@@ -291,13 +289,6 @@ def _two(runs: list[Run]) -> list[Run]:
     if len(runs) != 2:
         raise RunnerError(f"found {len(runs)} runs, expected two: only two are compared step by step.")
     return runs
-
-
-async def _difference(runs: list[Run], compute: ComputationOf) -> Json:
-    """Return the difference of two runs, see `fragments.difference`."""
-    body = await compute(fragments.difference, *runs)
-    found: Json = await run_in_threadpool(json.loads, body)
-    return found
 
 
 def _compared(runs: list[Run], here: str) -> Compared:

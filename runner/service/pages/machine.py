@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Annotated, ClassVar, Literal
@@ -15,6 +14,7 @@ from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.addresses import link
 from runner.service.dependencies import RecordedRun, RunComputationOf
+from runner.service.fragments import Output
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import page
 
@@ -34,23 +34,13 @@ class _SystemView(RunView):
 
 
 @dataclass(frozen=True)
-class Output:
-    """Lines of output."""
-
-    lines: list[tuple[float, int, str, str]]
-    """Seconds, number of steps, stream and text of the last lines that were found."""
-    found: int
-    total: int
-
-
-@dataclass(frozen=True)
 class _ConsoleView(RunView):
     TEMPLATE: ClassVar = "run_console.html"
     output: Output
     sought: str
     stream: Stream
     live: str
-    """As in the other view."""
+    """As in `_SystemView`."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +77,7 @@ async def console(
     request: Request, run: RecordedRun, compute: RunComputationOf, sought: Sought = "", stream: Stream = ""
 ) -> Response:
     """Show the last lines of the output, or the last that have a text."""
-    output = await _output(compute, sought, stream)
+    output = await compute.shown(Output, fragments.console, sought, stream)
     live = _live(run, "console/part", q=sought, stream=stream)
     view = _ConsoleView(head_of(run), "console", output, sought, stream, live)
     return await run_in_threadpool(page, request, view)
@@ -105,11 +95,7 @@ async def console_part(
     """Return the lines alone; 204 if the run no longer has this status."""
     if run.status != status:
         return Response(status_code=HTTPStatus.NO_CONTENT)
-    return page(request, _LinesView(await _output(compute, sought, stream)))
-
-
-async def _output(compute: RunComputationOf, sought: str, stream: Stream) -> Output:
-    return Output(**json.loads(await compute(fragments.console, sought, stream)))
+    return page(request, _LinesView(await compute.shown(Output, fragments.console, sought, stream)))
 
 
 def _live(run: Run, path: str, **query: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
@@ -10,12 +9,12 @@ from fastapi import APIRouter, Request, Response
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
-from runner.analysis.sections import Grid
 from runner.analysis.step_reference import StepRef
 from runner.service import fragments
 from runner.service.api.debugging import At
 from runner.service.api.replay import STEPS
 from runner.service.dependencies import ComputationOf, RecordedRun
+from runner.service.fragments import ShownBranches
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import page
 from runner.service.pages.replay import BEFORE, ShownStep, T, shown_step
@@ -29,17 +28,7 @@ class _WhatIfView(RunView):
     TEMPLATE: ClassVar = "run_what_if.html"
     at: str
     title: str
-    facts: dict[str, str]
-    notes: list[str]
-    name: str
-    """The action whose branch is shown."""
-    picture: str
-    """The grid in the state of the step, as SVG; empty without a scene."""
-    matrix: str
-    """The actions of two agents, as SVG; empty for other environments."""
-    grid: Grid
-    addresses: list[str]
-    """The page of each action's branch."""
+    found: ShownBranches
     step: ShownStep
     source: str
     """Address of the branch's data."""
@@ -61,25 +50,17 @@ async def what_if(
     step = StepRef.parse(at)
     shown_t = step.t if t is None else t
     start = max(0, shown_t - BEFORE)
-    body = await compute(fragments.what_if_page, run, step, action, start, STEPS)
+    found = await compute.shown(ShownBranches, fragments.what_if_page, run, step, action, start, STEPS)
 
     def show() -> Response:
-        found = json.loads(body)
-        address = f"/runs/{run.run_id}/what-if/{step}"
         view = _WhatIfView(
             run=head_of(run),
             here="replay",
             at=str(step),
             title=f"What if? {step.episode_name}, step {step.t:,}",
-            facts=found["facts"],
-            notes=found["notes"],
-            name=found["name"],
-            picture=found["picture"],
-            matrix=found["matrix"],
-            grid=Grid(**found["grid"]),
-            addresses=found["addresses"],
-            step=shown_step(found["part"], shown_t),
-            source=f"/api/v1{address}/{found['action']}",
+            found=found,
+            step=shown_step(found.part, shown_t),
+            source=f"/api/v1/runs/{run.run_id}/what-if/{step}/{found.action}",
             recorded=f"/runs/{run.run_id}/replay/{step.episode_path}?t={step.t}",
         )
         return page(request, view)

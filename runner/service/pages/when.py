@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Annotated, ClassVar, Final
 
 from fastapi import APIRouter, Query, Request, Response
 
-from runner.analysis.sections import Grid
 from runner.debugging.expressions import MAX_CHARACTERS
 from runner.errors import RunnerError
-from runner.service import computed
+from runner.service import fragments
 from runner.service.dependencies import RecordedRun, RunComputationOf
+from runner.service.fragments import ShownWhen
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import message_of, page
 
@@ -31,10 +30,7 @@ class _WhenView(RunView):
     every: bool
     first: str
     last: str
-    sentences: list[str]
-    grids: list[Grid]
-    replays: list[str]
-    """Address of the replay of each interval's first step."""
+    found: ShownWhen | None = None
     problem: str = ""
 
 
@@ -51,14 +47,10 @@ async def when(
     """Show the form, and the steps after which its expression holds."""
     form = (head_of(run), "when", expression, every, first, last)
     if not expression.strip():
-        return page(request, _WhenView(*form, [], [], []))
+        return page(request, _WhenView(*form))
+    options = (expression, every, first or None, last or None, INTERVALS)
     try:
-        found = json.loads(
-            await compute(computed.when_section, expression, every, first or None, last or None, INTERVALS)
-        )
+        found = await compute.shown(ShownWhen, fragments.when, *options)
     except RunnerError as error:
-        view = _WhenView(*form, [], [], [], message_of(error, request))
-        return page(request, view, HTTPStatus.BAD_REQUEST)
-    section = found["section"]
-    grids = [Grid(tuple(grid["headings"]), grid["rows"]) for grid in section["grids"]]
-    return page(request, _WhenView(*form, section["sentences"], grids, found["replays"]))
+        return page(request, _WhenView(*form, None, message_of(error, request)), HTTPStatus.BAD_REQUEST)
+    return page(request, _WhenView(*form, found))

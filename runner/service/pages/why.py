@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Final
 from fastapi import APIRouter, Query, Request, Response
 
 from runner.errors import RunnerError
-from runner.service import computed
+from runner.service import fragments
 from runner.service.dependencies import OpenRecording, RecordedRun, RunComputationOf
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import message_of, page
@@ -49,7 +49,7 @@ async def why(
     if state or action or at:
         given = (text.strip() or None for text in (state, action, agent, at))
         try:
-            body = await compute(computed.why, "html", *given, STEPS, alone=True)
+            body = await compute(fragments.why, *given, STEPS, alone=True)
         except RunnerError as error:
             problem = message_of(error, request)
     view = _WhyView(head_of(run), "why", recording.agents, state, action, agent, at, body.decode(), problem)
