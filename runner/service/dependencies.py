@@ -11,6 +11,7 @@ from fastapi import Depends, Request, Response
 from fastapi import Path as InPath
 from pydantic import TypeAdapter
 
+from runner.analysis.step_reference import StepRef
 from runner.archive.places import at_hand
 from runner.errors import RecordingError
 from runner.recording.reader import Recording, open_recording
@@ -87,6 +88,27 @@ def opened_recording(run: RecordedRun) -> Iterator[Recording]:
 
 
 OpenRecording = Annotated[Recording, Depends(opened_recording)]
+EpisodeNumber = Annotated[int, InPath(ge=0, lt=2**62, description="Counted from 0.")]
+After = Annotated[
+    int, InPath(ge=0, lt=2**62, description="The evaluation after this number of training episodes.")
+]
+
+
+def training_episode(episode: EpisodeNumber) -> StepRef:
+    """Return the training episode that the path names."""
+    return StepRef(episode)
+
+
+def trial_of_evaluation(after: After, trial: EpisodeNumber) -> StepRef:
+    """Return the trial that the path names."""
+    return StepRef(trial, after=after)
+
+
+EPISODES: Final[dict[str, Callable[..., StepRef]]] = {
+    "/train/{episode}": training_episode,
+    "/eval/{after}/{trial}": trial_of_evaluation,
+}
+"""The ends of paths that name an episode, and the dependencies that return it."""
 
 
 def recording_state(run: Run) -> tuple[str, int, int]:

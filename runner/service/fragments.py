@@ -114,12 +114,12 @@ class Output:
     total: int
 
 
-def episode_part(path: Path, which: tuple[int, ...], start: int, steps: int) -> bytes:
-    """Return a part of an episode as JSON for `replay.js`; `which` as for `place_of`."""
+def episode_part(path: Path, at: StepRef, start: int, steps: int) -> bytes:
+    """Return a part of an episode as JSON for `replay.js`."""
     with open_recording(path) as recording:
-        episode = playback_of(recording, which, steps, max(0, start - _STEPS_BEFORE))
+        episode = playback_of(recording, at.which, steps, max(0, start - _STEPS_BEFORE))
         scene = recording.environment["scene"] if episode.grid else None
-        has_pictures, note = picture_note(recording, "train" if len(which) == 1 else "eval")
+        has_pictures, note = picture_note(recording, "train" if at.after is None else "eval")
         data = {"episode": asdict(episode), "scene": scene}
         return as_json(data | {"has_pictures": has_pictures, "picture_note": note})
 

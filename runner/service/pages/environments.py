@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar, Final
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Depends, Request, Response
 
 from runner.analysis.step_reference import StepRef
 from runner.export.episodes import EpisodePlace, place_of
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
-from runner.service.dependencies import RecordedRun
+from runner.service.dependencies import EPISODES, RecordedRun
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.panels import Panel, panel_of
 from runner.service.pages.rendering import page
-from runner.service.pages.replay import Number, T
+from runner.service.pages.replay import T
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
 
@@ -37,18 +38,20 @@ class _EnvironmentsView(RunView):
     """Environments that are not shown."""
 
 
-@router.get("/train/{episode}/environments")
-def training_environments(request: Request, run: RecordedRun, episode: Number, t: T = 0) -> Response:
-    """Show all environments of a vector during a training episode of one of them."""
-    return page(request, _environments(run, StepRef(episode, t)))
+def _add_route(path: str, episode: Callable[..., StepRef]) -> None:
+    @router.get(f"{path}/environments")
+    def environments(
+        request: Request,
+        run: RecordedRun,
+        at: StepRef = Depends(episode),  # noqa: B008 - as FastAPI reads it
+        t: T = 0,
+    ) -> Response:
+        """Show all environments of a vector during an episode of one of them."""
+        return page(request, _environments(run, replace(at, t=t)))
 
 
-@router.get("/eval/{after}/{trial}/environments")
-def trial_environments(
-    request: Request, run: RecordedRun, after: Number, trial: Number, t: T = 0
-) -> Response:
-    """Show all environments of a vector during a trial of one of them."""
-    return page(request, _environments(run, StepRef(trial, t, after)))
+for _path, _episode in EPISODES.items():
+    _add_route(_path, _episode)
 
 
 def _environments(run: Run, at: StepRef) -> _EnvironmentsView:

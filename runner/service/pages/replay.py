@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from itertools import islice
 from typing import Annotated, ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
@@ -27,7 +27,7 @@ from runner.service import fragments
 from runner.service.addresses import link
 from runner.service.api.replay import STEPS, prepare_pictures
 from runner.service.catalogue import Catalogue
-from runner.service.dependencies import CatalogueOf, PicturesOf, RecordedRun, RunComputationOf
+from runner.service.dependencies import EPISODES, CatalogueOf, PicturesOf, RecordedRun, RunComputationOf
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.panels import Panel, panel_of
 from runner.service.pages.rendering import message_of, page
@@ -40,7 +40,6 @@ MAX_BRANCHES: Final = 20
 BEFORE: Final = 250
 """Steps before the requested one in the part that a page shows first, as in `parts.js`."""
 
-Number = Annotated[int, Path(ge=0, lt=2**62)]
 T = Annotated[int, Query(ge=0, lt=2**62)]
 
 
@@ -153,61 +152,39 @@ async def latest(
     return await run_in_threadpool(show)
 
 
-@router.get("/train/{episode}")
-async def training_replay(
-    request: Request,
-    run: RecordedRun,
-    compute: RunComputationOf,
-    streams: PicturesOf,
-    catalogue: CatalogueOf,
-    episode: Number,
-    t: T = 0,
-) -> Response:
-    """Show a step of a training episode."""
-    return await _replay(request, run, compute, streams, catalogue, (episode,), t)
+def _add_route(path: str, episode: Callable[..., StepRef]) -> None:
+    @router.get(path)
+    async def replay(
+        request: Request,
+        run: RecordedRun,
+        compute: RunComputationOf,
+        streams: PicturesOf,
+        catalogue: CatalogueOf,
+        at: StepRef = Depends(episode),  # noqa: B008 - as FastAPI reads it
+        t: T = 0,
+    ) -> Response:
+        """Show a step of an episode."""
+        part: bytes | RunnerError
+        preparing = asyncio.create_task(prepare_pictures(run, streams, replace(at, t=t)))
+        try:
+            part = await compute(fragments.episode_part, at, max(0, t - BEFORE), STEPS)
+        except RunnerError as error:
+            part = error
+        await preparing
+
+        def show() -> Response:  # in a thread, as it reads the recording
+            with open_recording(run.recording) as recording:
+                branches = _branches(recording, run, catalogue)
+            if isinstance(part, RunnerError):
+                view = _view(run, at, branches, None, message_of(part, request))
+                return page(request, view, HTTPStatus.NOT_FOUND)
+            return page(request, _view(run, at, branches, shown_step(json.loads(part), t)))
+
+        return await run_in_threadpool(show)
 
 
-@router.get("/eval/{after}/{trial}")
-async def trial_replay(
-    request: Request,
-    run: RecordedRun,
-    compute: RunComputationOf,
-    streams: PicturesOf,
-    catalogue: CatalogueOf,
-    after: Number,
-    trial: Number,
-    t: T = 0,
-) -> Response:
-    """Show a step of a trial of an evaluation."""
-    return await _replay(request, run, compute, streams, catalogue, (after, trial), t)
-
-
-async def _replay(
-    request: Request,
-    run: Run,
-    compute: RunComputationOf,
-    streams: PicturesOf,
-    catalogue: CatalogueOf,
-    which: tuple[int, ...],
-    t: int,
-) -> Response:
-    part: bytes | RunnerError
-    preparing = asyncio.create_task(prepare_pictures(run, streams, which, t))
-    try:
-        part = await compute(fragments.episode_part, which, max(0, t - BEFORE), STEPS)
-    except RunnerError as error:
-        part = error
-    await preparing
-
-    def show() -> Response:  # in a thread, as it reads the recording
-        with open_recording(run.recording) as recording:
-            branches = _branches(recording, run, catalogue)
-        if isinstance(part, RunnerError):
-            view = _view(run, which, branches, None, message_of(part, request))
-            return page(request, view, HTTPStatus.NOT_FOUND)
-        return page(request, _view(run, which, branches, shown_step(json.loads(part), t)))
-
-    return await run_in_threadpool(show)
+for _path, _episode in EPISODES.items():
+    _add_route(_path, _episode)
 
 
 def _branches(recording: Recording, run: Run, catalogue: Catalogue) -> list[Link]:
@@ -227,33 +204,31 @@ def _branches(recording: Recording, run: Run, catalogue: Catalogue) -> list[Link
 
 
 def _view(
-    run: Run, which: tuple[int, ...], branches: list[Link], step: ShownStep | None, problem: str = ""
+    run: Run, at: StepRef, branches: list[Link], step: ShownStep | None, problem: str = ""
 ) -> _ReplayView:
     with open_recording(run.recording) as recording:
         episodes = recording.count(recording.topic("/train/episode"))
         environments, is_job = recording.environments, recording.is_job
         evaluations = [Evaluation(one.after, one.stop - one.start) for one in evaluations_of(recording)]
-    if len(which) == 1:
+    if at.after is None:
         count = episodes
     else:
-        count = next((each.trials for each in evaluations if each.after == which[0]), 0)
-    number = which[-1]
-    at = StepRef(number) if len(which) == 1 else StepRef(number, after=which[0])
+        count = next((each.trials for each in evaluations if each.after == at.after), 0)
 
     def neighbour(other: int) -> str:
         path = replace(at, episode=other).episode_path
-        return f"/runs/{run.run_id}/replay/{path}" if 0 <= other < max(count, number) else ""
+        return f"/runs/{run.run_id}/replay/{path}" if 0 <= other < max(count, at.episode) else ""
 
     return _ReplayView(
         run=head_of(run),
         here="replay",
-        which=which,
+        which=at.which,
         step=step,
         problem=problem,
         episodes=episodes,
         evaluations=evaluations,
-        before=neighbour(number - 1),
-        after=neighbour(number + 1),
+        before=neighbour(at.episode - 1),
+        after=neighbour(at.episode + 1),
         source=f"/api/v1/runs/{run.run_id}/replay/{at.episode_path}",
         reference=at.episode_text,
         episode_path=at.episode_path,
