@@ -53,7 +53,7 @@ class Batches:
 
     def of(self, table: Table) -> Iterator[pa.RecordBatch]:
         """Yield the rows of a table in the order in which they were recorded."""
-        if table.topics[0] in self.shape.sizes:
+        if table.topics[0] in self.shape.dtypes:
             yield from (batch for _, _, batch in self.blocks(table))
             return
         rows: list[Json] = []

@@ -19,9 +19,9 @@ from runner.archive.values import SpaceColumns, numbers
 from runner.environments.mdp import Mdp
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import Sizes, blank_records, record_dtype
+from runner.recording.blocks import blank_records
 from runner.recording.extras import ExtraLayout
-from runner.recording.metadata import kind_of, sizes_of, spaces_of
+from runner.recording.metadata import dtypes_of, kind_of, spaces_of
 from runner.recording.recorder import BLOCK_BYTES
 from runner.recording.schema import STEP_NANOSECONDS, MessageType, Topic
 from runner.util.arrays import Array
@@ -43,8 +43,8 @@ class Shape:
     agents: tuple[str, ...]
     action_counts: tuple[int, ...]
     events: tuple[str, ...]
-    sizes: Mapping[Topic, Sizes]
-    """The sizes of each fixed-width topic, for `record_dtype`."""
+    dtypes: Mapping[Topic, np.dtype[np.void]]
+    """The dtype of each fixed-width topic's message records."""
     spaces: Mapping[str, SpaceColumns] = field(default_factory=dict)
     """Of a loop, by the field with the values: `action`, `next_observation`, `observation`, `extra`."""
     extras: tuple[ExtraLayout, ...] = ()
@@ -268,10 +268,10 @@ def shape_of(
             f"{where}: found learners {learners!r} and {len(events)} events, "
             f"expected {run['learners']} and {run['events']}."
         )
-    spaces, sizes = {}, sizes_of(run, where)
+    spaces, dtypes = {}, dtypes_of(run, where)
     if extras:
         spaces["extra"] = SpaceColumns(extras[-1].description, "values", where, "extra")
-        sizes |= dict.fromkeys((schema.TRAIN_EXTRA, schema.EVAL_EXTRA), extras[-1].sizes)
+        dtypes |= dict.fromkeys(schema.EXTRA_TOPICS, extras[-1].record)
     if kind_of(run) != "job":
         described = spaces_of(run, where)
         for name in ("action", "next_observation", "observation"):
@@ -283,7 +283,7 @@ def shape_of(
         agents=mdp.agents if mdp else (),
         action_counts=mdp.action_counts if mdp else (),
         events=events,
-        sizes=sizes,
+        dtypes=dtypes,
         spaces=spaces,
         extras=extras,
     )
@@ -307,7 +307,7 @@ def batch_of(topic: Topic, records: Records, shape: Shape) -> pa.RecordBatch:
 
 def records_of(topic: Topic, batch: pa.RecordBatch, shape: Shape) -> Records:
     """Return the message records of rows that are all of one topic."""
-    records = _blanks(topic, shape.sizes[topic], batch.num_rows)
+    records = _blanks(topic, shape.dtypes[topic], batch.num_rows)
     times = numbers(batch.column("position")).astype(np.uint64) * _TICK
     records["log_time"] = records["publish_time"] = times
     for column in shape.columns_of(topic.message):
@@ -348,7 +348,7 @@ def in_layouts(topic: Topic, records: Records, shape: Shape) -> Iterator[Records
 
 def _in_layout(topic: Topic, records: Records, target: ExtraLayout) -> Records:
     """Return extras with more names, which they do not have, or with fewer."""
-    moved = _blanks(topic, target.sizes, len(records))
+    moved = _blanks(topic, target.record, len(records))
     for number in ("log_time", "publish_time", "step"):
         moved[number] = records[number]
     for name in set(target.names) & set(records["values"].dtype.names or ()):
@@ -376,12 +376,12 @@ def of_phase(batch: pa.RecordBatch, phase: str, where: str) -> pa.RecordBatch:
     return batch if chosen.all() else batch.filter(pa.array(chosen))
 
 
-def _blanks(topic: Topic, sizes: Sizes, n: int) -> Records:
+def _blanks(topic: Topic, dtype: np.dtype[np.void], n: int) -> Records:
     """Return n blank records, which are copied from cached ones if they are small: that is quicker."""
     rounded = -(-n // _BLANKS) * _BLANKS
-    if rounded * record_dtype(topic.message, sizes).itemsize > BLOCK_BYTES:
-        return blank_records(topic, sizes, n)
-    return _cached_blanks(topic, sizes, rounded)[:n].copy()
+    if rounded * dtype.itemsize > BLOCK_BYTES:
+        return blank_records(topic, dtype, n)
+    return _cached_blanks(topic, dtype, rounded)[:n].copy()
 
 
 def _constant(code: int, n: int, names: tuple[str, ...]) -> pa.DictionaryArray:

@@ -112,7 +112,7 @@ class _Restorer:
     def _restore_table(self, table: Table) -> None:
         if table.name in layout.LEFT_OUT_IF_EMPTY and not self._archive.count(*table.topics):
             return
-        if table.topics[0] not in self._shape.sizes:
+        if table.topics[0] not in self._shape.dtypes:
             self._restore_messages(table)
         elif self._archive.is_job and table.name == layout.STEPS:
             self._restore_learning(table)
@@ -134,7 +134,7 @@ class _Restorer:
     def _records(self, table: Table) -> Iterator[tuple[Topic, Records]]:
         """Yield the rows of a table as records, at most as many as a chunk has."""
         archive, topic = self._archive, table.topics[0]
-        rows = capacity_of(topic, self._shape.sizes[topic], self._chunk_steps)
+        rows = capacity_of(topic, self._shape.dtypes[topic], self._chunk_steps)
         for batch in archive.batches(table.name, table.columns, archive.count(*table.topics), rows):
             for topic in table.topics:
                 mine = of_phase(batch, topic.phase, f"{self._where}: {table.name}")

@@ -32,7 +32,7 @@ from runner.execution.session import evaluation_metrics
 from runner.learning.learner import Learner
 from runner.planning import ExactEvaluator
 from runner.recording import schema
-from runner.recording.blocks import blank_records, topic_sizes
+from runner.recording.blocks import blank_records, topic_dtype
 from runner.sweep.local import Workers
 from runner.sweep.objective import readings
 from runner.util.files import storage_errors
@@ -107,7 +107,7 @@ def measure(
     mdp = _load_mdp(config.env.id, kwargs, config.rewards)
     learner = Learner(config, mdp, seed, tables_of(config, mdp, recordings))
     steps, episodes = (
-        blank_records(topic, topic_sizes(topic, len(learner.agents), len(mdp.event_names)), _BLOCK_STEPS)
+        blank_records(topic, topic_dtype(topic, len(learner.agents), len(mdp.event_names)), _BLOCK_STEPS)
         for topic in (schema.TRAIN_STEP, schema.TRAIN_EPISODE)
     )
     while learner.episode < config.episodes:

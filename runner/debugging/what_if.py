@@ -30,7 +30,6 @@ from runner.planning.evaluation import action_values, policy_values
 from runner.planning.optimum import optimal_values
 from runner.recording import schema
 from runner.recording.blocks import blank_records
-from runner.recording.metadata import sizes_of
 from runner.recording.reader import Recording, open_recording
 from runner.replay.steps import check_steps, episode_blocks, steps_of
 from runner.replay.tables import TableReplay
@@ -179,9 +178,8 @@ class _Branches:
         """Return the steps from an action on, and where the whole episode leads."""
         recording, place, t = self._recording, self._place, self._at.t
         limit = self._mdp.step_limit - t if self._mdp.step_limit else MAX_STEPS
-        sizes = sizes_of(recording.run, str(recording.path))
         blocks = [
-            blank_records(topic, sizes[topic], count).view(np.recarray)
+            blank_records(topic, recording.dtypes[topic], count).view(np.recarray)
             for topic, count in (
                 (recording.topic(f"/{place.phase}/step"), limit),
                 (recording.topic(f"/{place.phase}/episode"), 1),

@@ -22,7 +22,7 @@ from runner.learning.learner import Learner
 from runner.recording import schema
 from runner.recording.actions import ACTION_TOPICS
 from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD
-from runner.recording.metadata import json_object, sizes_of, write_result
+from runner.recording.metadata import json_object, write_result
 from runner.recording.reader import Recording, open_recording
 from runner.recording.recorder import Recorder
 from runner.recording.rewriting import rewrite
@@ -289,11 +289,10 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
         Diverged: they differ from the recorded ones.
     """
     names = {recording.topic(f"/{phase}/step").name for phase in schema.PHASES}
-    every = sizes_of(recording.run, str(recording.path))
-    sizes = {topic: size for topic, size in every.items() if topic.name in names}
+    dtypes = {topic: dtype for topic, dtype in recording.dtypes.items() if topic.name in names}
     plan = recording.config["recording"]
     packing = Packing(plan["compression"], plan["level"] or 0, plan["index"], plan["chunk_steps"])
-    recorder = Recorder(file, len(recording.agents), 0, packing, sizes=sizes)
+    recorder = Recorder(file, dtypes, packing)
     try:
         with closing(Replay(recording, trust, 0.0, lambda _: None, render=False)) as replay:
             states = {phase: np.full(recording.environments, -1, np.int64) for phase in schema.PHASES}

@@ -21,6 +21,7 @@ from runner.execution.initial_tables import configured_tables, resolve_job
 from runner.learning.learner import Held, Learner
 from runner.planning import ExactEvaluator
 from runner.recording import schema
+from runner.recording.blocks import topic_dtype
 from runner.recording.messages import Message, QTable, encode, encode_log, encode_q_table
 from runner.recording.metadata import (
     Attachments,
@@ -354,11 +355,10 @@ def recorder_for(
     packed: PackedChunks | None = None,
 ) -> Recorder:
     """Return a recorder for a learner's steps into a file, packed as in the job's configuration."""
-    options = job.config.recording
+    options, learners, events = job.config.recording, len(learner.agents), len(learner.mdp.event_names)
     return Recorder(
         file,
-        learners=len(learner.agents),
-        events=len(learner.mdp.event_names),
+        {topic: topic_dtype(topic, learners, events) for topic in schema.BLOCK_TOPICS},
         packing=options.packing,
         record_steps=options.steps == "all",
         reference=reference,

@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
 
+import numpy as np
 from gymnasium import spaces
 
 from runner.environments.gym_types import Space
 from runner.environments.loading import mdp_of
 from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
-from runner.recording.blocks import Sizes
 from runner.recording.gym_spaces import describe_space, parts_of
-from runner.recording.metadata import Attachments, environment_attachments, sizes_in
+from runner.recording.metadata import Attachments, dtypes_in, environment_attachments
 from runner.recording.schema import Topic
 from runner.util.jsonable import as_json
 
@@ -63,10 +63,10 @@ class Described:
         return self._spaces | wide
 
     @cached_property
-    def sizes(self) -> dict[Topic, Sizes]:
-        """The sizes of the topics of fixed width in its recordings."""
+    def dtypes(self) -> dict[Topic, np.dtype[np.void]]:
+        """The dtypes of the message records of fixed width in its recordings."""
         events = len(self.mdp.event_names) if self.mdp else 0
-        return sizes_in(self.kind, len(self.agents), events, self.recorded_spaces, self.env_id)
+        return dtypes_in(self.kind, len(self.agents), events, self.recorded_spaces, self.env_id)
 
     @cached_property
     def common(self) -> str:

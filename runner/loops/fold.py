@@ -30,7 +30,7 @@ from runner.recording.messages import (
     frame_place,
     log_level,
 )
-from runner.recording.metadata import sizes_of, write_result
+from runner.recording.metadata import dtypes_of, write_result
 from runner.recording.recorder import Recorder
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import create_recording
@@ -80,10 +80,8 @@ class Fold:
                 file.add_attachment(name, media_type, data)
             self._recorder = recorder = Recorder(
                 file,
-                learners=len(first.agents),
-                events=int(facts["events"]),
+                dtypes_of(facts, str(fresh)),
                 packing=packing,
-                sizes=sizes_of(facts, str(fresh)),
                 watch=self._outcomes.take_records,
             )
             try:

@@ -26,7 +26,6 @@ from runner.loops.outcomes import Outcomes
 from runner.recording import schema
 from runner.recording.action_recorder import ActionRecorder
 from runner.recording.actions import ACTION_TOPICS
-from runner.recording.blocks import record_dtype
 from runner.recording.compaction import compacted
 from runner.recording.gym_spaces import can_widen, widened
 from runner.recording.maker import EnvironmentMaker
@@ -73,12 +72,10 @@ class LoopRun:
         self.outcomes = Outcomes(described.mdp)
         self.recorder = Recorder(
             self._file,
-            learners=len(described.agents),
-            events=int(self._facts["events"]),
+            described.dtypes,
             packing=options.packing.packing,
             record_steps=options.steps == "all",
             beat=self._beat,
-            sizes=self.described.sizes,
             watch=self._watch,
             before=self.describe,
             system=options.packing.system and not is_shard,
@@ -170,7 +167,7 @@ class LoopRun:
             return False
         self.described = replace(self.described, wide_action=wide)
         self._facts = self._run_facts()
-        self.recorder.resize(self.described.sizes)
+        self.recorder.set_dtypes(self.described.dtypes)
         return True
 
     def commit(self) -> None:
@@ -202,8 +199,8 @@ class LoopRun:
         """Write a recording of actions alone again, in fewer chunks, if there are several."""
         counts = self.recorder.counts
         steps = {
-            ACTION_TOPICS[topic.name]: record_dtype(topic.message, sizes)
-            for topic, sizes in self.described.sizes.items()
+            ACTION_TOPICS[topic.name]: dtype
+            for topic, dtype in self.described.dtypes.items()
             if topic.name in ACTION_TOPICS
         }
         if sum(counts[topic.name] for topic in steps) > len(steps):

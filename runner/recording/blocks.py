@@ -30,9 +30,6 @@ _FIXED: Final[dict[int, tuple[str, int]]] = {
 _DELIMITED: Final = 2
 """The wire type of fields that their length precedes: bytes, and packed fields."""
 
-Sizes = tuple[int | np.dtype[np.generic], ...]
-"""The sizes that depend on the run: elements of each repeated field, the dtype of each bytes field."""
-
 HEADER: Final = [
     ("opcode", "u1"),
     ("record_length", "<u8"),
@@ -52,7 +49,7 @@ MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
 
 
 @lru_cache(64)
-def record_dtype(message: MessageType, sizes: Sizes) -> np.dtype[np.void]:
+def record_dtype(message: MessageType, *sizes: int | np.dtype[np.generic]) -> np.dtype[np.void]:
     """Return the dtype of a whole MCAP message record of a fixed-width message.
 
     Fields named `tag…` hold protobuf's constant bytes (see `blank_records`).
@@ -60,24 +57,17 @@ def record_dtype(message: MessageType, sizes: Sizes) -> np.dtype[np.void]:
     Args:
         sizes: of each repeated field the number of elements, of each bytes field its dtype, in order.
     """
-    layout: list[tuple[object, ...]] = list(HEADER)
-    for field, value in zip(message.fields, _value_dtypes(message, sizes), strict=True):
-        layout.append((f"tag_{field.name}", "u1", (len(_tag(field, value)),)))
-        layout.append((field.name, value))
-    return np.dtype(layout)
-
-
-def _value_dtypes(message: MessageType, sizes: Sizes) -> list[np.dtype[np.generic]]:
     remaining = iter(sizes)
-    values = []
+    layout: list[tuple[object, ...]] = list(HEADER)
     for field in message.fields:
         if field.kind == Pb.TYPE_BYTES:
-            values.append(np.dtype(next(remaining)))  # type: ignore[arg-type]
+            value = np.dtype(next(remaining))  # type: ignore[arg-type]
         elif field.repeated:
-            values.append(np.dtype((_FIXED[field.kind][0], (next(remaining),))))
+            value = np.dtype((_FIXED[field.kind][0], (next(remaining),)))
         else:
-            values.append(np.dtype(_FIXED[field.kind][0]))
-    return values
+            value = np.dtype(_FIXED[field.kind][0])
+        layout += [(f"tag_{field.name}", "u1", (len(_tag(field, value)),)), (field.name, value)]
+    return np.dtype(layout)
 
 
 def _tag(field: Field, value: np.dtype[np.generic]) -> bytes:
@@ -96,22 +86,21 @@ def varint(number: int) -> bytes:
     return bytes([*low, number])
 
 
-def blank_records(topic: Topic, sizes: Sizes, n: int) -> NDArray[np.void]:
+def blank_records(topic: Topic, dtype: np.dtype[np.void], n: int) -> NDArray[np.void]:
     """Return n message records of the topic with every constant byte set and every value 0."""
-    records = np.empty(n, record_dtype(topic.message, sizes))
-    records.view(np.uint8).reshape(n, records.itemsize)[:] = _blank_record(topic, sizes)  # not field by field
+    records = np.empty(n, dtype)
+    records.view(np.uint8).reshape(n, records.itemsize)[:] = _blank_record(topic, dtype)  # not field by field
     return records
 
 
 @lru_cache(64)
-def _blank_record(topic: Topic, sizes: Sizes) -> NDArray[np.uint8]:
-    dtype = record_dtype(topic.message, sizes)
+def _blank_record(topic: Topic, dtype: np.dtype[np.void]) -> NDArray[np.uint8]:
     one = np.zeros((), dtype=dtype)
     one["opcode"] = MESSAGE
     one["record_length"] = dtype.itemsize - RECORD_HEAD.size
     one["channel_id"] = topic.channel
-    for field, value in zip(topic.message.fields, _value_dtypes(topic.message, sizes), strict=True):
-        one[f"tag_{field.name}"] = list(_tag(field, value))
+    for field in topic.message.fields:
+        one[f"tag_{field.name}"] = list(_tag(field, dtype[field.name]))
     return np.frombuffer(one.tobytes(), np.uint8)
 
 
@@ -121,20 +110,20 @@ def message_record(topic: Topic, log_time: int, payload: bytes) -> bytes:
     return MESSAGE_HEAD.pack(MESSAGE, length, topic.channel, 0, log_time, log_time) + payload
 
 
-def topic_sizes(
+def topic_dtype(
     topic: Topic,
     learners: int,
     events: int,
     action: np.dtype[np.generic] | None = None,
     observation: np.dtype[np.generic] | None = None,
-) -> Sizes:
-    """Return the sizes of a topic in a run, as `record_dtype` takes them."""
-    known: dict[MessageType, tuple[int | np.dtype[np.generic] | None, ...]] = {
+) -> np.dtype[np.void]:
+    """Return the dtype of a topic's message records in a run; spaces are those of a loop."""
+    sizes: dict[MessageType, tuple[int | np.dtype[np.generic] | None, ...]] = {
         STEP: (learners,),
         EPISODE: (learners, events),
         TRANSITION: (action, observation, learners),
         RESET: (observation,),
     }
-    sizes = known[topic.message]
-    assert None not in sizes, f"{topic.message.name} needs the dtypes of its spaces"
-    return sizes  # type: ignore[return-value]
+    known = [size for size in sizes[topic.message] if size is not None]
+    assert len(known) == len(sizes[topic.message]), f"{topic.message.name} needs the dtypes of its spaces"
+    return record_dtype(topic.message, *known)

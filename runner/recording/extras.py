@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import Sizes, record_dtype
+from runner.recording.blocks import record_dtype
 from runner.recording.metadata import json_object
 from runner.recording.spaces import Description, dtype_of
 from runner.recording.topic_chunks import TopicChunks
@@ -47,11 +47,6 @@ class ExtraLayout:
     """A field for each name."""
 
     @property
-    def sizes(self) -> Sizes:
-        """The sizes of an `Extra`, as `record_dtype` takes them."""
-        return self.values, np.dtype([(name, "?") for name in self.names])
-
-    @property
     def names(self) -> tuple[str, ...]:
         """The names, in order."""
         return self.values.names or ()
@@ -59,7 +54,8 @@ class ExtraLayout:
     @property
     def record(self) -> np.dtype[np.void]:
         """The dtype of a message record: `step`, `values` by name, and `given` by name."""
-        return record_dtype(schema.EXTRA, self.sizes)
+        given = np.dtype([(name, "?") for name in self.names])
+        return record_dtype(schema.EXTRA, self.values, given)
 
     @property
     def description(self) -> Description:

@@ -20,7 +20,7 @@ import zstandard
 from runner.environments.mdp import MAX_AGENTS, MAX_ARRAYS_BYTES, MAX_EVENTS, Mdp, from_parts
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import Sizes, topic_sizes
+from runner.recording.blocks import topic_dtype
 from runner.recording.index import Index
 from runner.recording.maker import MAKER_RECORD, EnvironmentMaker
 from runner.recording.records import MAX_METADATA_BYTES
@@ -147,15 +147,17 @@ def spaces_of(run: Mapping[str, str], path: str) -> Json:
     return spaces
 
 
-def sizes_of(run: Mapping[str, str], path: str) -> dict[Topic, Sizes]:
-    """Return the sizes of each fixed-width topic of a recording, as `record_dtype` takes them."""
+def dtypes_of(run: Mapping[str, str], path: str) -> dict[Topic, np.dtype[np.void]]:
+    """Return the dtype of each fixed-width topic's message records in a recording."""
     kind = kind_of(run)
     spaces = spaces_of(run, path) if kind in _FIXED_KINDS else {}
-    return sizes_in(kind, int(run["learners"]), int(run["events"]), spaces, path)
+    return dtypes_in(kind, int(run["learners"]), int(run["events"]), spaces, path)
 
 
-def sizes_in(kind: str, learners: int, events: int, spaces: JsonView, path: str) -> dict[Topic, Sizes]:
-    """Return what `sizes_of` returns, of a recording of this kind, whose spaces have these descriptions."""
+def dtypes_in(
+    kind: str, learners: int, events: int, spaces: JsonView, path: str
+) -> dict[Topic, np.dtype[np.void]]:
+    """Return what `dtypes_of` returns, of a recording of this kind, whose spaces have these descriptions."""
     action = observation = None
     if kind in _FIXED_KINDS:
         action, observation = (
@@ -164,7 +166,7 @@ def sizes_in(kind: str, learners: int, events: int, spaces: JsonView, path: str)
         if action is None or observation is None:
             raise RecordingError(f"{path}: has a space of variable width, expected fixed ones in its kind.")
     return {
-        topic: topic_sizes(topic, learners, events, action, observation)
+        topic: topic_dtype(topic, learners, events, action, observation)
         for topic in schema.KINDS[kind]
         if topic in schema.ALL_BLOCK_TOPICS
     }

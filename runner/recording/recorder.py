@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.recording import schema
-from runner.recording.blocks import Sizes, blank_records, message_record, record_dtype, topic_sizes
+from runner.recording.blocks import blank_records, message_record
 from runner.recording.clock import Stopwatch
 from runner.recording.digest import combined_digest
 from runner.recording.observer import Observer
@@ -54,7 +54,7 @@ class _Lane:
     """The buffers of one fixed-width topic."""
 
     topic: Topic
-    sizes: Sizes
+    dtype: np.dtype[np.void]
     capacity: int
     """Records of a whole block."""
     write: bool
@@ -76,10 +76,10 @@ class Recorder:
 
     Args:
         file: the recording to write; None records nothing but the digest.
+        dtypes: those of the message records of the fixed-width topics.
         record_steps: False keeps the steps' digest but not the steps.
         reference: what the recording already holds.
         beat: called about once a second while the recorder is in use, by the thread that writes.
-        sizes: the fixed-width topics of the recording; those of a job by default.
         threads: False packs and writes in the thread that records.
         watch: called with the records of a block as they are committed; the block is used again.
         before: called once, before the first message is written. With it, threads are started and messages
@@ -94,13 +94,11 @@ class Recorder:
     def __init__(
         self,
         file: RecordingFile | None,
-        learners: int,
-        events: int,
+        dtypes: Mapping[Topic, np.dtype[np.void]],
         packing: Packing | None = None,
         record_steps: bool = True,
         reference: Reference | None = None,
         beat: Callable[[], None] = lambda: None,
-        sizes: Mapping[Topic, Sizes] | None = None,
         threads: bool = True,
         watch: Callable[[Topic, NDArray[np.void]], None] = lambda *_: None,
         before: Callable[[], None] | None = None,
@@ -116,10 +114,9 @@ class Recorder:
         self._chunk_steps = packing.chunk_steps
         self._first_records = _FIRST_RECORDS if before is not None else None
         self._reference = reference or Reference()
-        sizes = sizes or {topic: topic_sizes(topic, learners, events) for topic in schema.BLOCK_TOPICS}
         self._lanes = {
             topic: self._lane(topic, own, record_steps or topic.message not in schema.STEP_MESSAGES)
-            for topic, own in sizes.items()
+            for topic, own in dtypes.items()
         }
         self.steps = {"train": 0, "eval": 0, "elsewhere": 0}
         """Steps committed so far, by phase; and training steps of other processes, where they are stated."""
@@ -136,24 +133,24 @@ class Recorder:
             if (system or console is not None) and schema.HOST_TOPIC in file.topics:
                 self._observer = Observer(file.path.parent, self._stopwatch, system, console)
 
-    def _lane(self, topic: Topic, sizes: Sizes, write: bool) -> _Lane:
-        return _Lane(topic, sizes, capacity_of(topic, sizes, self._chunk_steps), write)
+    def _lane(self, topic: Topic, dtype: np.dtype[np.void], write: bool) -> _Lane:
+        return _Lane(topic, dtype, capacity_of(topic, dtype, self._chunk_steps), write)
 
     @property
     def bytes_written(self) -> int:
         """Bytes in the file so far."""
         return self._file.size if self._file is not None else 0
 
-    def resize(self, sizes: Mapping[Topic, Sizes]) -> None:
-        """Change the sizes of fixed-width topics, or add such topics; later messages have these sizes.
+    def set_dtypes(self, dtypes: Mapping[Topic, np.dtype[np.void]]) -> None:
+        """Change the dtypes of fixed-width topics, or add such topics; later messages have these dtypes.
 
-        Only the messages of a topic in `UNIFORM_TOPICS` may have different sizes in one recording.
+        Only the messages of a topic in `EXTRA_TOPICS` may have different dtypes in one recording.
         """
-        for topic, own in sizes.items():
+        for topic, own in dtypes.items():
             lane = self._lanes.get(topic)
             if lane is None:
                 self._lanes[topic] = self._lane(topic, own, write=True)
-            elif lane.sizes != own:
+            elif lane.dtype != own:
                 assert not self.counts[topic.name] or topic not in schema.ALL_BLOCK_TOPICS
                 if lane.open is not None and lane.open.filled:
                     self._send_block(lane)
@@ -169,7 +166,7 @@ class Recorder:
 
     def blank(self, topic: Topic, n: int) -> NDArray[np.void]:
         """Return n new records of a fixed-width topic, with every constant byte set."""
-        return blank_records(topic, self._lanes[topic].sizes, n)
+        return blank_records(topic, self._lanes[topic].dtype, n)
 
     def block(self, topic: Topic) -> NDArray[np.void]:
         """Return the free records of the topic's open block, to be filled from the first on."""
@@ -353,10 +350,10 @@ class Recorder:
         """Return a block to fill: one that was used before, or a new one while there may be more."""
         if self._first_records is not None and not lane.has_started:
             lane.has_started = True
-            return _Block(blank_records(lane.topic, lane.sizes, min(self._first_records, lane.capacity)))
+            return _Block(blank_records(lane.topic, lane.dtype, min(self._first_records, lane.capacity)))
         if lane.made < MAX_BLOCKS and lane.free.empty():
             lane.made += 1
-            return _Block(blank_records(lane.topic, lane.sizes, lane.capacity))
+            return _Block(blank_records(lane.topic, lane.dtype, lane.capacity))
         block = lane.free.get()
         block.filled = 0
         return block
@@ -390,7 +387,7 @@ def _offsets(count: int, size: int) -> NDArray[np.uint64]:
     return offsets
 
 
-def capacity_of(topic: Topic, sizes: Sizes, chunk_steps: int) -> int:
+def capacity_of(topic: Topic, dtype: np.dtype[np.void], chunk_steps: int) -> int:
     """Return how many records a block of a topic has."""
     limit = EPISODES_A_BLOCK if topic.message in (schema.EPISODE, schema.RESET) else chunk_steps
-    return max(1, min(limit, BLOCK_BYTES // record_dtype(topic.message, sizes).itemsize))
+    return max(1, min(limit, BLOCK_BYTES // dtype.itemsize))

@@ -22,12 +22,12 @@ from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD, record_dtype
+from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head
 from runner.recording.extras import read_layouts
 from runner.recording.integrity import check_integrity
 from runner.recording.messages import decode
-from runner.recording.metadata import REQUIRED_RECORDS, check_run, json_object, kind_of, sizes_of
+from runner.recording.metadata import REQUIRED_RECORDS, check_run, dtypes_of, json_object, kind_of
 from runner.recording.reader import open_recording
 from runner.recording.records import (
     IN_DATA,
@@ -200,10 +200,7 @@ class _Salvage:
             self._indexed = asks_for_indexes(entries)
         if name == "run":
             check_run(entries, str(self._path))
-            self._dtypes = {
-                topic: record_dtype(topic.message, sizes)
-                for topic, sizes in sizes_of(entries, str(self._path)).items()
-            }
+            self._dtypes = dtypes_of(entries, str(self._path))
         file.add_metadata(name, entries)
 
     def _take_chunk(self, file: RecordingFile, offset: int, body: bytes) -> None:

@@ -15,12 +15,11 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording.blocks import record_dtype
 from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.description import RunDescription
 from runner.recording.index import ChunkEntry, read_index
 from runner.recording.messages import Message, decode
-from runner.recording.metadata import check_file, sizes_of
+from runner.recording.metadata import check_file, dtypes_of
 from runner.recording.record_store import RecordStore
 from runner.recording.schema import Topic
 from runner.recording.topic_chunks import ChunkSpan, TopicChunks, chunks_by_topic
@@ -118,10 +117,7 @@ class TopicReader(RunDescription):
     @cached_property
     def dtypes(self) -> dict[Topic, np.dtype[np.void]]:
         """The dtype of each fixed-width topic's message records in this recording."""
-        return {
-            topic: record_dtype(topic.message, sizes)
-            for topic, sizes in sizes_of(self.run, str(self.path)).items()
-        }
+        return dtypes_of(self.run, str(self.path))
 
     def topic(self, name: str) -> Topic:
         """Return the topic of that name, such as `/train/step`.

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from runner.errors import CannotRedo, RecordingError
 from runner.recording.blocks import blank_records
-from runner.recording.metadata import sizes_of
 from runner.recording.reader import MAX_EPISODE_BYTES, Recording, open_recording
 from runner.replay.redone import RedoneSteps
 
@@ -50,7 +49,7 @@ def _done_again(path: Path, phase: str, episode: int) -> Iterator[RedoneSteps]:
 def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> NDArray[np.void]:
     with open_recording(path) as recording:
         span, topic = recording.episode_span(phase, episode), recording.topic(f"/{phase}/step")
-        records = blank_records(topic, sizes_of(recording.run, str(path))[topic], len(span))
+        records = blank_records(topic, recording.dtypes[topic], len(span))
         for block in recording.actions(phase):
             own = block[(block["step"] >= span.start) & (block["step"] < span.stop)]
             own = own[(own["step"] - span.start) % span.step == 0]

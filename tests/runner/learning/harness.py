@@ -13,7 +13,7 @@ from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.learning.learner import Learner
 from runner.recording import schema
-from runner.recording.blocks import blank_records, topic_sizes
+from runner.recording.blocks import blank_records, topic_dtype
 from tests.runner.learning.twin import Twin
 
 SMALL_MAP = ["+---+", "|A: |", "| |B|", "+---+"]
@@ -160,7 +160,7 @@ def blank_blocks(learner: Learner, n: int) -> tuple[Any, ...]:
     """Return n step records and n episode records to fill, such as the recorder hands out."""
     learners, events = len(learner.agents), len(learner.mdp.event_names)
     return tuple(
-        blank_records(topic, topic_sizes(topic, learners, events), n).view(np.recarray)
+        blank_records(topic, topic_dtype(topic, learners, events), n).view(np.recarray)
         for topic in (schema.TRAIN_STEP, schema.TRAIN_EPISODE)
     )
 

@@ -58,7 +58,7 @@ def test_memory_does_not_grow_with_the_number_of_steps(tmp_path):
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stderr
     steps, growth = map(int, done.stdout.split())
-    record_bytes = record_dtype(schema.STEP, (1,)).itemsize
+    record_bytes = record_dtype(schema.STEP, 1).itemsize
     assert steps > 4_000_000
     assert growth < steps * record_bytes / 10, "a tenth of the steps would not fit in what it grew by"
 

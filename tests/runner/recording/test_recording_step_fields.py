@@ -8,7 +8,7 @@ from runner.analysis import frames
 from runner.analysis.diff import divergence
 from runner.archive.columns import Shape, checked_batch
 from runner.recording import schema
-from runner.recording.blocks import blank_records
+from runner.recording.blocks import blank_records, record_dtype
 
 NAMES = [field.name for field in schema.STEP.fields]
 
@@ -25,8 +25,8 @@ def test_a_data_frame_has_it(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_an_archive_keeps_it(name):
-    sizes = (1,)
-    shape = Shape("k3v9m2xq", "job", ("agency",), ("a", "b"), (6, 6), (), {schema.TRAIN_STEP: sizes})
-    records = blank_records(schema.TRAIN_STEP, sizes, 1)
+    dtype = record_dtype(schema.STEP, 1)
+    shape = Shape("k3v9m2xq", "job", ("agency",), ("a", "b"), (6, 6), (), {schema.TRAIN_STEP: dtype})
+    records = blank_records(schema.TRAIN_STEP, dtype, 1)
     records[name] = 1
     assert checked_batch(schema.TRAIN_STEP, records, shape, "a recording").num_rows == 1
