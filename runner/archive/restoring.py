@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -20,14 +19,12 @@ from runner.archive.layout import Records, Table
 from runner.archive.manifest import Entry, Manifest
 from runner.archive.reading import Archive
 from runner.archive.rows import message_payload
-from runner.config import from_mapping
-from runner.config.loading import packing_from
+from runner.config.loading import recorded_packing
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, message_record
 from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.messages import QTable, encode_q_table
-from runner.recording.metadata import json_object
 from runner.recording.pipeline import MessageBatches, Pipeline
 from runner.recording.reader import open_recording
 from runner.recording.recorder import BLOCK_BYTES, capacity_of
@@ -36,7 +33,6 @@ from runner.recording.writer import RecordingFile
 from runner.replay.snapshots import DerivedTables, SnapshotVisitor
 from runner.replay.step_replay import StepReplay
 from runner.util.files import storage_errors
-from runner.util.packing import Packing
 from runner.util.values import Json
 
 _ROWS_AT_ONCE: Final = 1024
@@ -79,7 +75,7 @@ class _Restorer:
         self._report = report
         self._where = str(archive.folder)
         self._shape = archive.shape
-        packing = _packing_of(archive)
+        packing = recorded_packing(archive.config)
         self._chunk_steps = packing.chunk_steps
         self._pipeline = Pipeline(file, packing, lambda: None)
         self._batches = MessageBatches(self._send)
@@ -229,16 +225,6 @@ class _Restorer:
                 raise RecordingError(
                     f"{self._where}: {name}: restored {_count(restored)}, expected {_count(expected)}."
                 )
-
-
-def _packing_of(archive: Archive) -> Packing:
-    config = archive.config
-    if archive.is_job:
-        return from_mapping(config).recording.packing
-    parts = json_object(json.dumps(config.get("recording")), f"{archive.folder}: 'recording' in its config")
-    if parts.get("compression") != "zstd":
-        parts.pop("level", None)  # loops recorded before had one with any compression
-    return packing_from(parts).packing
 
 
 def _count(entry: Entry | None) -> str:

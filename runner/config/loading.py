@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path as FilePath
 from typing import Any, Final
 
@@ -30,6 +31,7 @@ from runner.config.sections import Recording
 from runner.config.shipped import config_path, suggestion
 from runner.config.values import MAX_DEPTH, Path, Section
 from runner.errors import ConfigError, shortened
+from runner.util.packing import Packing
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN, Json, JsonView
 
 MAX_BYTES: Final = 1 << 20
@@ -104,6 +106,19 @@ def packing_from(values: Mapping[str, object]) -> Recording:
     except ValidationError as error:
         problems = problems_in(error, values, schema_at(("recording",)))
         raise refuse(problems, Document(values)) from None
+
+
+def recorded_packing(config: JsonView) -> Packing:
+    """Return how a recording was packed, by its configuration.
+
+    Raises:
+        ConfigError: the configuration has values that are not possible.
+    """
+    chosen, names = config.get("recording"), [option.name for option in fields(Packing)]
+    parts = {key: chosen[key] for key in names if key in chosen} if isinstance(chosen, Mapping) else {}
+    if parts.get("compression", Packing.compression) != "zstd":
+        parts.pop("level", None)  # loops recorded by earlier versions have one with any compression
+    return packing_from(parts).packing
 
 
 def read_text(file: FilePath) -> str:

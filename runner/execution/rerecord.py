@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
+from runner.config.loading import recorded_packing
 from runner.environments.loading import load_mdp
 from runner.errors import CannotRedo, Diverged, RunnerError
 from runner.execution.initial_tables import address, recorded_tables
 from runner.execution.session import Report, Session, Stop, describe, recorder_for, run_job
 from runner.learning.learner import Learner
 from runner.recording import schema
-from runner.recording.actions import ACTION_TOPICS
+from runner.recording.actions import ACTION_TOPICS, after_step
 from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD
-from runner.recording.metadata import json_object, write_result
+from runner.recording.metadata import write_result
 from runner.recording.reader import Recording, open_recording
 from runner.recording.recorder import Recorder
 from runner.recording.rewriting import rewrite
@@ -33,12 +34,12 @@ from runner.replay.makers import why_not_redone
 from runner.replay.recorded import Piece, pieces
 from runner.replay.steps import last_step
 from runner.replay.tables import tables_at
+from runner.replay.whole_steps import blank_steps, fill_in
 from runner.runs import run as runs
 from runner.runs.locking import locked
 from runner.runs.provenance import provenance
 from runner.runs.run import Run, unless_empty
 from runner.util.files import storage_errors
-from runner.util.packing import Packing
 from runner.util.processes import report_progress
 
 Start = int | Literal["random", "each"]
@@ -87,32 +88,33 @@ def rerecord(
         KeyboardInterrupt: `stop` returned True; the recording stays as it is.
     """
     with locked(run) as current:
-        if is_done_again(current):
-            return current if holds_steps(current) else rerecord_loop(current, trust, count)
-        if current.status != "finished":
+        is_loop = is_done_again(current)
+        if not is_loop and current.status != "finished":
             from_mapping(current.file.config)  # refuses a loop's run, which nobody can resume
             raise RunnerError(
                 f"run {run.run_id} is {current.status}; `dualtaxi resume {run.run_id}` finishes it first."
             )
         if holds_steps(current):
             return current
-        return _rerecord(current, report, stop)
-
-
-def _rerecord(run: Run, report: Report, stop: Stop) -> Run:
-    config = from_mapping(run.file.config)
-    config = _with(config, recording=config.to_mapping()["recording"] | {"steps": "all"})
-    fresh = run.recording.with_suffix(".rerecording")
-    started = time.monotonic()
-    try:
-        with storage_errors(fresh):
+        if is_loop:
+            _require_actions(current, trust)
+        fresh, started = current.recording.with_suffix(".rerecording"), time.monotonic()
+        try:
+            with storage_errors(fresh):
+                fresh.unlink(missing_ok=True)
+                if is_loop:
+                    for done in stream_from_child(_rerecord_loop, current.recording, fresh, trust):
+                        count(done)
+                else:
+                    _rerecord_job(current, fresh, report, stop)
+                fresh.replace(current.recording)
+        finally:
             fresh.unlink(missing_ok=True)
-            summary = _record(Job(config, run.seed), run, fresh, report, stop)
-            fresh.replace(run.recording)
-    finally:
-        fresh.unlink(missing_ok=True)
-    summary |= {"seconds": round(time.monotonic() - started, 3), "bytes": run.recording.stat().st_size}
-    return run.update(config=config.to_mapping(), summary=summary)
+        with open_recording(current.recording) as recording:
+            config, summary = recording.config, recording.raw_result
+        summary = {key: value for key, value in summary.items() if key != "status"}
+        seconds, size = round(time.monotonic() - started, 3), current.recording.stat().st_size
+        return current.update(config=config, summary=summary | {"seconds": seconds, "bytes": size})
 
 
 def evaluate(
@@ -175,7 +177,14 @@ def evaluation_of(
     )
 
 
-def _record(job: Job, run: Run, fresh: Path, report: Report, stop: Stop) -> dict[str, object]:
+def _with(config: ExperimentConfig, **changes: object) -> ExperimentConfig:
+    return from_mapping(config.to_mapping() | changes)
+
+
+def _rerecord_job(run: Run, fresh: Path, report: Report, stop: Stop) -> None:
+    """Train a job again, and write its recording with steps into a new file."""
+    config = from_mapping(run.file.config)
+    job = Job(_with(config, recording=config.to_mapping()["recording"] | {"steps": "all"}), run.seed)
     mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
     with open_recording(run.recording) as recording:
         learner = Learner(job.config, mdp, job.seed, recorded_tables(recording))
@@ -211,21 +220,13 @@ def _record(job: Job, run: Run, fresh: Path, report: Report, stop: Stop) -> dict
         if summary["content_digest"] != expected:
             raise Diverged("the recording", "content digest", summary["content_digest"], expected)
         write_result(file, "finished", summary)
-    return summary
 
 
-def _with(config: ExperimentConfig, **changes: object) -> ExperimentConfig:
-    return from_mapping(config.to_mapping() | changes)
-
-
-def rerecord_loop(run: Run, trust: bool, report: Callable[[int], None]) -> Run:
-    """Record the whole steps of a loop; the caller has locked the run.
-
-    The new recording replaces the old one when it is complete and has the same content digest.
+def _require_actions(run: Run, trust: bool) -> None:
+    """Refuse a loop whose steps cannot be done again, or whose result cannot be compared.
 
     Raises:
         CannotRedo: the environment cannot be had.
-        Diverged: it gives other observations or rewards; the recording stays as it is.
         RunnerError: no actions were recorded, or the loop was cut off.
     """
     with open_recording(run.recording) as recording:
@@ -240,24 +241,10 @@ def rerecord_loop(run: Run, trust: bool, report: Callable[[int], None]) -> Run:
             )
         if reason := why_not_redone(recording, trust):
             raise CannotRedo(reason)
-    fresh, started = run.recording.with_suffix(".rerecording"), time.monotonic()
-    try:
-        with storage_errors(fresh):
-            fresh.unlink(missing_ok=True)
-            for done in stream_from_child(_write, run.recording, fresh, trust):
-                report(done)
-            fresh.replace(run.recording)
-    finally:
-        fresh.unlink(missing_ok=True)
-    with open_recording(run.recording) as recording:
-        config, result = recording.config, recording.metadata("result")["json"]
-    size, seconds = run.recording.stat().st_size, round(time.monotonic() - started, 3)
-    summary = json_object(result, "the result") | {"seconds": seconds, "bytes": size}
-    return run.update(config=config, summary=summary)
 
 
-def _write(path: Path, fresh: Path, trust: bool) -> None:
-    """Write the recording with whole steps into a new file; runs in a child process."""
+def _rerecord_loop(path: Path, fresh: Path, trust: bool) -> None:
+    """Write a loop's recording with whole steps into a new file; runs in a child process."""
     with open_recording(path) as recording:
         rewrite(
             path,
@@ -290,14 +277,13 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
     """
     names = {recording.topic(f"/{phase}/step").name for phase in schema.PHASES}
     dtypes = {topic: dtype for topic, dtype in recording.dtypes.items() if topic.name in names}
-    plan = recording.config["recording"]
-    packing = Packing(plan["compression"], plan["level"] or 0, plan["index"], plan["chunk_steps"])
+    packing = recorded_packing(recording.config)
     recorder = Recorder(file, dtypes, packing)
     try:
         with closing(Replay(recording, trust, 0.0, lambda _: None, render=False)) as replay:
             states = {phase: np.full(recording.environments, -1, np.int64) for phase in schema.PHASES}
             for piece in pieces(recording, schema.PHASES):
-                records = _whole_records(recording, replay, piece, recorder, states[piece.phase])
+                records = _whole_records(recording, replay, piece, states[piece.phase])
                 topic, times = recording.topic(f"/{piece.phase}/step"), records["log_time"]
                 for block, part in recorder.fill(topic, times // schema.STEP_NANOSECONDS):
                     block[:] = records[part]
@@ -315,21 +301,14 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
 
 
 def _whole_records(
-    recording: Recording, replay: Replay, piece: Piece, recorder: Recorder, states: NDArray[np.int64]
+    recording: Recording, replay: Replay, piece: Piece, states: NDArray[np.int64]
 ) -> NDArray[np.void]:
     """Return the whole records of the steps of a piece; `states` are those after the last of each."""
-    topic, rows = recording.topic(f"/{piece.phase}/step"), piece.rows
-    records = recorder.blank(topic, len(rows))
-    for name in rows.dtype.names or ():
-        if name != "digest":
-            records[name] = rows[name]
-    after = "next_state" if recording.kind == "step" else "next_observation"
+    rows, records = piece.rows, blank_steps(recording, piece.phase, piece.rows)
     for environment in replay.environments:
         for steps in replay.steps(piece, environment, draws=False):
-            if steps.difference is not None:
-                raise CannotRedo(f"The environment is not the recorded one: {steps.difference}.")
-            at = steps.step - piece.first
-            records[after][at], records["rewards"][at] = steps.got.observations, steps.got.rewards
+            fill_in(records, steps.step - piece.first, steps)
+    after = after_step(records.dtype)
     start = int(recording.spaces["observation"]["start"]) if recording.kind == "step" else 0
     for reset in piece.resets:
         row = reset.step - piece.first + reset.environment

@@ -12,10 +12,9 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.config.loading import packing_from
+from runner.config.loading import recorded_packing
 from runner.errors import truncated_message
 from runner.loops.copied_rows import Copied, CopiedExtras, CopiedMessages, CopiedRows
-from runner.loops.options import PACKING
 from runner.loops.outcomes import Outcomes
 from runner.loops.shard_sources import PHASES, Source
 from runner.recording import schema
@@ -67,8 +66,7 @@ class Fold:
         """Write the new recording; return the summary of the run."""
         first, started = self._first, time.monotonic()
         facts = self._facts()
-        chosen = first.config.get("recording") or {}
-        packing = packing_from({key: chosen[key] for key in PACKING if key in chosen}).packing
+        packing = recorded_packing(first.config)
         with create_recording(fresh, schema.KINDS[first.kind]) as file:
             file.add_metadata("run", facts)
             for name in first.metadata_names:

@@ -67,7 +67,7 @@ class VectorRows:
         self._length = np.zeros(n, np.int64)
         self._return = np.zeros(n)
         self._ended = self._reset_count = 0
-        self._observation_dtype = recorder.blank(self._resets, 1).dtype["observation"]
+        self._observation_dtype = recorder.dtype(self._resets)["observation"]
         self._current = np.zeros(n, self._observation_dtype)
         """The observations before the first row of the block."""
         self._room = self._filled = 0
@@ -96,7 +96,7 @@ class VectorRows:
         """Allocate the block; the dtype of actions is known."""
         n = self._n
         self._room = rows = max(1, min(_MAX_STEPS, self._recorder.capacity(self._steps) // n))
-        records = self._recorder.blank(self._steps, 1).dtype
+        records = self._recorder.dtype(self._steps)
         action = self._action_leaves[0].base if self._discrete else records["action"]
         self._actions = np.empty((rows, n), action)
         self._observations = np.empty((rows, n), self._observation_dtype)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.recording import schema
-from runner.recording.actions import ACTION_TOPICS, EpisodeDigests, Rows, kept_dtype, packed
+from runner.recording.actions import ACTION_TOPICS, EpisodeDigests, Rows, after_step, kept_dtype, packed
 from runner.recording.messages import encode
 from runner.recording.recorder import BLOCK_BYTES, Recorder
 from runner.recording.schema import RESET_ONLY, Topic
@@ -45,7 +42,8 @@ class ActionRecorder:
             taken = found["t"] != RESET_ONLY
             if not taken.all():
                 at, found = at[taken], found[taken]
-            for row, digest in self._digests[topic.phase].add(environment, *_outcomes(found)):
+            names = "t", after_step(found.dtype), "rewards", "terminated", "truncated"
+            for row, digest in self._digests[topic.phase].add(environment, *map(found.__getitem__, names)):
                 rows["digest"][at[row]] = np.void(digest)
         self._rows.append(rows)
         is_large = sum(each.nbytes for each in self._rows) >= BLOCK_BYTES
@@ -59,10 +57,3 @@ class ActionRecorder:
             position = int(rows["log_time"][-1]) // schema.STEP_NANOSECONDS
             topic = ACTION_TOPICS[f"/{self._phase}/step"]
             self._recorder.append(topic, encode(schema.ACTIONS, packed(rows, self._n)), position)
-
-
-def _outcomes(rows: Rows) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return number in the episode, observations, rewards and ends of whole records."""
-    names = rows.dtype.names or ()
-    observations = rows["next_state" if "next_state" in names else "next_observation"]
-    return rows["t"], observations, rows["rewards"], rows["terminated"], rows["truncated"]

@@ -48,6 +48,11 @@ def kept_dtype(step: np.dtype[np.void]) -> np.dtype[np.void]:
     return np.dtype([("step", "<i8"), *kept, ("digest", f"V{DIGEST_BYTES}")])
 
 
+def after_step(step: np.dtype[np.void]) -> str:
+    """Return the name of the field of whole records with the observation after the step."""
+    return "next_state" if "next_state" in (step.names or ()) else "next_observation"
+
+
 class EpisodeDigests:
     """The running digests of the episodes of some environments, over what their steps brought."""
 

@@ -164,9 +164,9 @@ class Recorder:
         """Raise the error that stopped the writing, if there was one."""
         self._pipeline.raise_failure()
 
-    def blank(self, topic: Topic, n: int) -> NDArray[np.void]:
-        """Return n new records of a fixed-width topic, with every constant byte set."""
-        return blank_records(topic, self._lanes[topic].dtype, n)
+    def dtype(self, topic: Topic) -> np.dtype[np.void]:
+        """Return the dtype of the records of a fixed-width topic."""
+        return self._lanes[topic].dtype
 
     def block(self, topic: Topic) -> NDArray[np.void]:
         """Return the free records of the topic's open block, to be filled from the first on."""

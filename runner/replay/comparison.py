@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from runner.errors import CannotRedo
 from runner.recording import schema
-from runner.recording.actions import EpisodeDigests
+from runner.recording.actions import EpisodeDigests, after_step
 from runner.recording.reader import Recording
 from runner.replay.differences import Difference, differing_value, first_differing_row
 from runner.replay.recorded import RecordedReset, ended_episode
@@ -205,5 +205,4 @@ def _recorded_values(rows: NDArray[np.void], results: Results) -> Values:
     if "rewards" not in names:
         got = results.values
         return Values(got.observations, got.rewards, rows["terminated"], rows["truncated"])
-    observations = rows["next_state" if "next_state" in names else "next_observation"]
-    return Values(observations, rows["rewards"], rows["terminated"], rows["truncated"])
+    return Values(rows[after_step(rows.dtype)], rows["rewards"], rows["terminated"], rows["truncated"])

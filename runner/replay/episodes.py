@@ -103,8 +103,7 @@ def episode_at(
             for action in stepper.actions(own_steps(piece, target.environment, n)[0])
         )
         for steps in _episode(recording, replay, until, start, lambda: on_reset(stepper, actions)):
-            if steps.difference is not None:
-                raise CannotRedo(f"The environment is not the recorded one: {steps.difference}.")
+            steps.require_equal()
         yield
 
 

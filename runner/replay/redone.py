@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.errors import CannotRedo
 from runner.recording.spaces import Value
 from runner.replay.differences import Difference
 from runner.util.arrays import Array
@@ -79,6 +80,16 @@ class RedoneSteps:
 
     def __len__(self) -> int:
         return len(self.step)
+
+    def require_equal(self) -> Self:
+        """Return these steps.
+
+        Raises:
+            CannotRedo: they differ from the recorded ones.
+        """
+        if self.difference is not None:
+            raise CannotRedo(f"The environment is not the recorded one: {self.difference}.")
+        return self
 
     def since(self, step: int) -> RedoneSteps:
         """Return what came from a step of the phase on."""

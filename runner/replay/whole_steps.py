@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.errors import CannotRedo, RecordingError
+from runner.errors import RecordingError
+from runner.recording.actions import after_step
 from runner.recording.blocks import blank_records
 from runner.recording.reader import MAX_EPISODE_BYTES, Recording, open_recording
 from runner.replay.redone import RedoneSteps
@@ -48,28 +49,39 @@ def _done_again(path: Path, phase: str, episode: int) -> Iterator[RedoneSteps]:
 @lru_cache(4)
 def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> NDArray[np.void]:
     with open_recording(path) as recording:
-        span, topic = recording.episode_span(phase, episode), recording.topic(f"/{phase}/step")
-        records = blank_records(topic, recording.dtypes[topic], len(span))
+        span, own = recording.episode_span(phase, episode), []
         for block in recording.actions(phase):
-            own = block[(block["step"] >= span.start) & (block["step"] < span.stop)]
-            own = own[(own["step"] - span.start) % span.step == 0]
-            if len(own):
-                at = (own["step"] - span.start) // span.step
-                for name in own.dtype.names or ():
-                    if name != "digest":
-                        records[name][at] = own[name]
+            inside = block[(block["step"] >= span.start) & (block["step"] < span.stop)]
+            own.append(inside[(inside["step"] - span.start) % span.step == 0])
+        records = blank_steps(recording, phase, np.concatenate(own))
         is_state, start = recording.kind == "step", 0
         if is_state:
             start = int(recording.spaces["observation"]["start"])
-    after = "next_state" if is_state else "next_observation"
     for steps in _done_again(path, phase, episode):
-        if steps.difference is not None:
-            raise CannotRedo(f"The environment is not the recorded one: {steps.difference}.")
-        at = (steps.step - span.start) // span.step
-        records[after][at], records["rewards"][at] = steps.got.observations, steps.got.rewards
+        fill_in(records, (steps.step - span.start) // span.step, steps)
         for first in steps.starts if is_state else ():
             records["state"][0] = int(np.asarray(first.got).reshape(())) - start
     if is_state:
         records["state"][1:] = records["next_state"][:-1]
     records.setflags(write=False)
     return records
+
+
+def blank_steps(recording: Recording, phase: str, rows: NDArray[np.void]) -> NDArray[np.void]:
+    """Return whole records of recorded actions, without states, observations and rewards."""
+    topic = recording.topic(f"/{phase}/step")
+    records = blank_records(topic, recording.dtypes[topic], len(rows))
+    for name in rows.dtype.names or ():
+        if name != "digest":
+            records[name] = rows[name]
+    return records
+
+
+def fill_in(records: NDArray[np.void], at: NDArray[np.int64], steps: RedoneSteps) -> None:
+    """Fill in what the environment returned for the records at these places.
+
+    Raises:
+        CannotRedo: it is not the recorded environment.
+    """
+    got = steps.require_equal().got
+    records[after_step(records.dtype)][at], records["rewards"][at] = got.observations, got.rewards
