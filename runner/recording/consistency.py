@@ -206,7 +206,7 @@ class _Phase:
         """Compare the states before steps with those after the steps, or resets, before them."""
         rows, number, reset_only, names = b.rows, b.number, b.reset_only, b.rows.dtype.names or ()
         observed: Array | None = None
-        if b.resets is not None and "observation" in (b.resets.dtype.names or ()):
+        if b.resets is not None:
             observed = np.zeros(len(rows), b.resets.dtype["observation"])
             observed[b.reset_rows] = b.resets["observation"]  # of several at one place the last counts
         if self._has_states:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +11,6 @@ from numpy.typing import NDArray
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.schema import RESET_ONLY, Topic
-
-_ROWS: Final = 4096
-"""Messages of varying size that are compared together."""
-_VALUES: Final = ("action", "observation", "next_observation", "seed", "seeded")
-"""The fields of such messages that are not compared."""
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -213,38 +207,18 @@ class Queue:
 def records_of(
     recording: Recording, name: str, on_block: OnBlock = lambda *_: None
 ) -> Iterator[NDArray[np.void]]:
-    """Yield the records of a topic in blocks; of messages of varying size all but the values of spaces.
+    """Yield the records of a topic in blocks, as `Recording.rows` does.
 
     Raises:
-        Inconsistent: messages are not numbered consecutively, or have not one reward for each learner.
+        Inconsistent: messages are not numbered consecutively.
     """
-    topic = recording.topic(name)
-    learners, number = len(recording.agents), schema.NUMBERED_BY[topic.message]
-    if topic in recording.dtypes:
-        first = 0
-        for block in recording.blocks(topic):
+    topic, first = recording.topic(name), 0
+    number = schema.NUMBERED_BY[topic.message]
+    for block in recording.rows(name):
+        if topic in recording.dtypes:
             on_block(topic, block)
-            if (wrong := np.flatnonzero(block[number] != first + np.arange(len(block)))).size:
-                found, expected = block[number][wrong[0]], first + wrong[0]
-                raise Inconsistent(f"{name}: found {number} {found}, expected {expected}")
-            yield block
-            first += len(block)
-        return
-    kinds = {"rewards": ("f8", (learners,)), "terminated": "?", "truncated": "?"}
-    names = [field.name for field in topic.message.fields if field.name not in _VALUES]
-    dtype = np.dtype([*((name, kinds.get(name, "i8")) for name in names), ("log_time", "u8")])
-    rows: list[tuple[Any, ...]] = []
-    for expected, message in enumerate(recording.decoded(topic)):
-        if message[number] != expected:
-            raise Inconsistent(f"{name}: found {number} {message[number]}, expected {expected}")
-        if len(message.get("rewards", [None] * learners)) != learners:
-            raise Inconsistent(
-                f"{name}, {number} {expected}: found {len(message['rewards'])} rewards, expected {learners}"
-            )
-        values = (message[field] for field in dtype.names or ())
-        rows.append(tuple(tuple(value) if isinstance(value, list) else value for value in values))
-        if len(rows) == _ROWS:
-            yield np.array(rows, dtype)
-            rows = []
-    if rows:
-        yield np.array(rows, dtype)
+        if (wrong := np.flatnonzero(block[number] != first + np.arange(len(block)))).size:
+            found, expected = block[number][wrong[0]], first + wrong[0]
+            raise Inconsistent(f"{name}: found {number} {found}, expected {expected}")
+        yield block
+        first += len(block)

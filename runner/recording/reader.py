@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import os
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Final
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from runner.errors import NotInRecording, RecordingError
 from runner.recording import schema
 from runner.recording.actions import kept_dtype, unpacked
+from runner.recording.blocks import topic_dtype
 from runner.recording.extras import ExtraLayout, Extras, read_layouts
 from runner.recording.labels import read_labels
 from runner.recording.liveness import is_owned
@@ -47,7 +48,12 @@ MAX_EPISODE_BYTES: Final = 128 << 20
 MAX_METRICS: Final = 1 << 17
 """The most that `metrics` returns as one list."""
 _METRICS_BYTES: Final = 1 << 20
-_ENDING: Final = np.dtype([("step", "i8"), ("terminated", "?"), ("truncated", "?")])
+FOREVER: Final = 2**63 - 1
+"""A time in nanoseconds that no message has."""
+_OBJECT: Final = np.dtype(object)
+_ROWS: Final = 1024
+_ROWS_BYTES: Final = 16 << 20
+"""The most messages of varying size in a block of `rows`, and the bytes of values with which one ends."""
 
 
 def open_recording(path: str | os.PathLike[str]) -> Recording:
@@ -127,15 +133,71 @@ class Recording(TopicReader):
     def actions(self, phase: str, times: range | None = None) -> Iterator[NDArray[np.void]]:
         """Yield the steps of a loop's phase of which only the actions were recorded, in blocks.
 
-        Their fields are those of `kept_dtype`; `times` selects blocks by the `log_time` of their last step.
+        Their fields are those of `kept_dtype`; `times` as for `rows`.
 
         Raises:
             RecordingError: they are damaged.
         """
         topic = self.topic(f"/{phase}/actions")
-        dtype, where = kept_dtype(self.dtypes[self.topic(f"/{phase}/step")]), f"{self.path}: {topic.name}"
-        for fields in self.decoded(topic, times=times):
-            yield unpacked(fields, dtype, self.environments, where)
+        dtype, where = self.row_dtype(f"/{phase}/step"), f"{self.path}: {topic.name}"
+        # A message has the time of its last step.
+        for fields in self.decoded(topic, times=times and range(times.start, FOREVER)):
+            block = unpacked(fields, dtype, self.environments, where)
+            if times is not None:
+                if block["log_time"][0] >= times.stop:
+                    return
+                block = block[(block["log_time"] >= times.start) & (block["log_time"] < times.stop)]
+            yield block
+
+    def rows(self, name: str, times: range | None = None) -> Iterator[NDArray[np.void]]:
+        """Yield the steps, resets or episodes of a loop as records in blocks, however they are recorded.
+
+        Values of varying size are objects: the bytes that `spaces.decode` takes. Steps whose actions alone
+        were recorded have the fields of `kept_dtype`.
+
+        Args:
+            name: of the topic.
+            times: their `log_time` in ns, from the first to before the last; None for all.
+
+        Raises:
+            RecordingError: they are damaged.
+        """
+        topic = self.topic(name)
+        if topic.message in schema.STEP_MESSAGES and self.has_actions_alone(topic.phase):
+            yield from self.actions(topic.phase, times)
+        elif topic not in self.dtypes:
+            yield from self._decoded_rows(topic, times)
+        elif times is None:
+            yield from self.blocks(topic)
+        else:
+            yield from self.blocks_between(topic, times.start, times.stop)
+
+    def row_dtype(self, name: str) -> np.dtype[np.void]:
+        """Return the dtype of `rows`."""
+        topic = self.topic(name)
+        if topic not in self.dtypes:
+            return topic_dtype(topic, len(self.agents), 0, _OBJECT, _OBJECT)
+        is_alone = topic.message in schema.STEP_MESSAGES and self.has_actions_alone(topic.phase)
+        return kept_dtype(self.dtypes[topic]) if is_alone else self.dtypes[topic]
+
+    def _decoded_rows(self, topic: Topic, times: range | None) -> Iterator[NDArray[np.void]]:
+        """Yield messages of varying size as records, their values of spaces as bytes."""
+        learners, number = len(self.agents), schema.NUMBERED_BY[topic.message]
+        dtype, size = self.row_dtype(topic.name), 0
+        messages: list[Message] = []
+        for message in self.decoded(topic, times=times):
+            if len(rewards := message.get("rewards", [0.0] * learners)) != learners:
+                raise RecordingError(
+                    f"{self.path}: {topic.name}, {number} {message[number]}: found {len(rewards)} rewards, "
+                    f"expected {learners}."
+                )
+            messages.append(message)
+            size += sum(len(value) for value in message.values() if isinstance(value, bytes))
+            if len(messages) == _ROWS or size > _ROWS_BYTES:
+                yield _records_of(messages, dtype)
+                messages, size = [], 0
+        if messages:
+            yield _records_of(messages, dtype)
 
     def has_messages(self, name: str) -> bool:
         """Return whether the topic of that name has any message."""
@@ -156,29 +218,18 @@ class Recording(TopicReader):
         Of a recording that was cut off these are the steps up to the first end of an episode after its last
         reset: what comes later may lack its reset, since topics are written one after the other.
         """
-        topic, resets = self.topic(f"/{phase}/step"), self.topic(f"/{phase}/reset")
         n, total = self.environments, self.step_count(phase)
         if "content_digest" in self.result:
             return total
-        if resets in self.dtypes:
-            count = self.count(resets)
-            last = max(
-                (int(block["step"][-1]) for block in self.blocks(resets, count - 1, count)), default=-1
-            )
-            steps: Iterator[Any] = self.blocks(topic, max(last, 0))
-            if self.has_actions_alone(phase):
-                steps = (block[block["step"] >= last] for block in self.actions(phase))
-        else:
-            last = max((int(each["step"]) for each in self.decoded(resets)), default=-1)
-            steps = (
-                np.array([(each["step"], each["terminated"], each["truncated"])], _ENDING)
-                for each in self.decoded(topic)
-                if each["step"] >= last
-            )
-        if last < 0:
+        name = f"/{phase}/reset"
+        chunks, last = self._chunks(self.topic(name)), None
+        start = chunks.entry(len(chunks) - 1).start_time if len(chunks) else FOREVER
+        for resets in self.rows(name, range(start, FOREVER)):
+            last = resets[-1]
+        if last is None:
             return 0
-        for block in steps:
-            over = block["terminated"] | block["truncated"]
+        for block in self.rows(f"/{phase}/step", range(int(last["log_time"]), FOREVER)):
+            over = (block["terminated"] | block["truncated"]) & (block["step"] >= last["step"])
             if over.any():
                 return min(int(block["step"][np.argmax(over)]) // n * n + n, total // n * n)
         return total // n * n
@@ -393,3 +444,10 @@ class Recording(TopicReader):
 
     def _snapshots(self, first_chunk: int) -> Iterator[QTable]:
         return (table for _, table in self._parsed(schema.Q_TABLE_TOPIC, decode_q_table, first_chunk))
+
+
+def _records_of(messages: Sequence[Message], dtype: np.dtype[np.void]) -> NDArray[np.void]:
+    records = np.zeros(len(messages), dtype)
+    for name in messages[0]:
+        records[name] = [message[name] for message in messages]
+    return records

@@ -138,14 +138,11 @@ def _target(recording: Recording, phase: str, number: int) -> _Target:
 
 def _step_time(recording: Recording, phase: str, step: int) -> int:
     topic = recording.topic(f"/{phase}/step")
-    if recording.has_actions_alone(phase):
-        found = (block[block["step"] == step] for block in recording.actions(phase))
-        times = (int(block["log_time"][0]) for block in found if len(block))
-    elif topic in recording.dtypes:
-        times = (int(block["log_time"][0]) for block in recording.blocks(topic, step, step + 1))
+    if topic in recording.dtypes and not recording.has_actions_alone(phase):
+        blocks = recording.blocks(topic, step, step + 1)
     else:
-        times = (int(each["log_time"]) for each in recording.decoded(topic) if each["step"] == step)
-    if (time := next(times, None)) is None:
+        blocks = (block[block["step"] == step] for block in recording.rows(topic.name))
+    if (time := next((int(block["log_time"][0]) for block in blocks if len(block)), None)) is None:
         raise RecordingError(f"{recording.path}: {topic.name}: step {step:,} was lost.")
     return time
 

@@ -13,17 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording import schema
-from runner.recording.actions import kept_dtype
 from runner.recording.loop_blocks import aligned
-from runner.recording.reader import Recording
+from runner.recording.reader import FOREVER, Recording
 from runner.recording.reset_states import ResetState
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.spaces import Value
 
-_ROWS: Final = 1024
-"""Steps of varying size in a piece."""
-_FOREVER: Final = 2**63 - 1
 _BLOCK_BYTES: Final = 16 << 20
 T = TypeVar("T")
 _Row = tuple[Any, ...]
@@ -115,11 +110,15 @@ def resets_of(
     recording: Recording, phase: str, start_time: int = 0, stop_time: int | None = None
 ) -> Iterator[RecordedReset]:
     """Yield the resets of a phase in order, from `start_time` up to and with `stop_time`."""
-    topic = recording.topic(f"/{phase}/reset")
-    times = range(start_time, _FOREVER if stop_time is None else stop_time + 1)
+    times = range(start_time, FOREVER if stop_time is None else stop_time + 1)
     states = recording.reset_states(phase, times)
     state = next(states, None)
-    rows = _reset_rows(recording, topic, times)
+    names = ("reset", "environment", "episode", "step", "log_time", "seed", "seeded")
+    rows = (
+        row
+        for block in recording.rows(f"/{phase}/reset", times)
+        for row in zip(*(block[name].tolist() for name in names), block["observation"], strict=True)
+    )
     for row, options, large_seed in _with_extras(recording, phase, rows, times):
         number, environment, episode, step, time, seed, seeded, observation = row
         own = None
@@ -127,16 +126,6 @@ def resets_of(
             own, state = state if state.reset == number else None, next(states, None)
         known_seed = seed if seeded else large_seed
         yield RecordedReset(number, environment, episode, step, time, observation, known_seed, options, own)
-
-
-def _reset_rows(recording: Recording, topic: schema.Topic, times: range) -> Iterator[_Row]:
-    names = ("reset", "environment", "episode", "step", "log_time", "seed", "seeded")
-    if topic in recording.dtypes:
-        for block in recording.blocks_between(topic, times.start, times.stop):
-            yield from zip(*(block[name].tolist() for name in names), block["observation"], strict=True)
-    else:
-        for message in recording.decoded(topic, times=times):
-            yield (*(message[name] for name in names), message["observation"])
 
 
 def _with_extras(
@@ -212,7 +201,7 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
     if "content_digest" not in recording.result:
         stop = recording.whole_steps(phase)
         rows = (whole for block in rows if len(whole := block[block["step"] < stop]))
-    nothing = np.empty(0, _row_dtype(recording, phase))
+    nothing = np.empty(0, recording.row_dtype(f"/{phase}/step"))
     for block in rows:
         first, time = int(block["step"][0]), int(block["log_time"][0]) - STEP_NANOSECONDS
         early = []
@@ -266,72 +255,16 @@ def _blocks(
     recording: Recording, phase: str, start_time: int, stop_time: int | None
 ) -> Iterator[NDArray[np.void]]:
     """Yield the steps of a phase in blocks, each without steps of the other phase in between."""
-    topic = recording.topic(f"/{phase}/step")
-    stop = _FOREVER if stop_time is None else stop_time + 1
-    if recording.has_actions_alone(phase):
-        found = _action_blocks(recording, phase, start_time, stop)
-    elif topic in recording.dtypes:
-        found = recording.blocks_between(topic, start_time + 1, stop)
-    else:
-        found = _variable_blocks(recording, topic, range(start_time + 1, stop))
-    for block in found:
-        if not len(block):
-            continue
+    name = f"/{phase}/step"
+    topic, stop = recording.topic(name), FOREVER if stop_time is None else stop_time + 1
+    # Of actions alone a block has so many that their whole steps would not fit into memory.
+    width = recording.dtypes[topic].itemsize * recording.environments if topic in recording.dtypes else 1
+    rows = max(_BLOCK_BYTES // width, 1) * recording.environments
+    for block in recording.rows(name, range(start_time + 1, stop)):
         others = block["log_time"].astype(np.int64) // STEP_NANOSECONDS - block["step"]
-        edges = [0, *(np.flatnonzero(np.diff(others)) + 1).tolist(), len(block)]
-        for begin, end in pairwise(edges):
+        changes = (np.flatnonzero(np.diff(others)) + 1).tolist()
+        for begin, end in pairwise(sorted({*changes, *range(0, len(block), rows), len(block)})):
             yield block[begin:end]
-
-
-def _action_blocks(recording: Recording, phase: str, start: int, stop: int) -> Iterator[NDArray[np.void]]:
-    """Yield the steps logged after `start` and before `stop` of which only the actions were recorded."""
-    rows_each = capacity_of_steps(recording, phase)
-    for block in recording.actions(phase, range(start + 1, _FOREVER)):
-        times = block["log_time"]
-        if times[0] >= stop:
-            return
-        own = block[(times > start) & (times < stop)]
-        for first in range(0, len(own), rows_each):
-            yield own[first : first + rows_each]
-
-
-def capacity_of_steps(recording: Recording, phase: str) -> int:
-    """Return how many steps of all environments fit into some megabytes when they are whole."""
-    width = recording.dtypes[recording.topic(f"/{phase}/step")].itemsize * recording.environments
-    return max(_BLOCK_BYTES // width, 1) * recording.environments
-
-
-def _variable_blocks(recording: Recording, topic: schema.Topic, times: range) -> Iterator[NDArray[np.void]]:
-    """Yield messages of varying size as records, their values of spaces as bytes."""
-    dtype, learners = _row_dtype(recording, topic.phase), len(recording.agents)
-    rows: list[tuple[object, ...]] = []
-    for message in recording.decoded(topic, times=times):
-        if len(message["rewards"]) != learners:
-            raise RecordingError(
-                f"{recording.path}: {topic.name}: found {len(message['rewards'])} rewards of a step, "
-                f"expected {learners}."
-            )
-        rows.append(
-            tuple(tuple(v) if isinstance(v := message[name], list) else v for name in dtype.names or ())
-        )
-        if len(rows) == _ROWS:
-            yield np.array(rows, dtype)
-            rows = []
-    if rows:
-        yield np.array(rows, dtype)
-
-
-def _row_dtype(recording: Recording, phase: str) -> np.dtype[np.void]:
-    topic = recording.topic(f"/{phase}/step")
-    if recording.has_actions_alone(phase):
-        return kept_dtype(recording.dtypes[topic])
-    if topic in recording.dtypes:
-        return recording.dtypes[topic]
-    learners = len(recording.agents)
-    kinds: dict[str, object] = {"rewards": ("f8", (learners,)), "terminated": "?", "truncated": "?"}
-    kinds |= {"action": "O", "next_observation": "O"}
-    names = [field.name for field in topic.message.fields]
-    return np.dtype([*((name, kinds.get(name, "i8")) for name in names), ("log_time", "u8")])
 
 
 def ended_episode(recording: Recording, phase: str, environment: int, step: int) -> int | None:
