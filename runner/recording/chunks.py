@@ -18,6 +18,7 @@ import numpy as np
 import zstandard
 from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
@@ -46,17 +47,21 @@ Packed = Callable[[str, bytes | memoryview], bytes | memoryview | None]
 
 
 @dataclass(frozen=True)
+class ChunkSummary:
+    """A chunk's entry in the summary of a file, and its messages."""
+
+    index: ChunkIndex
+    channel: int
+    messages: int
+
+
+@dataclass(frozen=True)
 class Chunk:
-    """An encoded chunk: its MCAP records, and its entry in the summary."""
+    """An encoded chunk: its MCAP records, and its summary, but for where it is in the file."""
 
     record: bytes
     index: bytes
-    compression: str
-    compressed_size: int
-    uncompressed_size: int
-    start_time: int
-    end_time: int
-    messages: int
+    summary: ChunkSummary
 
 
 def encode_chunk(
@@ -76,16 +81,18 @@ def encode_chunk(
     """
     name = "" if packing.compression == "none" else packing.compression
     width = len(records) // len(log_times) if topic.message is TRANSITION else 0
-    start, end, size, crc = int(log_times[0]), int(log_times[-1]), len(records), crc32(records)
+    size, crc = len(records), crc32(records)
     data = (packed and packed(name, records)) or _compress(records, packing, width)
     if topic.message is ACTIONS and len(data) * _MOSTLY_ZEROS < len(records):  # quick at any level
         data = _compress(records, replace(packing, level=MAX_LEVEL), width)
+    start, end = int(log_times[0]), int(log_times[-1])
     head = CHUNK_HEAD.pack(start, end, size, crc, len(name)) + name.encode()
     head += _DATA_LENGTH.pack(len(data))
     record = b"".join((RECORD_HEAD.pack(Opcode.CHUNK, len(head) + len(data)), head, data))
     indexed = has_message_index(topic, packing.index == "message")
     index = message_index(topic.channel, log_times, offsets) if indexed else b""
-    return Chunk(record, index, name, len(data), size, start, end, len(log_times))
+    entry = ChunkIndex(len(record), 0, name, len(data), end, 0, {}, start, size)
+    return Chunk(record, index, ChunkSummary(entry, topic.channel, len(log_times)))
 
 
 def has_message_index(topic: Topic, indexed: bool) -> bool:

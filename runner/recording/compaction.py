@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -21,6 +19,7 @@ from runner.recording.actions import Rows, kept_dtype, packed, unpacked
 from runner.recording.blocks import HEADER_BYTES, message_record
 from runner.recording.chunks import encode_chunk
 from runner.recording.messages import decode, encode
+from runner.recording.pipeline import MessageBatches
 from runner.recording.recorder import BLOCK_BYTES
 from runner.recording.records import ReadChunk, attachment_of, metadata_of, read_chunk
 from runner.recording.rewriting import whole_records
@@ -31,20 +30,6 @@ from runner.util.packing import Packing
 
 _SMALL: Final = 1 << 16
 """Chunks of more bytes, unpacked, are not put together with others."""
-_MAX_BYTES: Final = 1 << 20
-_MAX_MESSAGES: Final = 2048
-
-
-@dataclass
-class _Gathered:
-    """Messages of a topic that wait for a chunk."""
-
-    records: list[bytes] = field(default_factory=list)
-    times: list[NDArray[np.uint64]] = field(default_factory=list)
-    offsets: list[NDArray[np.uint64]] = field(default_factory=list)
-    size: int = 0
-    """Bytes of the records."""
-    count: int = 0
 
 
 class _Compaction:
@@ -65,18 +50,22 @@ class _Compaction:
         self._file, self._packing, self._n = file, packing, environments
         self._kept = {topic: kept_dtype(dtype) for topic, dtype in steps.items()}
         self._rows: dict[Topic, list[Rows]] = defaultdict(list)
-        self._gathered: dict[Topic, _Gathered] = defaultdict(_Gathered)
+        self._batches = MessageBatches(self._write)
         self.messages: dict[str, int] = {topic.name: 0 for topic in steps}
         """Messages with actions written so far, by topic."""
 
     def take(self, chunk: ReadChunk) -> None:
         """Take a chunk of the old recording."""
         topic = TOPIC_OF[chunk.summary.channel]
-        if topic not in self._kept:
-            self._gather(topic, chunk)
+        if topic not in self._kept and len(chunk.records) > _SMALL:
+            self._batches.flush_topic(topic)
+            self._write(topic, chunk.records, chunk.times, chunk.offsets)
             return
-        for start, stop in pairwise([*chunk.offsets.tolist(), len(chunk.records)]):
-            fields = decode(topic.message, chunk.records[start + HEADER_BYTES : stop])
+        if topic not in self._kept:
+            self._batches.add(topic, chunk.times.tolist(), chunk.messages)
+            return
+        for record in chunk.messages:
+            fields = decode(topic.message, record[HEADER_BYTES:])
             self._rows[topic].append(unpacked(fields, self._kept[topic], self._n, topic.name))
         limit = min(self._packing.chunk_steps, max(1, BLOCK_BYTES // self._kept[topic].itemsize))
         if sum(map(len, self._rows[topic])) >= limit:
@@ -91,35 +80,22 @@ class _Compaction:
         for topic, rows in self._rows.items():
             if sum(map(len, rows)):
                 self._write_actions(topic, np.concatenate(rows))
-        for topic in list(self._gathered):
-            self._write(topic)
+        self._batches.flush()
 
     def _write_actions(self, topic: Topic, rows: Rows) -> None:
         log_time = rows["log_time"][-1:].astype(np.uint64)
         record = message_record(topic, int(log_time[0]), encode(schema.ACTIONS, packed(rows, self._n)))
-        chunk = encode_chunk(topic, record, log_time, np.zeros(1, np.uint64), self._packing)
-        self._file.add_chunk(topic, chunk)
+        self._write(topic, record, log_time, np.zeros(1, np.uint64))
         self.messages[topic.name] += 1
 
-    def _gather(self, topic: Topic, chunk: ReadChunk) -> None:
-        size, waiting = len(chunk.records), self._gathered[topic]
-        is_small = size <= _SMALL
-        if not is_small or waiting.size + size > _MAX_BYTES or waiting.count >= _MAX_MESSAGES:
-            self._write(topic)
-        waiting = self._gathered[topic]
-        waiting.records.append(chunk.records)
-        waiting.times.append(chunk.times)
-        waiting.offsets.append(chunk.offsets + np.uint64(waiting.size))
-        waiting.size += size
-        waiting.count += len(chunk.times)
-        if not is_small:
-            self._write(topic)
-
-    def _write(self, topic: Topic) -> None:
-        if (waiting := self._gathered.pop(topic, None)) is not None:
-            times, offsets = np.concatenate(waiting.times), np.concatenate(waiting.offsets)
-            chunk = encode_chunk(topic, b"".join(waiting.records), times, offsets, self._packing)
-            self._file.add_chunk(topic, chunk)
+    def _write(
+        self,
+        topic: Topic,
+        records: bytes | memoryview,
+        times: NDArray[np.uint64],
+        offsets: NDArray[np.uint64],
+    ) -> None:
+        self._file.add_chunk(encode_chunk(topic, records, times, offsets, self._packing))
 
 
 def compacted(

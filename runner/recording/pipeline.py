@@ -226,7 +226,7 @@ class Pipeline:
             return
         chunk = work.encode() if encoded is None else encoded.result()
         try:
-            self._file.add_chunk(work.topic, chunk)
+            self._file.add_chunk(chunk)
         except OSError:
             self._file.cut_back()
             raise
@@ -256,12 +256,16 @@ class MessageBatches:
             pack(MESSAGE, head + len(payload), channel, 0, time, time) + payload
             for time, payload in zip(log_times, payloads, strict=True)
         ]
+        self.add(topic, log_times, records)
+
+    def add(self, topic: Topic, log_times: Sequence[int], records: Sequence[bytes]) -> None:
+        """Add whole message records to their topic's batch."""
         size = sum(map(len, records))
         batch = self._batches.get(topic)
         if batch is not None and (
             batch.size + size > MAX_BATCH_BYTES or len(batch.times) + len(records) > MAX_BATCH_MESSAGES
         ):
-            self._flush(topic)
+            self.flush_topic(topic)
             batch = None
         if batch is None:
             batch = self._batches[topic] = _Batch()
@@ -272,10 +276,12 @@ class MessageBatches:
     def flush(self) -> None:
         """Send every batch."""
         for topic in list(self._batches):
-            self._flush(topic)
+            self.flush_topic(topic)
 
-    def _flush(self, topic: Topic) -> None:
-        batch = self._batches.pop(topic)
+    def flush_topic(self, topic: Topic) -> None:
+        """Send the batch of a topic, if it has one."""
+        if (batch := self._batches.pop(topic, None)) is None:
+            return
         sizes = np.array([len(record) for record in batch.records], np.uint64)
         times = np.array(batch.times, np.uint64)
         self._send(topic, memoryview(b"".join(batch.records)), times, np.cumsum(sizes) - sizes)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
+from itertools import pairwise
 from typing import BinaryIO, Final, NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ from runner.recording.chunks import (
     CHUNK_HEAD,
     MAX_CHUNK_BYTES,
     Chunk,
+    ChunkSummary,
     chunk_head,
     has_message_index,
     message_index,
@@ -55,15 +57,6 @@ Report = Callable[[int, int], None]
 """Called with the bytes that were read, and the size of the file."""
 
 
-@dataclass(frozen=True)
-class ChunkSummary:
-    """The index entry, channel and number of messages of an undamaged chunk."""
-
-    index: ChunkIndex
-    channel: int
-    messages: int
-
-
 class ReadChunk(NamedTuple):
     """An undamaged chunk and its messages."""
 
@@ -74,6 +67,12 @@ class ReadChunk(NamedTuple):
     """Log times of the messages, in nanoseconds."""
     offsets: NDArray[np.uint64]
     """Where each message begins in `records`."""
+
+    @property
+    def messages(self) -> list[bytes]:
+        """The message records one by one."""
+        edges = pairwise([*self.offsets.tolist(), len(self.records)])
+        return [self.records[start:stop] for start, stop in edges]
 
 
 @dataclass
@@ -215,16 +214,9 @@ def copied_chunk(chunk: ReadChunk, body: bytes, indexed: bool) -> Chunk:
     summary, start, end = chunk.summary, int(chunk.times[0]), int(chunk.times[-1])
     body = _CHUNK_TIMES.pack(start, end) + body[_CHUNK_TIMES.size :]  # no checksum covers them
     indexed = has_message_index(schema.TOPIC_OF[summary.channel], indexed)
-    return Chunk(
-        record=RECORD_HEAD.pack(Opcode.CHUNK, len(body)) + body,
-        index=message_index(summary.channel, chunk.times, chunk.offsets) if indexed else b"",
-        compression=summary.index.compression,
-        compressed_size=summary.index.compressed_size,
-        uncompressed_size=summary.index.uncompressed_size,
-        start_time=start,
-        end_time=end,
-        messages=summary.messages,
-    )
+    index = message_index(summary.channel, chunk.times, chunk.offsets) if indexed else b""
+    entry = replace(summary.index, message_start_time=start, message_end_time=end)
+    return Chunk(RECORD_HEAD.pack(Opcode.CHUNK, len(body)) + body, index, replace(summary, index=entry))
 
 
 def attachment_of(body: bytes, offset: int) -> tuple[str, str, bytes]:

@@ -227,14 +227,13 @@ class _Salvage:
         if first > expected:
             self._done.lost.setdefault(topic.name, []).append([expected, first])
         self._next[topic] = first + count
-        file.add_chunk(topic, copied_chunk(chunk, body, self._indexed))
+        file.add_chunk(copied_chunk(chunk, body, self._indexed))
         self._done.kept[topic.name] = self._done.kept.get(topic.name, 0) + count
 
     def _take_extra_columns(self, chunk: ReadChunk) -> None:
         """Note how wide the records of extras are from here on."""
-        ends = [*chunk.offsets.tolist()[1:], len(chunk.records)]
-        for time, start, end in zip(chunk.times.tolist(), chunk.offsets.tolist(), ends, strict=True):
-            fields = decode(schema.EXTRA_COLUMNS, chunk.records[start + HEADER_BYTES : end])
+        for time, record in zip(chunk.times.tolist(), chunk.messages, strict=True):
+            fields = decode(schema.EXTRA_COLUMNS, record[HEADER_BYTES:])
             self._extra_columns.append((time, fields["json"]))
         layouts = read_layouts(self._extra_columns, str(self._path))
         self._extra_widths = {layout.record.itemsize for layout in layouts}

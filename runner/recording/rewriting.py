@@ -74,7 +74,7 @@ def rewrite(
                 chunk = read_chunk(body, offset)
                 topic = TOPIC_OF[chunk.summary.channel]
                 if topic.name not in left_out:
-                    file.add_chunk(topic, copied_chunk(chunk, body, indexed))
+                    file.add_chunk(copied_chunk(chunk, body, indexed))
         add(file)
         for name, added in (more or {}).items():
             file.add_metadata(name, added)

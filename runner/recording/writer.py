@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
 from types import TracebackType
@@ -33,7 +34,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import StorageError
 from runner.recording.blocks import RECORD_HEAD
-from runner.recording.chunks import Chunk
+from runner.recording.chunks import Chunk, ChunkSummary
 from runner.recording.index import FOOTER_BODY_BYTES, FOOTER_HEAD, checksum
 from runner.recording.messages import file_descriptor_set
 from runner.recording.records import Contents
@@ -109,7 +110,7 @@ class RecordingFile:
         file._attachments = list(contents.attachments)
         file._metadata = list(contents.metadata)
         for chunk in contents.chunks:
-            file._note_chunk(chunk.index, chunk.channel, chunk.messages)
+            file._note_chunk(chunk)
         return file
 
     @property
@@ -139,30 +140,23 @@ class RecordingFile:
         self._append(record)
         self._attachments.append(index)
 
-    def add_chunk(self, topic: Topic, chunk: Chunk) -> None:
+    def add_chunk(self, chunk: Chunk) -> None:
         """Append a chunk of one topic and its message index."""
-        start = self._offset
+        start, channel = self._offset, chunk.summary.channel
         self._append(chunk.record + chunk.index)
-        index_start = start + len(chunk.record)
-        index = ChunkIndex(
-            chunk_length=len(chunk.record),
-            chunk_start_offset=start,
-            compression=chunk.compression,
-            compressed_size=chunk.compressed_size,
-            message_end_time=chunk.end_time,
-            message_index_length=len(chunk.index),
-            message_index_offsets={topic.channel: index_start} if chunk.index else {},
-            message_start_time=chunk.start_time,
-            uncompressed_size=chunk.uncompressed_size,
-        )
-        self._note_chunk(index, topic.channel, chunk.messages)
+        place = {
+            "chunk_start_offset": start,
+            "message_index_offsets": {channel: start + len(chunk.record)} if chunk.index else {},
+            "message_index_length": len(chunk.index),
+        }
+        self._note_chunk(replace(chunk.summary, index=replace(chunk.summary.index, **place)))
 
-    def _note_chunk(self, index: ChunkIndex, channel: int, messages: int) -> None:
-        self._chunks.append(index)
-        self._counts[channel] += messages
-        start = index.message_start_time
+    def _note_chunk(self, chunk: ChunkSummary) -> None:
+        self._chunks.append(chunk.index)
+        self._counts[chunk.channel] += chunk.messages
+        start = chunk.index.message_start_time
         self._start_time = start if self._start_time is None else min(start, self._start_time)
-        self._end_time = max(index.message_end_time, self._end_time)
+        self._end_time = max(chunk.index.message_end_time, self._end_time)
 
     def sync(self) -> None:
         """Have the system write everything to disk."""

@@ -87,7 +87,7 @@ def _write(file: RecordingFile, topic: Topic, records: list[bytes], times: list[
         part = records[start : start + 300]
         offsets = np.cumsum([0, *map(len, part[:-1])], dtype=np.uint64)
         log_times = np.array(times[start : start + 300], dtype=np.uint64)
-        file.add_chunk(topic, encode_chunk(topic, b"".join(part), log_times, offsets, Packing()))
+        file.add_chunk(encode_chunk(topic, b"".join(part), log_times, offsets, Packing()))
 
 
 def without_digest(entries):

@@ -55,7 +55,7 @@ def repacked(run, folder, compression="zstd", level=19, damaged=None, altered=No
                     own = bytearray(fresh.record)
                     CHUNK_HEAD.pack_into(own, RECORD_HEAD.size, *CHUNK_HEAD.unpack_from(body))
                     fresh = replace(fresh, record=bytes(own))
-                file.add_chunk(topic, fresh)
+                file.add_chunk(fresh)
         file.finish()
     if damaged is not None:
         data = bytearray(copy.recording.read_bytes())

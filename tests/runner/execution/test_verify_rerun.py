@@ -63,7 +63,7 @@ def described_as(source, target, change):
             body = source.read_bytes()[entry.index.chunk_start_offset + 9 :][: entry.index.chunk_length - 9]
             _, records, times, offsets = read_chunk(body, entry.index.chunk_start_offset)
             topic = schema.TOPIC_OF[entry.channel]
-            file.add_chunk(topic, encode_chunk(topic, records, times, offsets, Packing()))
+            file.add_chunk(encode_chunk(topic, records, times, offsets, Packing()))
         file.finish("result", recording.metadata("result"))
     return target
 

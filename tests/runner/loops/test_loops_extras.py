@@ -301,7 +301,7 @@ def test_recordings_with_message_indexes_of_extras_are_read_as_those_without(tmp
                 chunk = read_chunk(body, offset)
                 index = message_index(chunk.summary.channel, chunk.times, chunk.offsets)
                 new = replace(copied_chunk(chunk, body, indexed=True), index=index)
-                file.add_chunk(schema.TOPIC_OF[chunk.summary.channel], new)
+                file.add_chunk(new)
         with runner.open_recording(run.recording) as recording:
             file.finish("result", recording.metadata("result"))
     assert earlier.stat().st_size > run.recording.stat().st_size + 9000 * 16
@@ -348,5 +348,5 @@ def forge(source: Path, path: Path, payload: bytes) -> None:
                     time = int(chunk.times[0])
                     record = message_record(topic, time, payload)
                     new = encode_chunk(topic, record, chunk.times[:1], chunk.offsets[:1], Packing())
-                file.add_chunk(topic, new)
+                file.add_chunk(new)
         file.finish()
