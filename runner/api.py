@@ -18,8 +18,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from runner.config import ConfigError, ExperimentConfig, RunTable, from_mapping, load
+from runner.config import ConfigError, ExperimentConfig, from_mapping, load
 from runner.config.job import Job, jobs_of
+from runner.config.sections import RunTable
 from runner.runs.run import Run, create_run, recordings_folder, unless_empty
 from runner.util.values import checked_name
 

@@ -175,7 +175,7 @@ def random_policy_sentence(recording: Recording) -> str:
     That is so of a loop, whose environment is not known as a table, and of a run that acts at random itself.
     It takes about a second unless it was computed for this environment before.
     """
-    from runner.planning import random_baseline
+    from runner.planning.baseline import random_baseline
 
     if not recording.has_tables or recording.config["algorithm"] == "random":
         return ""

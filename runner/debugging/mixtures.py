@@ -30,7 +30,7 @@ from runner.errors import RunnerError
 from runner.execution.initial_tables import tables_of
 from runner.execution.session import evaluation_metrics
 from runner.learning.learner import Learner
-from runner.planning import ExactEvaluator
+from runner.planning.optimality import ExactEvaluator
 from runner.recording import schema
 from runner.recording.blocks import blank_records, topic_dtype
 from runner.sweep.local import Workers

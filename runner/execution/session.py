@@ -19,7 +19,7 @@ from runner.environments.mdp import Mdp
 from runner.errors import Diverged, RunnerError, StorageError, truncated_message
 from runner.execution.initial_tables import configured_tables, resolve_job
 from runner.learning.learner import Held, Learner
-from runner.planning import ExactEvaluator
+from runner.planning.optimality import ExactEvaluator
 from runner.recording import schema
 from runner.recording.blocks import topic_dtype
 from runner.recording.messages import Message, QTable, encode, encode_log, encode_q_table

@@ -8,16 +8,9 @@ import sys
 import pytest
 from pydantic import ValidationError
 
-from runner.config import (
-    ExperimentConfig,
-    Exponential,
-    Linear,
-    Piecewise,
-    RandomTable,
-    RunTable,
-    from_mapping,
-    load,
-)
+from runner.config import ExperimentConfig, from_mapping, load
+from runner.config.schedules import Exponential, Linear, Piecewise
+from runner.config.sections import RandomTable, RunTable
 from runner.errors import ConfigError
 from runner.util.packing import DEFAULT_LEVEL
 

@@ -287,10 +287,10 @@ def test_a_changed_action_is_found(tmp_path, monkeypatch):
             yield piece
 
     monkeypatch.setattr("runner.execution.rerecord.pieces", changed)
-    from runner.execution.rerecord import _write
+    from runner.execution.rerecord import _rerecord_loop
 
     with pytest.raises((CannotRedo, Diverged)):
-        _write(run.recording, tmp_path / "fresh.mcap", trust=False)
+        _rerecord_loop(run.recording, tmp_path / "fresh.mcap", trust=False)
 
 
 def test_wide_actions_of_many_environments_stay_readable(tmp_path):

@@ -14,17 +14,10 @@ from hypothesis import strategies as st
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
-from runner.planning import (
-    baseline,
-    best_response,
-    best_response_to_stochastic,
-    evaluate_policy,
-    evaluate_stochastic_policy,
-    greedy_policy,
-    optimal_values,
-    random_baseline,
-    random_policy,
-)
+from runner.planning import baseline
+from runner.planning.baseline import random_baseline
+from runner.planning.evaluation import evaluate_policy, evaluate_stochastic_policy, random_policy
+from runner.planning.optimum import best_response, best_response_to_stochastic, greedy_policy, optimal_values
 
 DISCOUNT = 0.9
 
