@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -30,7 +29,7 @@ from runner.recording.reader import open_recording
 from runner.recording.recorder import BLOCK_BYTES, capacity_of
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
-from runner.replay.snapshots import DerivedTables, SnapshotVisitor
+from runner.replay.snapshots import DerivedTables
 from runner.replay.step_replay import StepReplay
 from runner.util.files import storage_errors
 from runner.util.values import Json
@@ -119,13 +118,13 @@ class _Restorer:
     def _restore_learning(self, table: Table) -> None:
         """Restore the steps of a job, and the snapshots that they make."""
         seed = self._archive.seed or 0
-        tables = DerivedTables(StepReplay(self._archive.config, self._archive.mdp, seed, self._where))
-        visitor = SnapshotVisitor(tables, self._snapshots(), partial(self._restore_snapshot, tables))
+        replay = StepReplay(self._archive.config, self._archive.mdp, seed, self._where)
+        tables = DerivedTables(replay, self._snapshots(), self._restore_snapshot)
         for topic, records in self._records(table):
             if topic is schema.TRAIN_STEP:
-                visitor.take(records)
+                tables.take(records)
             self._send_block(topic, records)
-        visitor.finish()
+        tables.finish()
 
     def _records(self, table: Table) -> Iterator[tuple[Topic, Records]]:
         """Yield the rows of a table as records, at most as many as a chunk has."""
@@ -193,7 +192,7 @@ class _Restorer:
         table = Table(layout.Q_TABLES, (schema.Q_TABLE_TOPIC,), layout.SCHEMAS[layout.Q_TABLES])
         return ((row["step"], row) for row in self._rows(table))
 
-    def _restore_snapshot(self, tables: DerivedTables, row: Json) -> None:
+    def _restore_snapshot(self, tables: DerivedTables[Json], row: Json) -> None:
         """Send a snapshot: its values, or those that the steps before it give."""
         where = f"{self._where}: the Q-table of {row['agent']!r} after {row['step']} steps"
         if row["data"] is None:

@@ -26,7 +26,7 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.messages import QTable, decode_q_table, encode_q_table
 from runner.recording.reader import Recording
-from runner.replay.snapshots import DerivedTables, SnapshotVisitor
+from runner.replay.snapshots import DerivedTables
 from runner.replay.step_replay import StepReplay
 from runner.runs.checkpoints import read_checkpoints
 
@@ -186,18 +186,20 @@ class _ArchiveWriter:
         """Write the steps of a job, and its snapshots, which follow from them."""
         recording = self._recording
         seed = recording.seed or 0
-        tables = DerivedTables(StepReplay(recording.config, recording.mdp, seed, self._where))
+        replay = StepReplay(recording.config, recording.mdp, seed, self._where)
         columns = layout.SCHEMAS[layout.Q_TABLES]
         with TableWriter(self._folder / layout.Q_TABLES, columns) as snapshots:
-            visitor = SnapshotVisitor(
-                tables, self._snapshots(), lambda found: snapshots.add(self._snapshot_row(tables, *found))
+            tables = DerivedTables(
+                replay,
+                self._snapshots(),
+                lambda tables, found: snapshots.add(self._snapshot_row(tables, *found)),
             )
             for topic, records, batch in self._batches.blocks(table):
                 steps.add(batch)
                 if topic is schema.TRAIN_STEP:
-                    visitor.take(records)
+                    tables.take(records)
                 self._report(self._batches.steps)
-            visitor.finish()
+            tables.finish()
 
     def _snapshots(self) -> Iterator[tuple[int, tuple[int, QTable]]]:
         """Yield the step of each snapshot, and the snapshot with its position."""
@@ -207,7 +209,9 @@ class _ArchiveWriter:
             self._batches.compare(topic, position, encode_q_table(table), payload)
             yield table.step, (position, table)
 
-    def _snapshot_row(self, tables: DerivedTables, position: int, table: QTable) -> pa.RecordBatch:
+    def _snapshot_row(
+        self, tables: DerivedTables[tuple[int, QTable]], position: int, table: QTable
+    ) -> pa.RecordBatch:
         """Return the row of a snapshot; of values that the steps before it give, only their hash."""
         derived, data = tables.at(table.step, table.table), table.values.tobytes()
         is_derived = derived is not None and derived.tobytes() == data

@@ -22,7 +22,7 @@ from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording, open_recording
 from runner.replay.differences import Difference
 from runner.replay.engine import Replay
-from runner.replay.environment import MEMORY_BYTES, SECONDS, redo, stream_from_child
+from runner.replay.environment import redo, stream_from_child
 from runner.replay.makers import why_not_redone
 from runner.runs.provenance import Differences
 from runner.util.processes import report_progress
@@ -69,15 +69,12 @@ def verify_by_redoing(
     tolerance: float = 0.0,
     trust: bool = False,
     report: Report = lambda _: None,
-    seconds: float = SECONDS,
-    memory_bytes: int = MEMORY_BYTES,
 ) -> Redone:
     """Do the episodes of a loop again, in a child process with limits, and compare every step.
 
     Args:
         sample: how many episodes to do again, at even distances; None for all that happened.
         tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
-        seconds: how long a block of steps may take, which is meant to take 0.2 s.
     """
     result = Redone("impossible", tolerance=tolerance)
     with open_recording(path) as recording:
@@ -88,9 +85,7 @@ def verify_by_redoing(
                 result, versions=_other_versions(recording.maker), assumed=recording.maker.assumed
             )
     try:
-        for found in stream_from_child(
-            _compare, path, sample, tolerance, trust, seconds=seconds, memory_bytes=memory_bytes
-        ):
+        for found in stream_from_child(_compare, path, sample, tolerance, trust):
             if isinstance(found, int):
                 report(found)
             else:
@@ -116,7 +111,7 @@ def _compare_all(recording: Recording, tolerance: float, trust: bool) -> Redone:
     found = Redone("reproduced", tolerance=tolerance)
     total = {phase: recording.step_count(phase) for phase in schema.PHASES}
     left = total.copy()
-    with closing(Replay(recording, trust, tolerance, report_progress, render=False)) as replay:
+    with closing(Replay(recording, trust, tolerance, report_progress)) as replay:
         for steps in replay.all():
             if len(steps):
                 after = total[steps.phase] - 1 - int(steps.step[-1])

@@ -280,7 +280,7 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
     packing = recorded_packing(recording.config)
     recorder = Recorder(file, dtypes, packing)
     try:
-        with closing(Replay(recording, trust, 0.0, lambda _: None, render=False)) as replay:
+        with closing(Replay(recording, trust)) as replay:
             states = {phase: np.full(recording.environments, -1, np.int64) for phase in schema.PHASES}
             for piece in pieces(recording, schema.PHASES):
                 records = _whole_records(recording, replay, piece, states[piece.phase])

@@ -50,10 +50,10 @@ class Replay:
     def __init__(
         self,
         recording: Recording,
-        trust: bool,
-        tolerance: float,
-        report: Report,
-        render: bool,
+        trust: bool = False,
+        tolerance: float = 0.0,
+        report: Report = lambda _: None,
+        render: bool = False,
         make: Callable[[], object] | None = None,
         draw_from: int = 0,
     ) -> None:

@@ -98,56 +98,38 @@ def redo_in_child(
     *,
     render: bool = False,
     trust: bool = False,
-    tolerance: float = 0.0,
-    seconds: float = SECONDS,
-    memory_bytes: int = MEMORY_BYTES,
-    report: Report = lambda _: None,
     draw_from: int = 0,
 ) -> Iterator[RedoneSteps]:
     """Do recorded episodes again in a child process, which ends with the iterator; see `redo`.
 
     The child works ahead of the caller by a block at most.
 
-    Args:
-        seconds: how long a block of steps may take, and making the environment.
-        memory_bytes: how much the process may allocate.
-
     Raises:
         CannotRedo: see `redo`; or the environment hangs, crashes, or needs more memory.
     """
-    arguments = {"render": render, "trust": trust, "tolerance": tolerance, "draw_from": draw_from}
-    for found in stream_from_child(
-        _redo_path, path, phase, episodes, seconds=seconds, memory_bytes=memory_bytes, **arguments
-    ):
-        if isinstance(found, int):
-            report(found)
-        else:
+    options = {"render": render, "trust": trust, "draw_from": draw_from}
+    for found in stream_from_child(_redo_path, path, phase, episodes, **options):
+        if isinstance(found, RedoneSteps):  # else steps taken, which show that it does not hang
             yield found
 
 
 def stream_from_child(
-    function: Callable[..., None],
-    path: Path,
-    *arguments: object,
-    seconds: float = SECONDS,
-    memory_bytes: int = MEMORY_BYTES,
-    **keywords: object,
+    function: Callable[..., None], path: Path, *arguments: object, **keywords: object
 ) -> Iterator[Any]:
     """Yield what a function that runs foreign code passes to `report_progress` in a child process.
 
     Args:
         function: of a module; called with the path and the other arguments.
-        seconds: how long it may take for each value.
 
     Raises:
         CannotRedo: the process hangs, crashes or needs more memory.
     """
-    with ChildProcess(memory_bytes) as child:
+    with ChildProcess(MEMORY_BYTES) as child:
         try:
-            yield from child.stream(_quietly, seconds, function, path, *arguments, **keywords)
+            yield from child.stream(_quietly, SECONDS, function, path, *arguments, **keywords)
         except TimedOut:
             raise CannotRedo(
-                f"The environment took longer than {seconds:g} s to be made or stepped, and was stopped."
+                f"The environment took longer than {SECONDS:g} s to be made or stepped, and was stopped."
             ) from None
         except CallFailed as error:
             raise CannotRedo(f"The environment ended its process: {error}") from error

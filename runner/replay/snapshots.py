@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Generic, TypeVar
+from typing import Generic, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,30 +11,42 @@ from numpy.typing import NDArray
 from runner.learning.learner import held_of
 from runner.replay.step_replay import StepReplay
 
+S = TypeVar("S")
 
-class DerivedTables:
+
+class DerivedTables(Generic[S]):
     """The tables of a run as far as its steps determine them, updated by the steps as they come.
 
     Args:
         replay: at the run's first step.
+        snapshots: each with the number of training steps before it.
+        visit: called with these tables and each snapshot, after the steps before it were applied.
     """
 
-    def __init__(self, replay: StepReplay) -> None:
+    def __init__(
+        self, replay: StepReplay, snapshots: Iterator[tuple[int, S]], visit: Callable[[Self, S], None]
+    ) -> None:
         self._replay = replay
+        self._snapshots = snapshots
+        self._visit = visit
+        self._next = next(snapshots, None)
         self._given: set[int] = set()
         self._known = True
         """Whether the tables are the run's own: no step is missing since it began or they were given."""
 
     def take(self, steps: NDArray[np.void]) -> None:
         """Take the next training steps."""
-        if not len(steps):
-            return
-        first, last = int(steps["step"][0]), int(steps["step"][-1])
-        self._known &= first == self._replay.step and last == first + len(steps) - 1
-        if self._known:
-            self._replay.apply(steps)
-        self._replay.step = last + 1
-        self._given.clear()
+        while self._next is not None and self._next[0] <= int(steps["step"][-1]):
+            before = int(np.searchsorted(steps["step"], self._next[0]))
+            self._apply(steps[:before])
+            self._visit_next()
+            steps = steps[before:]
+        self._apply(steps)
+
+    def finish(self) -> None:
+        """Visit the snapshots that are left."""
+        while self._next is not None:
+            self._visit_next()
 
     def at(self, step: int, table: int) -> NDArray[np.float64] | None:
         """Return a table after `step` training steps, a view; None if the steps do not determine it."""
@@ -56,41 +68,17 @@ class DerivedTables:
         tables[table] = values
         replay.rewind(step, held_of(tables, replay.kinds))
 
-
-S = TypeVar("S")
-
-
-class SnapshotVisitor(Generic[S]):
-    """Calls a function with each snapshot of a run, after the training steps before it were applied.
-
-    Args:
-        tables: moved forward by the steps.
-        snapshots: each with the number of training steps before it.
-    """
-
-    def __init__(
-        self, tables: DerivedTables, snapshots: Iterator[tuple[int, S]], visit: Callable[[S], None]
-    ) -> None:
-        self._tables = tables
-        self._snapshots = snapshots
-        self._visit = visit
-        self._next = next(snapshots, None)
-
-    def take(self, steps: NDArray[np.void]) -> None:
-        """Take the next training steps."""
-        while self._next is not None and self._next[0] <= int(steps["step"][-1]):
-            before = int(np.searchsorted(steps["step"], self._next[0]))
-            self._tables.take(steps[:before])
-            self._visit_next()
-            steps = steps[before:]
-        self._tables.take(steps)
-
-    def finish(self) -> None:
-        """Visit the snapshots that are left."""
-        while self._next is not None:
-            self._visit_next()
+    def _apply(self, steps: NDArray[np.void]) -> None:
+        if not len(steps):
+            return
+        first, last = int(steps["step"][0]), int(steps["step"][-1])
+        self._known &= first == self._replay.step and last == first + len(steps) - 1
+        if self._known:
+            self._replay.apply(steps)
+        self._replay.step = last + 1
+        self._given.clear()
 
     def _visit_next(self) -> None:
         assert self._next is not None
-        self._visit(self._next[1])
+        self._visit(self, self._next[1])
         self._next = next(self._snapshots, None)

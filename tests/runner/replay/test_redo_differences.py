@@ -249,11 +249,13 @@ def test_another_space_is_named(tmp_path):
         (loops.hungry, 60, "more than 0.5 GiB"),
     ],
 )
-def test_an_environment_of_bad_habits_ends_with_the_reason(make, seconds, reason, tmp_path):
+def test_an_environment_of_bad_habits_ends_with_the_reason(make, seconds, reason, tmp_path, monkeypatch):
+    monkeypatch.setattr("runner.replay.environment.SECONDS", seconds)
+    monkeypatch.setattr("runner.replay.environment.MEMORY_BYTES", 1 << 29)
     path = record(make(), tmp_path, 60, make=make)
     with pytest.raises(CannotRedo, match=reason):
-        list(redo_in_child(path, trust=True, seconds=seconds, memory_bytes=1 << 29))
-    found = verify_by_redoing(path, trust=True, seconds=seconds, memory_bytes=1 << 29)
+        list(redo_in_child(path, trust=True))
+    found = verify_by_redoing(path, trust=True)
     assert found.verdict == "impossible"
     assert reason in found.reason
 
