@@ -29,7 +29,7 @@ from runner.config.problems import found, problems_in, refuse
 from runner.config.schema import schema_at
 from runner.config.sections import Recording
 from runner.config.shipped import config_path, suggestion
-from runner.config.values import MAX_DEPTH, Path, Section
+from runner.config.values import MAX_DEPTH, Path, Section, position_in, value_at
 from runner.errors import ConfigError, shortened
 from runner.util.packing import Packing
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN, Json, JsonView
@@ -242,7 +242,7 @@ def put(document: Document, values: Sequence[tuple[tuple[str, ...], Document]]) 
                 document.value = {key: each for key, each in document.value.items() if key != rival}
                 document.problems = _without(document.problems, (rival,))
         for length in range(1, len(path)):
-            if not isinstance(_at(document.value, path[:length]), Mapping | list | tuple):
+            if not isinstance(value_at(document.value, path[:length]), Mapping | list | tuple):
                 start = {} if path[0] in document.value else _default(path[0])
                 place = {here: place for here, place in read.places.items() if not here}
                 _assign(document, path[:length], Document(start, place))
@@ -282,27 +282,10 @@ def _with(value: object, path: Path, new: object) -> Any:
     if not path:
         return new
     key, below = path[0], path[1:]
-    if isinstance(value, list | tuple) and (at := _position(key, value)) is not None:
+    if isinstance(value, list | tuple) and (at := position_in(value, key)) is not None:
         return [*value[:at], _with(value[at], below, new), *value[at + 1 :]]
     mapping = dict(value) if isinstance(value, Mapping) else {}
     return {**mapping, key: _with(mapping.get(key), below, new)}
-
-
-def _at(value: object, path: Path) -> object:
-    for part in path:
-        if isinstance(value, Mapping):
-            value = value.get(part)
-        elif isinstance(value, list | tuple) and _position(part, value) is not None:
-            value = value[int(part)]
-        else:
-            return None
-    return value
-
-
-def _position(part: str | int, items: Sequence[object]) -> int | None:
-    """Return `part` as a position in `items`, if it is one."""
-    text = str(part)
-    return int(text) if text.isascii() and text.isdecimal() and int(text) < len(items) else None
 
 
 def _default(key: str) -> Json:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from runner.config.document import Document, Place, Problem
 from runner.config.schema import Schema, choices_of, expected, keys_of, schema_at
-from runner.config.values import REFUSED, Path
+from runner.config.values import REFUSED, Path, value_at
 from runner.errors import ConfigError, ConfigProblem, nearest, shortened
 
 _LONGEST = 60
@@ -115,7 +114,7 @@ def _problem(path: Path, detail: ErrorDetails, value: object, schema: Schema | N
         if not isinstance(path[-1], int):
             return Problem(path, f"missing, expected {expected(here)}")
         path, here = path[:-1], around
-    value = _at(value, path)
+    value = value_at(value, path)
     hint = nearest(value, choices_of(here)) if isinstance(value, str) else ""
     return Problem(path, f"found {found(value)}, expected {expected(here)}{'.' if hint else ''}{hint}")
 
@@ -127,12 +126,6 @@ def _path(detail: ErrorDetails) -> Path:
     last = len(location) - 1 if detail["type"] == _UNKNOWN else -1
     keys = [part for index, part in enumerate(location) if index == last or part not in _BRANCHES]
     return (*keys, *below)
-
-
-def _at(value: Any, path: Path) -> Any:
-    for part in path:
-        value = value[part]
-    return value
 
 
 def _hint(key: str, known: Sequence[str]) -> str:

@@ -7,7 +7,7 @@ that it is about. Free values are the arguments of an environment: anything that
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler
@@ -102,6 +102,24 @@ def plain(value: object) -> Any:
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     return value
+
+
+def value_at(value: object, path: Path) -> object:
+    """Return the value at a path, whose list positions may be text; None if there is none."""
+    for part in path:
+        if isinstance(value, Mapping):
+            value = value.get(part)
+        elif isinstance(value, list | tuple) and (at := position_in(value, part)) is not None:
+            value = value[at]
+        else:
+            return None
+    return value
+
+
+def position_in(items: Sequence[object], part: str | int) -> int | None:
+    """Return a part of a path as a position in `items`, if it is one."""
+    text = str(part)
+    return int(text) if text.isascii() and text.isdecimal() and int(text) < len(items) else None
 
 
 def _text(value: object, path: Path) -> str:
