@@ -53,6 +53,8 @@ _CONTROL: Final = re.compile(
 _NOTE: Final = f"Console output beyond {MAX_CONSOLE_BYTES >> 20} MB is not recorded."
 
 
+Stream = Any
+"""A text stream, or an object of somebody's own in its place."""
 Write = Callable[..., object]
 """A method `write` of a stream."""
 
@@ -64,8 +66,8 @@ class Tee:
         self._writes: deque[tuple[float, int, str]] = deque()
         self._waiting = self._left_out = 0
         self._is_on = False
-        self._streams: list[tuple[int, Any]] = []
-        self._patched: deque[tuple[Any, Any, Any]] = deque(maxlen=64)
+        self._streams: list[tuple[int, Stream]] = []
+        self._patched: deque[tuple[Stream, Write | None, Write]] = deque(maxlen=64)
         """Streams, the method that each had as its own attribute (None if it had not), and the one it has."""
         self._local = threading.local()
         self._shell: Any = None

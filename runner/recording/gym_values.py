@@ -90,7 +90,7 @@ class Leaf:
 
 
 @cache
-def _exact_scalars(base: np.dtype[Any]) -> frozenset[type]:
+def _exact_scalars(base: np.dtype[np.generic]) -> frozenset[type]:
     scalars = {kind for kind in SCALARS if np.can_cast(kind, base)}
     return frozenset(
         scalars | {bool} | ({int} if base.kind in "iu" else {float} if base.char == "d" else set())

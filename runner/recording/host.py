@@ -11,7 +11,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,9 @@ from runner.recording import schema
 from runner.recording.clock import MAX_SAMPLES, Clock
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.topic_reader import TopicReader
+
+if TYPE_CHECKING:
+    import psutil
 
 MAX_GPUS: Final = 64
 _CHILDREN_SECONDS: Final = 10.0
@@ -42,7 +45,7 @@ class HostSampler:
 
         self._psutil = psutil
         self._process = psutil.Process()
-        self._children: list[Any] = []
+        self._children: list[psutil.Process] = []
         self._looked = -math.inf
         self._before: tuple[float, float] | None = None
         """When the last sample was taken, and the processor time until then."""

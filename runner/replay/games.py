@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from runner.environments.gym_types import Space
+
 ByAgent = dict[Any, Any]
 """Values of a game by agent."""
 GameStepResult = tuple[ByAgent, ByAgent, ByAgent, ByAgent, ByAgent]
@@ -17,7 +19,7 @@ def as_parallel(env: Any) -> Any:
     return MultiAgent(env) if is_multi_agent(env) else env
 
 
-def is_multi_agent(env: Any) -> bool:
+def is_multi_agent(env: object) -> bool:
     """Return whether an environment has the interface of RLlib's `MultiAgentEnv`."""
     own = getattr(env, "unwrapped", env)
     return not isinstance(env, MultiAgent) and hasattr(own, "get_observation_space")
@@ -45,13 +47,15 @@ class Turns:
         self.render_mode = getattr(env, "render_mode", None)
         self.unwrapped = env.unwrapped
 
-    def observation_space(self, agent: object) -> Any:
+    def observation_space(self, agent: object) -> Space:
         """Return the space of an agent's observations."""
-        return self.env.observation_space(agent)
+        found: Space = self.env.observation_space(agent)
+        return found
 
-    def action_space(self, agent: object) -> Any:
+    def action_space(self, agent: object) -> Space:
         """Return the space of an agent's actions."""
-        return self.env.action_space(agent)
+        found: Space = self.env.action_space(agent)
+        return found
 
     @property
     def agents(self) -> list[object]:
@@ -63,7 +67,7 @@ class Turns:
         self.env.reset(**arguments)
         return self._observations(), dict(self.env.infos)
 
-    def step(self, actions: Mapping[Any, object]) -> GameStepResult:
+    def step(self, actions: ByAgent) -> GameStepResult:
         """Take the step of the selected agent; return what a parallel game returns, of all agents.
 
         Raises:
@@ -86,7 +90,7 @@ class Turns:
             env.step(None)
         return result
 
-    def render(self) -> Any:
+    def render(self) -> object:
         """Return a picture of the game."""
         return self.env.render()
 
@@ -131,13 +135,15 @@ class MultiAgent:
             raise AttributeError(name)
         return getattr(self.env, name)
 
-    def observation_space(self, agent: object) -> Any:
+    def observation_space(self, agent: object) -> Space:
         """Return the space of an agent's observations."""
-        return self.unwrapped.get_observation_space(agent)
+        found: Space = self.unwrapped.get_observation_space(agent)
+        return found
 
-    def action_space(self, agent: object) -> Any:
+    def action_space(self, agent: object) -> Space:
         """Return the space of an agent's actions."""
-        return self.unwrapped.get_action_space(agent)
+        found: Space = self.unwrapped.get_action_space(agent)
+        return found
 
     def reset(self, **arguments: object) -> tuple[ByAgent, ByAgent]:
         """Begin a game; return the observations and infos of the agents that act next."""
@@ -145,7 +151,7 @@ class MultiAgent:
         self.agents = list(observations)
         return observations, infos
 
-    def step(self, actions: Mapping[Any, object]) -> GameStepResult:
+    def step(self, actions: ByAgent) -> GameStepResult:
         """Take a step; return what the environment returns, with its flags for `__all__`."""
         result: GameStepResult = self.env.step(actions)
         observations, _, terminated, truncated, _ = result
@@ -153,7 +159,7 @@ class MultiAgent:
         self.agents = [] if is_over else list(observations)
         return result
 
-    def render(self) -> Any:
+    def render(self) -> object:
         """Return a picture of the game."""
         return self.env.render()
 

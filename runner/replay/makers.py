@@ -129,7 +129,7 @@ def make_vector(maker: EnvironmentMaker, trust: bool, render: bool = False) -> o
         return _made_vector(maker, trust, render)
 
 
-def _made_vector(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
+def _made_vector(maker: EnvironmentMaker, trust: bool, render: bool) -> object:
     import gymnasium
 
     assert maker.vector is not None
@@ -151,7 +151,7 @@ def _made_vector(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
     return envs
 
 
-def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
+def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Env:
     import gymnasium
 
     spec, registered = _registered(maker, trust)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Generic, Self, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,10 @@ class DerivedTables(Generic[S]):
     """
 
     def __init__(
-        self, replay: StepReplay, snapshots: Iterator[tuple[int, S]], visit: Callable[[Self, S], None]
+        self,
+        replay: StepReplay,
+        snapshots: Iterator[tuple[int, S]],
+        visit: Callable[[DerivedTables[S], S], None],
     ) -> None:
         self._replay = replay
         self._snapshots = snapshots

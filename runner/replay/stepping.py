@@ -148,7 +148,7 @@ class Stepper(ABC):
             base.ale.restoreState(ale_py.ALEState(state.ale_state))
         return None
 
-    def _render(self) -> Any:
+    def _render(self) -> object:
         return self.env.render()
 
     def draw(self) -> Frame:
