@@ -180,14 +180,14 @@ class TopicChunks:
             first = int(firsts[k])
             yield self._block(k, data)[max(start - first, 0) : stop - first]
 
-    def blocks_between(self, start_time: int, stop_time: int) -> Iterator[NDArray[np.void]]:
-        """Yield the messages logged from `start_time` up to `stop_time`, in ns; they must have one size."""
+    def blocks_between(self, times: range) -> Iterator[NDArray[np.void]]:
+        """Yield the messages with a `log_time` in a range, in ns; they must have one size."""
         firsts, ends = self._numbers
         if not len(firsts):
             return
-        start, stop = np.uint64(max(start_time, 0)), np.uint64(max(stop_time, 0))
-        times = self._table.columns[self._places]
-        first, end = np.searchsorted(times["end_time"], start), np.searchsorted(times["start_time"], stop)
+        start, stop = np.uint64(max(times.start, 0)), np.uint64(max(times.stop, 0))
+        spans = self._table.columns[self._places]
+        first, end = np.searchsorted(spans["end_time"], start), np.searchsorted(spans["start_time"], stop)
         if first >= end:
             return
         for block in self.blocks(int(firsts[first]), int(ends[end - 1])):
@@ -204,33 +204,30 @@ class TopicChunks:
         block = next(self.blocks(firsts[k], ends[k]))
         return int(firsts[k]) + int(np.searchsorted(block[field], value))
 
-    def messages(self, first_chunk: int = 0) -> Iterator[tuple[int, bytes]]:
-        """Yield (log time in nanoseconds, payload) of the messages from a chunk on."""
-        for k in range(first_chunk, len(self)):
-            yield from self._messages_of(k)
+    def messages(self, first_chunk: int = 0, times: range | None = None) -> Iterator[tuple[int, bytes]]:
+        """Yield (log time in nanoseconds, payload) of the messages from a chunk on.
 
-    def messages_between(self, start_time: int, stop_time: int) -> Iterator[tuple[int, bytes]]:
-        """Yield the messages logged from `start_time` up to `stop_time`, in ns, as `messages` does."""
-        times = self._table.columns[self._places] if len(self) else self._table.columns[:0]
-        start, stop = np.uint64(max(start_time, 0)), np.uint64(max(stop_time, 0))
-        for k in np.flatnonzero((times["end_time"] >= start) & (times["start_time"] < stop)).tolist():
-            for time, payload in self._messages_of(k):
-                if start_time <= time < stop_time:
-                    yield time, payload
-
-    def _messages_of(self, k: int) -> Iterator[tuple[int, bytes]]:
-        data = self._store.chunk(self.entry(k))
-        at = 0
-        while at < len(data):
-            if at + HEADER_BYTES > len(data):
-                raise self._damaged(k, f"stray bytes at {at}")
-            opcode, length, channel, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, at)
-            end = at + RECORD_HEAD.size + length
-            whole = at + HEADER_BYTES <= end <= len(data)
-            if opcode != MESSAGE or not whole or channel != self._topic.channel:
-                raise self._damaged(k, f"no message of {self._topic.name} at {at}")
-            yield log_time, data[at + HEADER_BYTES : end]
-            at = end
+        Args:
+            times: of the log times, from the first to before the last; None for all.
+        """
+        chunks = np.arange(first_chunk, len(self))
+        if times is not None and len(chunks):
+            spans = self._table.columns[self._places[first_chunk:]]
+            start, stop = np.uint64(max(times.start, 0)), np.uint64(max(times.stop, 0))
+            chunks = chunks[(spans["end_time"] >= start) & (spans["start_time"] < stop)]
+        for k in chunks.tolist():
+            data, at = self._store.chunk(self.entry(k)), 0
+            while at < len(data):
+                if at + HEADER_BYTES > len(data):
+                    raise self._damaged(k, f"stray bytes at {at}")
+                opcode, length, channel, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, at)
+                end = at + RECORD_HEAD.size + length
+                whole = at + HEADER_BYTES <= end <= len(data)
+                if opcode != MESSAGE or not whole or channel != self._topic.channel:
+                    raise self._damaged(k, f"no message of {self._topic.name} at {at}")
+                if times is None or log_time in times:
+                    yield log_time, data[at + HEADER_BYTES : end]
+                at = end
 
     @cached_property
     def _numbers(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

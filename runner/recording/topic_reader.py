@@ -137,10 +137,6 @@ class TopicReader(RunDescription):
         """
         return self._chunks(topic).blocks(start, stop)
 
-    def blocks_between(self, topic: Topic, start_time: int, stop_time: int) -> Iterator[NDArray[np.void]]:
-        """Yield the messages of a fixed-width topic logged from `start_time` up to `stop_time`, in ns."""
-        return self._chunks(topic).blocks_between(start_time, stop_time)
-
     def first_from(self, topic: Topic, field: str, value: int) -> int:
         """Return the number of a fixed-width topic's first message of that value or more.
 
@@ -194,13 +190,7 @@ class TopicReader(RunDescription):
         Raises:
             RecordingError: one cannot be parsed, or has more than `max_bytes` bytes; it is named.
         """
-        chunks = self._chunks(topic)
-        found = (
-            chunks.messages(first_chunk)
-            if times is None
-            else chunks.messages_between(times.start, times.stop)
-        )
-        for time, payload in found:
+        for time, payload in self._chunks(topic).messages(first_chunk, times):
             try:
                 if len(payload) > max_bytes:
                     raise RecordingError(f"found {len(payload):,} bytes, expected at most {max_bytes:,}.")
