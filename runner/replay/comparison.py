@@ -12,10 +12,14 @@ from runner.errors import CannotRedo
 from runner.recording import schema
 from runner.recording.actions import EpisodeDigests, after_step
 from runner.recording.reader import Recording
+from runner.recording.spaces import Value
 from runner.replay.differences import Difference, differing_value, first_differing_row
 from runner.replay.recorded import RecordedReset, ended_episode
 from runner.replay.redone import RedoneStart, RedoneSteps, Values
 from runner.replay.stepping import Results
+
+_Place = tuple[int, int, int]
+"""Episode, step of the episode, and step of the phase."""
 
 
 class Part(NamedTuple):
@@ -65,17 +69,9 @@ class Comparison:
             resets_done = sum(row < done for row, _ in resets[:resets_done])
             difference = self._row_difference(part, recorded, *place)
         elif failed_reset is not None:
-            done, reset = resets[failed_reset]
-            first = differing_value(
-                reset.observation,
-                results.first_observations[failed_reset],
-                self._recording.spaces["observation"],
-                self._tolerance,
-            )
-            difference = self._difference(
-                phase, environment, reset.episode, 0, reset.step, f"first observation{first[0]}", *first[1:]
-            )
-            resets_done = failed_reset + 1
+            (done, reset), resets_done = resets[failed_reset], failed_reset + 1
+            field, *values = self._observation(reset.observation, results.first_observations[failed_reset])
+            difference = self._difference(part, _of_reset(reset), f"first {field}", *values)
         elif results.error is not None:
             difference = self._failure(part, results.error)
         else:
@@ -107,17 +103,15 @@ class Comparison:
 
     def _failure(self, part: Part, error: Exception) -> Difference:
         """Return the difference that the environment raised an error where the recorded one did not."""
-        phase, environment, rows, resets, results = part
+        _, _, rows, resets, results = part
         got = f"{type(error).__name__}: {error}"
         waiting = resets[results.resets_done :]
         if waiting and (waiting[0][0] <= results.done or results.done >= len(rows)):
-            reset = waiting[0][1]
-            return self._difference(phase, environment, reset.episode, 0, reset.step, "error", None, got)
+            return self._difference(part, _of_reset(waiting[0][1]), "error", None, got)
         if not len(rows):  # another environment of the vector raised it
             raise CannotRedo(f"The vector environment fails: {got}")
         row = rows[min(results.done, len(rows) - 1)]
-        episode, t, step = (int(row[name]) for name in ("episode", "t", "step"))
-        return self._difference(phase, environment, episode, t, step, "error", None, got)
+        return self._difference(part, _of_row(row), "error", None, got)
 
     def _first_row(self, part: Part, recorded: Values) -> tuple[int, str] | None:
         """Return the first row that differs, and the first field of it that does; None if none does."""
@@ -159,44 +153,43 @@ class Comparison:
         return first_differing_row(recorded, results.first_observations[:done], self._tolerance)
 
     def _row_difference(self, part: Part, recorded: Values, row: int, name: str) -> Difference:
-        phase, environment, rows, _, results = part
-        episode, t, step = (int(rows[row][each]) for each in ("episode", "t", "step"))
+        rows, results = part.rows, part.results
+        place = _of_row(rows[row])
         if name == "digest":
-            field, was = "digest of the episode so far", rows[row]["digest"].tobytes().hex()
-            return self._difference(phase, environment, episode, t, step, field, was, "another one")
-        was, got = (
-            (rows[name][row], getattr(results, name)[row])
-            if name.startswith("agents_")
-            else (getattr(recorded, name)[row], getattr(results, name)[row])
-        )
+            was = rows[row]["digest"].tobytes().hex()
+            return self._difference(part, place, "digest of the episode so far", was, "another one")
+        was = rows[name][row] if name.startswith("agents_") else getattr(recorded, name)[row]
+        got = getattr(results, name)[row]
         if name == "observations":
-            place, was, got = differing_value(
-                was, got, self._recording.spaces["observation"], self._tolerance
-            )
-            field = f"observation{place}"
+            name, was, got = self._observation(was, got)
         elif name == "rewards":
             agent = int(np.argmax(was != got)) if len(was) > 1 else 0
-            field = f"reward[{self._recording.agents[agent]!r}]" if len(was) > 1 else "reward"
+            name = f"reward[{self._recording.agents[agent]!r}]" if len(was) > 1 else "reward"
             was, got = float(was[agent]), float(got[agent])
         else:
-            field, was, got = name, was.item(), got.item()
-        return self._difference(phase, environment, episode, t, step, field, was, got)
+            was, got = was.item(), got.item()
+        return self._difference(part, place, name, was, got)
 
-    def _difference(
-        self,
-        phase: str,
-        environment: int,
-        episode: int,
-        t: int,
-        step: int,
-        field: str,
-        recorded: object,
-        got: object,
-    ) -> Difference:
+    def _observation(self, recorded: Value, got: Value) -> tuple[str, object, object]:
+        """Return the first differing part of two observations, such as `observation[2]`, and its values."""
+        space = self._recording.spaces["observation"]
+        place, *values = differing_value(recorded, got, space, self._tolerance)
+        return f"observation{place}", *values
+
+    def _difference(self, part: Part, place: _Place, field: str, recorded: object, got: object) -> Difference:
+        episode, t, step = place
         number: int | None = episode
         if self._recording.environments > 1:
-            number = ended_episode(self._recording, phase, environment, step)
-        return Difference(phase, number, t, step, environment, field, recorded, got)
+            number = ended_episode(self._recording, part.phase, part.environment, step)
+        return Difference(part.phase, number, t, step, part.environment, field, recorded, got)
+
+
+def _of_row(row: np.void) -> _Place:
+    return int(row["episode"]), int(row["t"]), int(row["step"])
+
+
+def _of_reset(reset: RecordedReset) -> _Place:
+    return reset.episode, 0, reset.step
 
 
 def _recorded_values(rows: NDArray[np.void], results: Results) -> Values:
