@@ -36,8 +36,14 @@ from runner.export.painting import (
 )
 from runner.export.values import Values, action_in_words
 from runner.recording.reader import Recording
-from runner.replay.makers import environments_with_frames, why_not_redone
-from runner.replay.steps import check_steps, environment_of, frames_every, transitions_of
+from runner.replay.makers import why_not_redone
+from runner.replay.steps import (
+    check_steps,
+    environment_of,
+    environments_with_frames,
+    frames_every,
+    transitions_of,
+)
 
 
 class Source(StrEnum):

@@ -10,7 +10,7 @@ import importlib.util
 import inspect
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Final
 
 from runner.errors import CannotRedo
@@ -123,32 +123,29 @@ def make_vector(maker: EnvironmentMaker, trust: bool, render: bool = False) -> o
     Raises:
         CannotRedo: it cannot be made; the message is why.
     """
+    import gymnasium
+
     with _making("vector environment", maker, trust, render):
         if maker.make and trust:
             return _made_by_function(maker.make, render)
-        return _made_vector(maker, trust, render)
-
-
-def _made_vector(maker: EnvironmentMaker, trust: bool, render: bool) -> object:
-    import gymnasium
-
-    assert maker.vector is not None
-    if maker.vector.mode == "custom":
-        spec, registered = _registered(maker, trust)
-        settings = spec.kwargs | {"num_envs": maker.vector.number, "vectorization_mode": "vector_entry_point"}
-        settings |= {"render_mode": "rgb_array"} if render else {}
-        limit = spec.kwargs.get("max_episode_steps", spec.max_episode_steps)
-        envs = gymnasium.make_vec(dataclasses.replace(registered, kwargs=settings, max_episode_steps=limit))
-    else:
-        envs = gymnasium.vector.SyncVectorEnv(
-            [lambda: make_environment(maker, trust, render)] * maker.vector.number,
-            autoreset_mode=gymnasium.vector.AutoresetMode(maker.vector.autoreset),
-        )
-    for name, entry_point, kwargs in vector_wrappers(maker.vector):
-        if not trust:
-            check_plain(f"argument of the wrapper {name}", kwargs, {})
-        envs = _wrapper(entry_point, gymnasium.vector.VectorWrapper)(envs, **kwargs)
-    return envs
+        vector = maker.vector
+        assert vector is not None
+        if vector.mode == "custom":
+            spec, registered = _registered(maker, trust)
+            kwargs = spec.kwargs | {"num_envs": vector.number, "vectorization_mode": "vector_entry_point"}
+            kwargs |= {"render_mode": "rgb_array"} if render else {}
+            limit = spec.kwargs.get("max_episode_steps", spec.max_episode_steps)
+            envs = gymnasium.make_vec(dataclasses.replace(registered, kwargs=kwargs, max_episode_steps=limit))
+        else:
+            envs = gymnasium.vector.SyncVectorEnv(
+                [lambda: make_environment(maker, trust, render)] * vector.number,
+                autoreset_mode=gymnasium.vector.AutoresetMode(vector.autoreset),
+            )
+        for name, entry_point, arguments in vector_wrappers(vector):
+            if not trust:
+                check_plain(f"argument of the wrapper {name}", arguments, {})
+            envs = _wrapper(entry_point, gymnasium.vector.VectorWrapper)(envs, **arguments)
+        return envs
 
 
 def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Env:
@@ -288,15 +285,6 @@ def _without_display() -> None:
 
 def _short(error: BaseException) -> str:
     return " ".join(str(error).split())[:500]
-
-
-def environments_with_frames(recording: Recording, phase: str) -> Sequence[int]:
-    """Return the environments of which frames were recorded in a phase; of a job none."""
-    if recording.can_train_again or not recording.has_messages(f"/{phase}/frame"):
-        return ()
-    frames = recording.config.get("frames")
-    chosen = frames.get("environments") if isinstance(frames, Mapping) else None
-    return chosen if isinstance(chosen, list) else range(recording.environments)
 
 
 def why_not_redone(recording: Recording, trust: bool = False) -> str:

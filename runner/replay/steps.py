@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any, Final
 
@@ -154,6 +154,15 @@ def frames_every(recording: Recording) -> int:
     frames = recording.config.get("frames")
     every = frames.get("every") if isinstance(frames, Mapping) else None
     return every if isinstance(every, int) and every > 0 else 1
+
+
+def environments_with_frames(recording: Recording, phase: str) -> Sequence[int]:
+    """Return the environments of which frames were recorded in a phase; of a job none."""
+    if recording.can_train_again or not recording.has_messages(f"/{phase}/frame"):
+        return ()
+    frames = recording.config.get("frames")
+    chosen = frames.get("environments") if isinstance(frames, Mapping) else None
+    return chosen if isinstance(chosen, list) else range(recording.environments)
 
 
 def environment_of(recording: Recording, phase: str, episode: int) -> int:
