@@ -173,8 +173,8 @@ class Comparison:
     def _observation(self, recorded: Value, got: Value) -> tuple[str, object, object]:
         """Return the first differing part of two observations, such as `observation[2]`, and its values."""
         space = self._recording.spaces["observation"]
-        place, *values = differing_value(recorded, got, space, self._tolerance)
-        return f"observation{place}", *values
+        place, recorded, got = differing_value(recorded, got, space, self._tolerance)
+        return f"observation{place}", recorded, got
 
     def _difference(self, part: Part, place: _Place, field: str, recorded: object, got: object) -> Difference:
         episode, t, step = place
