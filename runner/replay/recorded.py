@@ -257,7 +257,7 @@ def _blocks(
     """Yield the steps of a phase in blocks, each without steps of the other phase in between."""
     name = f"/{phase}/step"
     topic, stop = recording.topic(name), FOREVER if stop_time is None else stop_time + 1
-    # Of actions alone a block has so many that their whole steps would not fit into memory.
+    # A block of actions alone may have more steps than fit into memory when they are whole.
     width = recording.dtypes[topic].itemsize * recording.environments if topic in recording.dtypes else 1
     rows = max(_BLOCK_BYTES // width, 1) * recording.environments
     for block in recording.rows(name, range(start_time + 1, stop)):
