@@ -30,6 +30,7 @@ from runner.replay.specifications import (
     vector_wrappers,
     why_not_imported,
 )
+from runner.util.processes import raise_if_out_of_memory
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
@@ -92,6 +93,7 @@ def _making(what: str, maker: EnvironmentMaker, trust: bool, render: bool) -> It
     except (CannotRedo, MemoryError):
         raise
     except Exception as error:  # foreign code raises anything
+        raise_if_out_of_memory()
         raise CannotRedo(
             f"The {what} cannot be made here: {type(error).__name__}: {_short(error)}"
         ) from error

@@ -24,6 +24,7 @@ from runner.recording.spaces import leaves_of as recorded_leaves
 from runner.replay.recorded import RecordedReset
 from runner.replay.redone import Frame, Values
 from runner.util.arrays import Array
+from runner.util.processes import raise_if_out_of_memory
 
 _MAX_TEXT: Final = 300
 _ENDING: Final = struct.Struct("<d??")
@@ -207,6 +208,7 @@ class RowStepper(Stepper):
         except (MemoryError, CannotRedo):
             raise
         except Exception as error:  # foreign code raises anything
+            raise_if_out_of_memory()
             results.error = error
         return results
 

@@ -18,6 +18,7 @@ from runner.replay.recorded import RecordedReset, calls
 from runner.replay.redone import Frame
 from runner.replay.stepping import Results, Stepper, values_in
 from runner.util.arrays import Array
+from runner.util.processes import raise_if_out_of_memory
 
 _Numbered = tuple[int, RecordedReset]
 """The place of a reset among those of a block, and the reset."""
@@ -85,6 +86,7 @@ class VectorStepper(Stepper):
         except (MemoryError, CannotRedo):
             raise
         except Exception as error:  # foreign code raises anything
+            raise_if_out_of_memory()
             results.error = error
         return results
 

@@ -23,6 +23,8 @@ from typing import Any, Final, ParamSpec, Self, TypeVar
 
 from runner.errors import RunnerError
 
+_RESERVE_BYTES: Final = 64 << 20
+"""Memory counts as used up if no block of this size is left."""
 Args = ParamSpec("Args")
 Result = TypeVar("Result")
 
@@ -224,6 +226,14 @@ def _outcome(
         if isinstance(error, RunnerError | OSError):
             return "error", (type(error), error.args, vars(error))
         return "unexpected", traceback.format_exc()
+
+
+def raise_if_out_of_memory() -> None:
+    """Raise MemoryError if the memory of this process is used up; libraries report that in their own ways.
+
+    Called after an error of foreign code, to learn its cause: SDL raises `pygame.error`, for example.
+    """
+    bytes(_RESERVE_BYTES)
 
 
 def _limit_memory(more_bytes: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import time
@@ -136,6 +137,23 @@ class Hungry(Counter):
 
 def hungry() -> Hungry:
     return Hungry()
+
+
+class Reticent(Counter):
+    """Uses up the memory of a child process, and reports that by an error of its own, as SDL does."""
+
+    def reward(self) -> float:
+        if multiprocessing.parent_process():
+            self.food = []
+            with contextlib.suppress(MemoryError):
+                while True:
+                    self.food.append(bytes(8 << 20))
+            raise RuntimeError("Out of memory")
+        return 1.0
+
+
+def reticent() -> Reticent:
+    return Reticent()
 
 
 class Noisy(Counter):
