@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 import shutil
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from benchmarks.figures import Figure, figure, seconds
 from benchmarks.processes import run, run_command
 from benchmarks.serving import Service, serving
 from runner.client.client import Client
+from runner.client.uploads import append_upload, put_upload
 from runner.execution.verify import verify
 from runner.runs.resolve import find_run
 from runner.runs.run import Run
@@ -69,15 +71,16 @@ def _speed(source: Run, folder: Path, url: str, repetitions: int) -> list[Figure
             copied.append(size / seconds(lambda: _copy(source.recording, folder / "copy")) / 1e6)
             (folder / "copy").unlink()
             begin = time.perf_counter()
-            sent = client.begin_upload(size=size)
-            while sent.offset < size:
-                sent = client.append_upload(sent, source.recording, size)
             last = number == repetitions - 1
-            sent = client.complete_upload(sent, size, digest if last else "0" * 64)
+            known = {"digest": digest if last else "0" * 64, "size": size}
+            sent = put_upload(client, secrets.token_hex(32), **known)
+            while sent.offset < size:
+                sent = append_upload(client, sent, source.recording, size)
             uploaded.append(size / (time.perf_counter() - begin) / 1e6)
             begin = time.perf_counter()
             while sent.state == "verifying":
-                sent = client.upload_status(sent, 20)
+                time.sleep(0.05)
+                sent = put_upload(client, sent.id, **known)
         assert sent.state == "stored", sent.problem
     checked = size / (time.perf_counter() - begin) / 1e6
     return [

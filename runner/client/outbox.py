@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 import shutil
 import threading
 import warnings
@@ -17,8 +18,9 @@ from typing import Final, NamedTuple
 
 from platformdirs import user_state_path
 
-from runner.client.client import Client, UploadStatus
+from runner.client.client import Client
 from runner.client.connection import Report, ServerUnavailable, find_token
+from runner.client.uploads import UploadStatus, append_upload, put_upload
 from runner.errors import RunnerError
 from runner.runs.listing import list_runs
 from runner.runs.locking import locked
@@ -42,7 +44,7 @@ class _Push(NamedTuple):
 
     server: str = ""
     upload: str = ""
-    """The id of the upload that has begun; empty before."""
+    """The id of the upload that has its first bytes; empty if none has."""
 
 
 def is_server(recordings: object) -> bool:
@@ -76,10 +78,8 @@ def deliver(run: Run, client: Client, report: Report = lambda *_: None) -> Uploa
                 f"its shards are not added to it yet: `dualtaxi show {own.folder}` does it when all of its "
                 "processes have ended."
             )
-        push, begun = _read_push_file(own), None
-        if push.upload and push.server == client.url:
-            begun = UploadStatus(push.upload)
-        upload = client.push(own, report, begun)
+        push = _read_push_file(own)
+        upload = client.push(own, report, begun=push.upload if push.server == client.url else "")
         sent = own.folder.with_name(f"{_SENT}{own.folder.name}")
         own.folder.rename(sent)
     shutil.rmtree(sent, ignore_errors=True)
@@ -96,7 +96,8 @@ class Follower:
     def __init__(self, client: Client, run: Run, size: Callable[[], int]) -> None:
         self._client, self._run, self._size = client, run, size
         self._over = threading.Event()
-        _write_push_file(run, _Push(client.url))
+        self._upload_id = secrets.token_hex(32)
+        _write_push_file(run, _Push(client.url, self._upload_id))
         self._thread = threading.Thread(target=self._follow, name="push", daemon=True)
         self._thread.start()
 
@@ -122,17 +123,14 @@ class Follower:
             self._client.close()
 
     def _follow(self) -> None:
-        pause, upload = FOLLOW_SECONDS, None
+        pause, client, run = FOLLOW_SECONDS, self._client, self._run
         while not self._over.wait(pause):
-            try:
-                if upload is None:
-                    upload = self._client.begin_upload(name=self._run.name, run_id=self._run.run_id)
-                    _write_push_file(self._run, _Push(self._client.url, upload.id))
-                upload = self._client.upload_status(upload)  # so the server knows that the loop goes on
-                if upload.stop_requested and not self._run.is_stop_requested:
-                    self._run.request_stop()
+            try:  # also without new bytes, so the server knows that the loop goes on
+                upload = put_upload(client, self._upload_id, name=run.name, run_id=run.run_id)
+                if upload.stop_requested and not run.is_stop_requested:
+                    run.request_stop()
                 while upload.offset < (size := self._size()) and not self._over.is_set():
-                    upload = self._client.append_upload(upload, self._run.recording, size)
+                    upload = append_upload(client, upload, run.recording, size)
                 pause = FOLLOW_SECONDS
             except ServerUnavailable:
                 pause = min(2 * pause, MAX_PAUSE)

@@ -32,8 +32,7 @@ from runner.service.response_cache import ResponseCache
 from runner.service.settings import Settings
 from runner.service.sweep_fragments import load_sweep_libraries
 from runner.service.tokens import Sessions, Tokens
-from runner.service.upload import Upload
-from runner.service.uploads import Uploads
+from runner.service.uploads import Upload, Uploads
 from runner.sweep import sweeps_in
 from runner.util.version import __version__
 

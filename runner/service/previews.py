@@ -22,7 +22,6 @@ from runner.recording.reader import open_recording
 from runner.runs.importing import checked_facts
 from runner.runs.listing import run_in
 from runner.runs.run import PREVIEW, RECORDING_FILE, RUN_FILE, Run
-from runner.service.upload import Upload
 from runner.util.files import write_object
 from runner.util.values import NAME_PATTERN
 
@@ -36,43 +35,41 @@ class Previews:
     def __init__(self, recordings: Path) -> None:
         self._recordings = recordings
 
-    def of(self, upload: Upload) -> Run | None:
-        """Return the run that shows an upload; None if there is none."""
-        if not upload.run_id or not re.fullmatch(NAME_PATTERN, upload.run_id):
-            return None
-        run = run_in(self._recordings / upload.run_id)
-        return run if run is not None and run.facts.get(PREVIEW) == upload.id else None
-
-    def update(self, upload: Upload, body: Path) -> None:
-        """Show an upload whose sender still records, as soon as it describes a run; or note that it goes on.
+    def update(self, upload_id: str, run_id: str, body: Path) -> Run | None:
+        """Note that the sender of an upload goes on; return the run that shows it, if its bytes describe it.
 
         A run of another upload, or one that is stored, stays as it is.
         """
-        if upload.digest is not None or upload.checkpoint_of or upload.state != "receiving":
-            return
-        if (run := self.of(upload)) is not None:
+        if not re.fullmatch(NAME_PATTERN, run_id):
+            return None
+        if (run := self._run(upload_id, run_id)) is not None:
             run.beat()
-            return
-        if not 0 < upload.offset < _DESCRIPTION_BYTES or not re.fullmatch(NAME_PATTERN, upload.run_id):
-            return
-        target = self._recordings / upload.run_id
+            return run
+        target = self._recordings / run_id
         if os.path.lexists(target):
-            return
+            return None
         with contextlib.suppress(RunnerError, OSError):  # its description is not complete, or no run's
+            if body.stat().st_size > _DESCRIPTION_BYTES:
+                return None
             with open_recording(body) as recording:
                 facts = checked_facts(recording, {})
-            if facts["run_id"] != upload.run_id:
-                return
+            if facts["run_id"] != run_id:
+                return None
             # The owner is no process of this machine, so the run counts as running by its heartbeat.
-            facts |= {"status": "running", "owner": {"host": "upload"}, PREVIEW: upload.id}
+            facts |= {"status": "running", "owner": {"host": "upload"}, PREVIEW: upload_id}
             hidden = body.with_name("preview")
             shutil.rmtree(hidden, ignore_errors=True)
             hidden.mkdir()
             os.link(body, hidden / RECORDING_FILE)
             write_object(hidden / RUN_FILE, facts)
             hidden.rename(target)
+        return self._run(upload_id, run_id)
 
-    def remove(self, upload: Upload) -> None:
+    def remove(self, upload_id: str, run_id: str) -> None:
         """Remove the run that shows an upload, if there is one."""
-        if (run := self.of(upload)) is not None:
+        if (run := self._run(upload_id, run_id)) is not None:
             shutil.rmtree(run.folder, ignore_errors=True)
+
+    def _run(self, upload_id: str, run_id: str) -> Run | None:
+        run = run_in(self._recordings / run_id) if re.fullmatch(NAME_PATTERN, run_id) else None
+        return run if run is not None and run.facts.get(PREVIEW) == upload_id else None

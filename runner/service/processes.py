@@ -47,8 +47,12 @@ PRELOADED: Final = (
 
 Most environments draw by pygame, whose import takes as long as all else until their first picture.
 """
-NICENESS: Final = 5
-"""Processes that train or verify yield to the server, whose users are waiting."""
+
+
+def lower_priority() -> None:
+    """Let this process, which trains or verifies, yield to the server, whose users are waiting."""
+    with contextlib.suppress(OSError, AttributeError):  # not on Windows
+        os.nice(5)
 
 
 class ProcessPool:

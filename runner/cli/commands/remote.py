@@ -23,9 +23,10 @@ from runner.util.humanize import UNKNOWN, counted, size
 from runner.util.values import Json
 
 if TYPE_CHECKING:
-    from runner.client.client import Client, UploadStatus
+    from runner.client.client import Client
     from runner.client.connection import Report
     from runner.client.jobs import RemoteJob
+    from runner.client.uploads import UploadStatus
 
     Upload = Callable[[Report], dict[str, object]]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import time
 from multiprocessing.connection import Connection
@@ -30,7 +29,7 @@ from runner.service.jobs.channel import (
 )
 from runner.service.jobs.explanations import run_explain_job
 from runner.service.jobs.sweeps import run_sweep_job
-from runner.service.processes import NICENESS
+from runner.service.processes import lower_priority
 from runner.service.settings import without_folders
 from runner.sweep.cluster import RayActor, connect, start_actor
 
@@ -41,8 +40,7 @@ MAX_TEXT: Final = 4000
 def work(pipe: Connection, spec: JobSpec) -> None:
     """Run a job and report its outcome; the main function of a worker process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C, which reaches every process, is for the server
-    with contextlib.suppress(OSError, AttributeError):  # not on Windows
-        os.nice(NICENESS)
+    lower_priority()
     channel = PipeChannel(pipe)
     signal.signal(signal.SIGTERM, channel.request_stop)
     try:

@@ -10,8 +10,8 @@ from typing import Annotated, ClassVar, Final
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
-from runner.client.client import UploadStatus
 from runner.client.jobs import JobEvent, SweepProgress
+from runner.client.uploads import UploadStatus
 from runner.debugging.explanation_files import explanations_in
 from runner.export.reports.rendering import View
 from runner.service.addresses import Paging

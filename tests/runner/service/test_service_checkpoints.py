@@ -12,6 +12,7 @@ import runner
 from runner.cli import cli
 from runner.client.client import Client
 from runner.client.connection import ServerError
+from runner.client.uploads import put_upload
 from runner.runs.store import Store
 
 pytestmark = pytest.mark.usefixtures("outbox")
@@ -63,9 +64,9 @@ def test_a_server_takes_no_content_that_its_run_does_not_name(server, tmp_path):
         client.push(run)
         digest = blake3(b"strange").hexdigest()
         with pytest.raises(ServerError, match="has no checkpoint of this digest"):
-            client.begin_upload(digest=digest, size=7, checkpoint_of=run.run_id)
+            put_upload(client, digest, digest=digest, size=7, checkpoint_of=run.run_id)
         with pytest.raises(ServerError, match="push it before"):
-            client.begin_upload(digest=digest, size=7, checkpoint_of="unknown")
+            put_upload(client, digest, digest=digest, size=7, checkpoint_of="unknown")
     response = httpx2.get(f"{server.url}/api/v1/runs/{run.run_id}/checkpoints/{digest}")
     assert response.status_code == 404
     for strange in ("..%2F..%2Frun.json", "run.json", "A" * 64):

@@ -21,7 +21,7 @@ from runner.recording.labels import change_labels
 from runner.runs.listing import list_runs
 from runner.runs.run import RUN_FILE
 from tests.runner.loops.making import make, play
-from tests.runner.service.test_service_upload_routes import PIECE, UPLOADS, complete, message, patch
+from tests.runner.service.test_service_upload_routes import PIECE, UPLOADS, begin, message, over, patch, put
 from tests.waiting import until
 
 
@@ -154,10 +154,6 @@ def growing(tmp_path):
     return env.run.recording.read_bytes(), env.run
 
 
-def begin(client, run_id, **more):
-    return client.post(UPLOADS, json={"run_id": run_id, "name": "mine"} | more).json()["id"]
-
-
 def runs_of(client):
     return {run["run_id"]: run["status"] for run in client.get("/api/v1/runs").json()["runs"]}
 
@@ -165,7 +161,7 @@ def runs_of(client):
 def test_what_has_arrived_is_shown_and_what_is_refused_disappears(connect, elsewhere, growing):
     data, run = growing
     client = connect(elsewhere)
-    upload = begin(client, run.run_id)
+    upload = begin(client, run_id=run.run_id)
     patch(client, upload, data[:100], 0)
     assert list_runs(elsewhere.recordings[0]) == []  # it is not described yet
     patch(client, upload, data[100 : len(data) // 2], 100)
@@ -173,25 +169,26 @@ def test_what_has_arrived_is_shown_and_what_is_refused_disappears(connect, elsew
     assert (shown.run_id, shown.status) == (run.run_id, "running")
     rest = data[len(data) // 2 : -9] + b"damaged!!"
     patch(client, upload, rest, len(data) // 2)
-    assert complete(client, upload, data[: len(data) // 2] + rest).status_code == 202
-    assert client.get(f"{UPLOADS}/{upload}", params={"wait": 30}).json()["state"] == "refused"
+    whole = data[: len(data) // 2] + rest
+    assert over(client, upload, whole, run_id=run.run_id)["state"] == "refused"
     until(lambda runs: runs == [], lambda: list_runs(elsewhere.recordings[0]))
 
 
 def test_a_sender_that_is_gone_leaves_an_interrupted_run_until_it_is_back(connect, elsewhere, growing):
     data, run = growing
     client = connect(elsewhere)
-    upload = begin(client, run.run_id)
+    upload = begin(client, run_id=run.run_id)
     patch(client, upload, data[:-50], 0)
     (shown,) = list_runs(elsewhere.recordings[0])
     assert shown.status == "running"
     long_ago = time.time() - 60
     os.utime(shown.folder / RUN_FILE, (long_ago, long_ago))
     assert shown.status == "interrupted"
-    assert not client.get(f"{UPLOADS}/{upload}").json()["stop_requested"]  # its sender asks how far it is
+    back = put(client, upload, run_id=run.run_id)  # its sender asks how far it is
+    assert not back.json()["stop_requested"]
     assert shown.status == "running"
     shown.request_stop()
-    assert client.get(f"{UPLOADS}/{upload}").json()["stop_requested"]
+    assert put(client, upload, run_id=run.run_id).json()["stop_requested"]
     assert client.delete(f"{UPLOADS}/{upload}").status_code == 204
     assert list_runs(elsewhere.recordings[0]) == []
 
@@ -200,7 +197,7 @@ def test_a_sender_that_is_gone_leaves_an_interrupted_run_until_it_is_back(connec
 def test_an_upload_is_shown_only_under_the_id_of_its_run(connect, elsewhere, growing, announced):
     data, _ = growing
     client = connect(elsewhere)
-    upload = begin(client, announced)
+    upload = begin(client, run_id=announced)
     assert patch(client, upload, data, 0).status_code == 200
     assert list_runs(elsewhere.recordings[0]) == []
     assert not (elsewhere.recordings[0].parent / "outside").exists()
@@ -209,14 +206,13 @@ def test_an_upload_is_shown_only_under_the_id_of_its_run(connect, elsewhere, gro
 def test_a_run_that_is_there_stays_as_it_is(connect, elsewhere, growing):
     data, run = growing
     client = connect(elsewhere)
-    first, second = begin(client, run.run_id), begin(client, run.run_id)
+    first, second = begin(client, run_id=run.run_id), begin(client, run_id=run.run_id)
     patch(client, first, data[:-200], 0)
     patch(client, second, data, 0)
     (shown,) = list_runs(elsewhere.recordings[0])
     assert shown.facts["upload"] == first
     change_labels(shown.folder, lambda labels: replace(labels, note="seen"))
-    assert complete(client, second, data).status_code == 202
-    assert client.get(f"{UPLOADS}/{second}", params={"wait": 30}).json()["state"] == "stored"
+    assert over(client, second, data, run_id=run.run_id)["state"] == "stored"
     (stored,) = list_runs(elsewhere.recordings[0])
     assert (stored.status, stored.note, "upload" in stored.facts) == ("finished", "seen", False)
     before = stored.recording.read_bytes()
@@ -228,7 +224,7 @@ def test_a_run_that_is_there_stays_as_it_is(connect, elsewhere, growing):
 def test_a_server_that_is_started_again_shows_it_again(connect, elsewhere, growing):
     data, run = growing
     client = connect(elsewhere)
-    upload = begin(client, run.run_id)
+    upload = begin(client, run_id=run.run_id)
     patch(client, upload, data[:-200], 0)
     client.__exit__(None, None, None)
     client = connect(elsewhere)

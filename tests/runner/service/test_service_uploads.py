@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import shutil
 import threading
 import time
@@ -23,10 +24,9 @@ from runner.recording.labels import Labels, change_labels
 from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run
-from runner.service.errors import TooManyUploads, UploadConflict, UploadTooLarge
+from runner.service.errors import Busy, TooManyUploads, UploadConflict, UploadTooLarge
 from runner.service.settings import Limits
-from runner.service.upload import Announcement, Completion
-from runner.service.uploads import FOLDER, Uploads
+from runner.service.uploads import FOLDER, Uploads, UploadSource
 from tests.runner.recording.making import TAXIS, experiment, make_run, stopping_after, with_id
 from tests.waiting import until
 
@@ -35,28 +35,39 @@ ANNA, BEN = "anna", "ben"
 
 @pytest.fixture
 def uploads(tmp_path):
-    made = Uploads(tmp_path / "runs", Limits(spare_bytes=0))
+    made = start(tmp_path / "runs", spare_bytes=0)
     yield made
     made.close()
 
 
-def completion(data: bytes, **details) -> Completion:
-    return Completion(digest=blake3(data).hexdigest(), size=len(data), run=details)
+def start(folder: Path, **limits) -> Uploads:
+    return Uploads(folder, Limits(**limits), lambda _: None)
 
 
-def announced(data: bytes, **more) -> Announcement:
-    return Announcement(digest=blake3(data).hexdigest(), size=len(data), **more)
+def source(data: bytes, **more) -> UploadSource:
+    return UploadSource(digest=blake3(data).hexdigest(), size=len(data), **more)
 
 
-def send(uploads, data, owner=ANNA, whole=None, **details):
+def begin(uploads, owner, data, **more):
+    """Begin the upload of bytes, or find the one that has begun."""
+    return uploads.put(owner, blake3(data).hexdigest(), source(data, **more))
+
+
+def grow(uploads, owner, **known):
+    """Begin an upload of unknown bytes."""
+    return uploads.put(owner, secrets.token_hex(32), UploadSource(**known))
+
+
+def send(uploads, data, owner=ANNA, labels=None, **details):
     """Upload bytes in one go, and return the upload when its verification is over."""
-    upload, _ = uploads.begin(owner, announced(data))
-    uploads.append(upload.id, owner, 0, data)
-    return over(uploads, uploads.complete(upload.id, owner, whole or completion(data, **details)))
+    upload = begin(uploads, owner, data, run=details, labels=labels or {})
+    if upload.state == "receiving" and data:
+        upload = uploads.append(owner, upload.id, 0, data)
+    return over(uploads, upload)
 
 
 def over(uploads, upload):
-    return until(lambda upload: upload.state != "verifying", lambda: uploads.get(upload.id, upload.owner))
+    return until(lambda upload: upload.state != "verifying", lambda: uploads.get(upload.owner, upload.id))
 
 
 def visible(folder: Path) -> list[str]:
@@ -65,24 +76,26 @@ def visible(folder: Path) -> list[str]:
 
 def test_a_recording_becomes_its_run(uploads, taxis, tmp_path):
     data = taxis.recording.read_bytes()
-    upload, new = uploads.begin(ANNA, announced(data))
-    assert new
+    upload = grow(uploads, ANNA)
     for offset in range(0, len(data), 10_000):
         piece = data[offset : offset + 10_000]
-        assert uploads.append(upload.id, ANNA, offset, piece).offset == offset + len(piece)
-    assert uploads.get(upload.id, ANNA).offset == len(data)
+        assert uploads.append(ANNA, upload.id, offset, piece).offset == offset + len(piece)
+    assert uploads.get(ANNA, upload.id).offset == len(data)
     assert list_runs(tmp_path / "runs") == []
     seconds = taxis.summary["seconds"]
-    verifying = uploads.complete(
-        upload.id, ANNA, completion(data, summary={"seconds": seconds}, name="taxis")
-    )
+    whole = source(data, run={"summary": {"seconds": seconds}, "name": "taxis"})
+    verifying = uploads.put(ANNA, upload.id, whole)
     assert verifying.state == "verifying"
     assert over(uploads, verifying).run_id == taxis.run_id
     run = find_run(taxis.run_id, tmp_path / "runs")
     assert {key: value for key, value in taxis.facts.items() if key != "owner"} == run.facts
     assert run.recording.read_bytes() == data
     assert sorted(path.name for path in run.folder.iterdir()) == ["recording.mcap", "run.json"]
-    assert not (tmp_path / "runs" / FOLDER / upload.id / "body").exists()
+    assert bodies(tmp_path) == []
+
+
+def bodies(folder: Path) -> list[Path]:
+    return list((folder / "runs" / FOLDER).rglob("body"))
 
 
 def test_an_exported_recording_is_stored_with_its_labels(uploads, lake, tmp_path):
@@ -97,40 +110,38 @@ def test_an_exported_recording_is_stored_with_its_labels(uploads, lake, tmp_path
 
 def test_the_same_bytes_are_the_same_upload_and_the_same_run(uploads, lake, tmp_path):
     data = lake.recording.read_bytes()
-    first, _ = uploads.begin(ANNA, announced(data))
-    assert uploads.begin(ANNA, announced(data)) == (first, False)
-    assert uploads.begin(BEN, announced(data))[1], "another's upload is not handed out"
-    done = send(uploads, data)
-    known, new = uploads.begin(ANNA, announced(data))
-    assert (known.id, known.already, new) == (done.id, True, False)
-    again = uploads.complete(done.id, ANNA, completion(data))
-    assert again == done
+    first = begin(uploads, ANNA, data)
+    first = uploads.append(ANNA, first.id, 0, data[:7])
+    assert begin(uploads, ANNA, data) == first
+    assert begin(uploads, BEN, data).offset == 0, "another's upload is not handed out"
+    done = over(uploads, uploads.append(ANNA, first.id, 7, data[7:]))
+    assert (done.state, done.already) == ("stored", False)
+    known = begin(uploads, ANNA, data)
+    assert known == done
     others = send(uploads, data, BEN)
     assert (others.state, others.already) == ("stored", True)
-    digest = lake.summary["content_digest"]
-    known, _ = uploads.begin("carl", Announcement(run_id=lake.run_id, content_digest=digest))
+    known = grow(uploads, "carl", run_id=lake.run_id, content_digest=lake.summary["content_digest"])
     assert (known.state, known.already) == ("stored", True)
     assert visible(tmp_path / "runs") == [lake.run_id]
     shutil.rmtree(tmp_path / "runs" / lake.run_id)
-    fresh, new = uploads.begin(ANNA, announced(data))
-    assert (new, fresh.state) == (True, "receiving"), "a run that was removed can be sent again"
+    fresh = begin(uploads, ANNA, data)
+    assert (fresh.state, fresh.offset) == ("receiving", 0), "a run that was removed can be sent again"
 
 
 def test_received_bytes_outlive_the_server(lake, tmp_path):
     data = lake.recording.read_bytes()
-    first = Uploads(tmp_path / "runs")
-    upload, _ = first.begin(ANNA, announced(data))
-    first.append(upload.id, ANNA, 0, data[:5_000], len(data) - 5_000)
+    first = start(tmp_path / "runs")
+    upload = begin(first, ANNA, data)
+    first.append(ANNA, upload.id, 0, data[:5_000], len(data) - 5_000)
     with pytest.raises(RunnerError, match="is served by another process already"):
-        Uploads(tmp_path / "runs")
+        start(tmp_path / "runs")
     first.close()
-    second = Uploads(tmp_path / "runs")
-    known, new = second.begin(ANNA, announced(data))
-    assert (known.id, new, known.offset) == (upload.id, False, 5_000)
-    second.append(upload.id, ANNA, 5_000, data[5_000:])
-    second.complete(upload.id, ANNA, completion(data))
+    second = start(tmp_path / "runs")
+    known = begin(second, ANNA, data)
+    assert (known.id, known.created, known.offset) == (upload.id, upload.created, 5_000)
+    assert second.append(ANNA, upload.id, 5_000, data[5_000:]).state == "verifying"
     second.close()  # while it verifies
-    third = Uploads(tmp_path / "runs")
+    third = start(tmp_path / "runs")
     assert over(third, upload).run_id == lake.run_id
     third.close()
 
@@ -138,12 +149,11 @@ def test_received_bytes_outlive_the_server(lake, tmp_path):
 def test_a_repeated_verification_has_the_same_result(uploads, lake, tmp_path):
     data = lake.recording.read_bytes()
     stored = send(uploads, data)
-    folder = tmp_path / "runs" / FOLDER / stored.id
-    state = json.loads((folder / "upload.json").read_text())
+    (path,) = (tmp_path / "runs" / FOLDER).glob("*/upload.json")
     uploads.close()
-    (folder / "upload.json").write_text(json.dumps(state | {"state": "verifying", "run_id": ""}))
-    (folder / "body").write_bytes(data)
-    again = Uploads(tmp_path / "runs")
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"state": "receiving", "run_id": ""}))
+    path.with_name("body").write_bytes(data)  # killed before the result was saved
+    again = start(tmp_path / "runs")
     known = over(again, stored)
     assert (known.state, known.run_id, known.already) == ("stored", lake.run_id, True)
     again.close()
@@ -171,17 +181,17 @@ def test_an_unsound_recording_is_refused_and_leaves_nothing(uploads, lake, tmp_p
     assert refused.problem.startswith("the upload: ")
     assert str(tmp_path) not in refused.problem
     assert visible(tmp_path / "runs") == []
-    assert not (tmp_path / "runs" / FOLDER / refused.id / "body").exists()
-    again, new = uploads.begin(ANNA, announced(change(lake.recording.read_bytes())))
-    assert new, "it can be sent again"
-    assert again.id != refused.id
+    assert bodies(tmp_path) == []
+    assert begin(uploads, ANNA, change(lake.recording.read_bytes())) == refused
+    uploads.delete(ANNA, refused.id)
+    again = begin(uploads, ANNA, change(lake.recording.read_bytes()))
+    assert (again.offset, again.problem) == (0, ""), "it can be sent again"
 
 
 def test_bytes_changed_in_transit_are_refused(uploads, lake):
     data = lake.recording.read_bytes()
-    upload, _ = uploads.begin(ANNA, announced(data))
-    uploads.append(upload.id, ANNA, 0, altered(data))
-    refused = over(uploads, uploads.complete(upload.id, ANNA, completion(data)))
+    upload = begin(uploads, ANNA, data)
+    refused = over(uploads, uploads.append(ANNA, upload.id, 0, altered(data)))
     assert "another digest" in refused.problem
 
 
@@ -218,10 +228,9 @@ def test_a_resumed_run_replaces_its_beginning(uploads, stopped, tmp_path):
     there = tmp_path / "runs" / early.run_id
     change_labels(there, lambda _: Labels("mine", ("here",), "seen"))
     data = whole.recording.read_bytes()
-    more = completion(data, status="finished").model_copy(
-        update={"labels": {"name": "yours", "tags": ["there"], "note": "other"}}
+    stored = send(
+        uploads, data, labels={"name": "yours", "tags": ["there"], "note": "other"}, status="finished"
     )
-    stored = send(uploads, data, whole=more)
     assert (stored.state, stored.problem, stored.already) == ("stored", "", False)
     run = find_run(whole.run_id, tmp_path / "runs")
     assert run.status == "finished"
@@ -264,50 +273,57 @@ def test_an_interrupted_replacement_is_completed_by_a_second_upload(uploads, sto
 
 def test_wrong_requests_of_a_client_are_refused(uploads, lake):
     data = lake.recording.read_bytes()
-    upload, _ = uploads.begin(ANNA, announced(data))
+    upload = begin(uploads, ANNA, data)
     with pytest.raises(RunNotFound):
-        uploads.get(upload.id, BEN)
+        uploads.get(BEN, upload.id)
     with pytest.raises(RunNotFound):
-        uploads.append("../" + upload.id, ANNA, 0, b"1")
+        uploads.append(ANNA, "../" + upload.id, 0, b"1")
     with pytest.raises(UploadConflict, match="expected 0"):
-        uploads.append(upload.id, ANNA, 7, b"1")
+        uploads.append(ANNA, upload.id, 7, b"1")
     with pytest.raises(UploadTooLarge):
-        uploads.append(upload.id, ANNA, 0, b"", len(data) + 1)
+        uploads.append(ANNA, upload.id, 0, b"", len(data) + 1)
     with pytest.raises(UploadTooLarge):
-        uploads.append(upload.id, ANNA, 0, data + b"more")
-    assert uploads.get(upload.id, ANNA).offset == 0
-    with pytest.raises(UploadConflict, match="found 0 bytes"):
-        uploads.complete(upload.id, ANNA, completion(data))
-    assert uploads.append(upload.id, ANNA, 0, data).offset == len(data)
-    with pytest.raises(UploadConflict, match=f"expected {len(data):,}"):
-        uploads.append(upload.id, ANNA, 0, data)
-    other = completion(data).model_copy(update={"digest": "0" * 64})
+        uploads.append(ANNA, upload.id, 0, data + b"more")
+    assert uploads.get(ANNA, upload.id).offset == 0
+    assert begin(uploads, ANNA, data).state == "receiving", "it is not verified without its bytes"
     with pytest.raises(UploadConflict, match="another digest"):
-        uploads.complete(upload.id, ANNA, other)
+        uploads.put(ANNA, upload.id, source(altered(data)))
+    assert uploads.append(ANNA, upload.id, 0, data).offset == len(data)
+    with pytest.raises(UploadConflict, match=f"expected {len(data):,}"):
+        uploads.append(ANNA, upload.id, 0, data)
+
+
+def test_a_file_that_became_shorter_is_sent_from_its_beginning(uploads, lake):
+    data = lake.recording.read_bytes()
+    upload = grow(uploads, ANNA, run_id=lake.run_id)
+    uploads.append(ANNA, upload.id, 0, data + b"lost by a full disk")
+    again = uploads.put(ANNA, upload.id, source(data))
+    assert (again.id, again.offset) == (upload.id, 0)
+    assert over(uploads, uploads.append(ANNA, upload.id, 0, data)).state == "stored"
 
 
 def test_uploads_beyond_the_limits_are_refused(lake, tmp_path):
-    uploads = Uploads(tmp_path / "runs", Limits(upload_bytes=1_000, uploads=2))
+    uploads = start(tmp_path / "runs", upload_bytes=1_000, uploads=2)
     with pytest.raises(UploadTooLarge, match="1,000"):
-        uploads.begin(ANNA, Announcement(size=1_001))
-    first, _ = uploads.begin(ANNA, Announcement())
+        grow(uploads, ANNA, size=1_001)
+    first = grow(uploads, ANNA)
     with pytest.raises(UploadTooLarge):
-        uploads.append(first.id, ANNA, 0, bytes(1_001))
-    uploads.begin(ANNA, Announcement())
+        uploads.append(ANNA, first.id, 0, bytes(1_001))
+    grow(uploads, ANNA)
     with pytest.raises(TooManyUploads):
-        uploads.begin(BEN, Announcement())
-    uploads.delete(first.id, ANNA)
-    uploads.begin(BEN, Announcement())
+        grow(uploads, BEN)
+    uploads.delete(ANNA, first.id)
+    grow(uploads, BEN)
     uploads.close()
-    full = Uploads(tmp_path / "full", Limits(spare_bytes=1 << 60))
+    full = start(tmp_path / "full", spare_bytes=1 << 60)
     with pytest.raises(StorageError, match="room for 0 bytes"):
-        full.begin(ANNA, Announcement(size=10))
+        grow(full, ANNA, size=10)
     full.close()
 
 
 def test_a_full_disk_keeps_what_is_there(uploads, lake, monkeypatch):
     data = lake.recording.read_bytes()
-    upload, _ = uploads.begin(ANNA, announced(data))
+    upload = begin(uploads, ANNA, data)
     real, room = os.write, [6_000]
 
     def full(descriptor, view):
@@ -319,54 +335,51 @@ def test_a_full_disk_keeps_what_is_there(uploads, lake, monkeypatch):
 
     monkeypatch.setattr("runner.service.uploads.os.write", full)
     with pytest.raises(StorageError, match="No space left"):
-        uploads.append(upload.id, ANNA, 0, data)
+        uploads.append(ANNA, upload.id, 0, data)
     monkeypatch.undo()
-    assert uploads.get(upload.id, ANNA).offset == 6_000
-    uploads.append(upload.id, ANNA, 6_000, data[6_000:])
-    assert over(uploads, uploads.complete(upload.id, ANNA, completion(data))).state == "stored"
+    assert uploads.get(ANNA, upload.id).offset == 6_000
+    assert over(uploads, uploads.append(ANNA, upload.id, 6_000, data[6_000:])).state == "stored"
 
 
 def test_the_disk_reserve_holds_for_uploads_of_unknown_size(tmp_path, monkeypatch):
-    uploads = Uploads(tmp_path / "runs", Limits(spare_bytes=5_000))
-    upload, _ = uploads.begin(ANNA, Announcement())
+    uploads = start(tmp_path / "runs", spare_bytes=5_000)
+    upload = grow(uploads, ANNA)
     free = iter((7_000, 6_000))
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr("runner.service.uploads.shutil.disk_usage", lambda _: usage._replace(free=next(free)))
-    uploads.append(upload.id, ANNA, 0, bytes(2_000))
+    uploads.append(ANNA, upload.id, 0, bytes(2_000))
     with pytest.raises(StorageError, match="room for 1,000 bytes"):
-        uploads.append(upload.id, ANNA, 2_000, bytes(2_000))
-    assert uploads.get(upload.id, ANNA).offset == 2_000
+        uploads.append(ANNA, upload.id, 2_000, bytes(2_000))
+    assert uploads.get(ANNA, upload.id).offset == 2_000
     uploads.close()
 
 
 def test_a_limited_number_of_results_is_remembered(lake, tmp_path):
     shutil.copytree(lake.folder, tmp_path / "runs" / lake.run_id)
-    uploads = Uploads(tmp_path / "runs", Limits(uploads=3))
-    for number in range(9):
-        known = {"run_id": lake.run_id, "content_digest": lake.summary["content_digest"]}
-        upload, _ = uploads.begin(ANNA, Announcement(digest=f"{number:064}", **known))
+    uploads = start(tmp_path / "runs", uploads=3)
+    for _ in range(9):
+        upload = grow(uploads, ANNA, run_id=lake.run_id, content_digest=lake.summary["content_digest"])
         assert upload.state == "stored"
     assert len(uploads.all()) == len(list((tmp_path / "runs" / FOLDER).glob("*/upload.json"))) == 4
-    assert uploads.get(upload.id, ANNA).already
+    assert uploads.get(ANNA, upload.id).already
     uploads.close()
 
 
 def test_old_results_and_abandoned_uploads_are_forgotten(lake, tmp_path):
-    uploads = Uploads(tmp_path / "runs")
+    uploads = start(tmp_path / "runs")
     stored = send(uploads, lake.recording.read_bytes())
-    idle, _ = uploads.begin(ANNA, Announcement(name="idle"))
-    fresh, _ = uploads.begin(ANNA, Announcement(name="fresh"))
+    idle, fresh = grow(uploads, ANNA, name="idle"), grow(uploads, ANNA, name="fresh")
     uploads.close()
     for upload, days in ((stored, 2), (idle, 8)):
-        folder = tmp_path / "runs" / FOLDER / upload.id
+        folder = tmp_path / "runs" / FOLDER / upload.folder
         state = json.loads((folder / "upload.json").read_text())
         (folder / "upload.json").write_text(json.dumps(state | {"created": "2020-01-01T00:00:00.000+00:00"}))
         for path in folder.iterdir():
             os.utime(path, (time.time() - days * 86400,) * 2)
     (tmp_path / "runs" / FOLDER / ("0" * 32)).mkdir()
-    again = Uploads(tmp_path / "runs")
+    again = start(tmp_path / "runs")
     assert [upload.id for upload in again.all()] == [fresh.id]
-    assert [path.name for path in (tmp_path / "runs" / FOLDER).iterdir() if path.is_dir()] == [fresh.id]
+    assert [path.name for path in (tmp_path / "runs" / FOLDER).iterdir() if path.is_dir()] == [fresh.folder]
     assert visible(tmp_path / "runs") == [lake.run_id]
     again.close()
 
@@ -374,14 +387,13 @@ def test_old_results_and_abandoned_uploads_are_forgotten(lake, tmp_path):
 def test_removing_an_upload_does_not_block_others(uploads, lake, monkeypatch):
     """The event loop of the server reads uploads: it must not wait for the disk."""
     data, go_on = lake.recording.read_bytes(), threading.Event()
-    given_up, _ = uploads.begin(ANNA, Announcement(name="given up"))
-    upload, _ = uploads.begin(ANNA, announced(data))
+    given_up, upload = grow(uploads, ANNA, name="given up"), begin(uploads, ANNA, data)
     monkeypatch.setattr("runner.service.uploads.shutil.rmtree", lambda *_, **__: go_on.wait(60))
     with ThreadPoolExecutor(2) as threads:
-        removal = threads.submit(uploads.delete, given_up.id, ANNA)
+        removal = threads.submit(uploads.delete, ANNA, given_up.id)
         try:
             until(lambda known: len(known) == 1, uploads.all)
-            assert threads.submit(uploads.get, upload.id, ANNA).result(20) == upload
+            assert threads.submit(uploads.get, ANNA, upload.id).result(20) == upload
             assert not removal.done()
         finally:
             go_on.set()
@@ -393,18 +405,19 @@ def test_an_upload_whose_verification_fails_unexpectedly_can_be_completed_again(
         broken.setattr("runner.service.processes.ChildProcess", lambda *_: json.loads("no process"))
         failed = send(uploads, data)
     assert failed.state == "receiving"
-    assert failed.problem == "something unexpected went wrong while it was verified; complete it again."
-    again = uploads.complete(failed.id, ANNA, completion(data))
-    assert over(uploads, again).state == "stored"
+    assert failed.problem == "something unexpected went wrong while it was verified; try again."
+    with pytest.raises(Busy, match="went wrong"):
+        begin(uploads, ANNA, data)
+    assert over(uploads, begin(uploads, ANNA, data)).state == "stored"
 
 
 def test_one_client_cannot_hold_all_uploads(tmp_path):
-    uploads = Uploads(tmp_path / "runs", Limits(uploads=3, uploads_each=2))
+    uploads = start(tmp_path / "runs", uploads=3, uploads_each=2)
     for _ in range(2):
-        uploads.begin(ANNA, Announcement())
+        grow(uploads, ANNA)
     with pytest.raises(TooManyUploads, match="2 of your uploads are open"):
-        uploads.begin(ANNA, Announcement())
-    uploads.begin(BEN, Announcement())
+        grow(uploads, ANNA)
+    grow(uploads, BEN)
     with pytest.raises(TooManyUploads, match="3 uploads are open"):
-        uploads.begin(BEN, Announcement())
+        grow(uploads, BEN)
     uploads.close()

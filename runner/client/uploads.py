@@ -1,0 +1,152 @@
+"""Uploading a run to a server: resumed where it was interrupted, and verified before it is stored."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, fields, replace
+from http import HTTPStatus
+from pathlib import Path
+from typing import Final, Literal
+
+from runner.client.connection import Connection, Report, ServerError, ServerUnavailable
+from runner.errors import RunnerError
+from runner.recording.labels import as_json
+from runner.runs.run import Run
+from runner.util.files import hash_of
+from runner.util.values import Json
+
+PIECE: Final = 16 << 20
+"""Maximum number of bytes of a request; a proxy in front of the server must accept them."""
+POLL_SECONDS: Final = 1.0
+"""The longest pause before a server is asked again whether it has verified an upload."""
+UploadState = Literal["receiving", "verifying", "stored", "refused"]
+
+
+@dataclass(frozen=True)
+class UploadStatus:
+    """An upload and its state, as clients see them."""
+
+    id: str
+    state: UploadState = "receiving"
+    offset: int = 0
+    """Number of bytes received: the next ones begin here."""
+    size: int | None = None
+    """Number of bytes when it is complete, if that is known."""
+    name: str = ""
+    run_id: str = ""
+    """The announced run; when it is stored, the run that it is."""
+    already: bool = False
+    """Whether that run was there before."""
+    problem: str = ""
+    """Why it was refused; of one that is being received again, why it could not be stored."""
+    created: str = ""
+    """In UTC, as ISO 8601."""
+    stop_requested: bool = False
+    """Whether the loop that records the run is requested to stop."""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether its result is final."""
+        return self.state in ("stored", "refused")
+
+
+def push(server: Connection, run: Run, report: Report = lambda *_: None, begun: str = "") -> UploadStatus:
+    """Upload a run with the contents of its checkpoints; return the result when the server has stored it.
+
+    Args:
+        server: a connection to the server.
+        run: a run that is over.
+        report: called with the progress.
+        begun: the id of an upload that has its first bytes already.
+
+    Raises:
+        ServerError: it was refused, with the reason.
+        ServerUnavailable: the server did not respond in time; it keeps what it has received.
+        RunnerError: the run is running, or in an archive only, or cannot be read.
+    """
+    if run.status not in ("finished", "interrupted", "failed"):
+        raise RunnerError(f"run {run.run_id} is {run.status}; only one that is over and here can be pushed.")
+    try:
+        size, digest = hash_of(run.recording)
+    except OSError as error:
+        raise RunnerError(f"{run.recording}: cannot be read ({error.strerror}).") from error
+    source: Json = {"digest": digest, "size": size, "name": run.name, "run_id": run.run_id}
+    source["content_digest"] = run.summary.content_digest
+    if not run.stands_alone:  # an exported recording carries its own record of the run
+        summary = {"seconds": run.summary.seconds, "error": run.summary.error}
+        facts = {"name": run.file.name, "status": run.status, "proof": run.file.proof, "summary": summary}
+        source |= {"run": facts, "labels": as_json(run.labels)}
+    upload = _send(server, begun or digest, source, run.recording, report)
+    if upload.state == "refused" and begun:  # the file has changed since it began
+        upload = _send(server, digest, source, run.recording, report)
+    if upload.state == "refused":
+        raise ServerError(f"{server.url}: refused the run {run.run_id}: {upload.problem}")
+    for checkpoint in {each.digest: each for each in run.checkpoints() if each.is_here}.values():
+        source = {"digest": checkpoint.digest, "size": checkpoint.size, "checkpoint_of": upload.run_id}
+        sent = _send(server, checkpoint.digest, source, checkpoint.path, report)
+        if sent.state == "refused":
+            raise ServerError(f"{server.url}: refused {checkpoint.reference}: {sent.problem}")
+    return upload
+
+
+def _send(server: Connection, upload_id: str, source: Json, path: Path, report: Report) -> UploadStatus:
+    """Upload a file until it is stored or refused; what fails for now is repeated."""
+    furthest, pause, backoff, is_known = -1, POLL_SECONDS / 16, server.backoff(), False
+    while True:
+        try:
+            upload = put_upload(server, upload_id, **source)
+            if upload.is_over and not is_known:  # since an earlier push
+                if upload.state == "stored":
+                    return replace(upload, already=True)
+                server.request("DELETE", f"/uploads/{upload_id}")
+                continue
+            is_known = True
+            while upload.state == "receiving":
+                if upload.offset > furthest:
+                    furthest = upload.offset
+                    backoff.reset()
+                report(upload.offset, source["size"])
+                upload = append_upload(server, upload, path, source["size"])
+            if upload.is_over:
+                return upload
+            time.sleep(pause)
+            pause = min(2 * pause, POLL_SECONDS)
+        except ServerError as error:
+            is_behind = error.status in (HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT)
+            if not (is_behind or isinstance(error, ServerUnavailable)):
+                raise
+            backoff.wait(error)
+
+
+def put_upload(server: Connection, upload_id: str, **source: object) -> UploadStatus:
+    """Begin or continue an upload, with what is known of its file; return its state.
+
+    Args:
+        server: a connection to the server.
+        upload_id: 64 hexadecimal digits: the BLAKE3 of the file, or random ones while it is growing.
+        source: the fields of `UploadSource`.
+    """
+    return _request(server, "PUT", upload_id, json=source)
+
+
+def append_upload(server: Connection, upload: UploadStatus, path: Path, end: int) -> UploadStatus:
+    """Send the next piece of a file, not beyond an offset.
+
+    Raises:
+        RunnerError: the file has become shorter, or as `Connection.request`.
+    """
+    with path.open("rb") as stream:
+        stream.seek(upload.offset)
+        piece = stream.read(min(end - upload.offset, PIECE))
+    if not piece:
+        raise RunnerError(f"{path}: became shorter while it was sent; try again.")
+    headers = {"Upload-Offset": str(upload.offset)}
+    return _request(server, "PATCH", upload.id, content=piece, headers=headers)
+
+
+def _request(server: Connection, method: str, upload_id: str, **options: object) -> UploadStatus:
+    response = server.request_object(method, f"/uploads/{upload_id}", **options)
+    try:
+        return UploadStatus(**{field.name: response[field.name] for field in fields(UploadStatus)})
+    except KeyError as error:
+        raise server.unexpected_response() from error
