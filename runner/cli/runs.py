@@ -51,7 +51,7 @@ def folded(run: Run) -> Run:
     """Return a run with the shards of processes that were killed; print how many shards are still open."""
     if not (run.folder / SHARDS_FOLDER).is_dir():
         return run
-    from runner.loops.folding import fold_if_over
+    from runner.loops.fold import fold_if_over
 
     what = shards_in_words(run)
     if not are_over(run):

@@ -1,22 +1,30 @@
-"""Writing the recordings of several processes into one, episode by episode, in one order."""
+"""The shards of a run, folded into its recording when no process records into it any more.
+
+Each episode is kept whole, with the resets before it, and the episodes of all processes are put in one order:
+by how many steps their processes had taken when they began, then by the names of the processes. So the run is
+as if one loop had done all of it, and does not depend on which process was faster.
+"""
 
 from __future__ import annotations
 
 import json
+import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.client.outbox import forget_upload
 from runner.config.loading import recorded_packing
 from runner.errors import truncated_message
 from runner.loops.copied_rows import Copied, CopiedExtras, CopiedMessages, CopiedRows
 from runner.loops.outcomes import Outcomes
-from runner.loops.shard_sources import PHASES, Source
+from runner.loops.shard_sources import PHASES, Source, open_sources
 from runner.recording import schema
 from runner.recording.maker import SHARD_MAKER, EnvironmentMaker, Shard
 from runner.recording.messages import (
@@ -29,22 +37,73 @@ from runner.recording.messages import (
     frame_place,
     log_level,
 )
-from runner.recording.metadata import dtypes_of, write_result
+from runner.recording.metadata import dtypes_of, json_object, write_result
 from runner.recording.recorder import Recorder
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import create_recording
-from runner.runs.run import Run
-from runner.runs.shards import ENDS_AS, shards_of
+from runner.runs.listing import run_at
+from runner.runs.run import RECORDING_FILE, SHARDS_FOLDER, Run
+from runner.runs.shards import ENDS_AS, are_over, handed_over, shards_locked, shards_of
 from runner.util.arrays import Array
+from runner.util.files import storage_errors
 
-_KEPT: Final = frozenset({"run", "result", "repair"})
+_NOT_COPIED: Final = frozenset({"run", "result", "repair"})
 """The metadata that is not copied from the process that began the run."""
+
+OWNER_WAITS: Final = 5.0
+"""Seconds for which the process that began a run waits, at its end, for the others to end."""
+_POLL_SECONDS: Final = 0.05
 
 Report = Callable[[int, int], None]
 """Takes the steps copied so far, and how many there are."""
 
 
-class Fold:
+def fold_if_over(run: Run, seconds: float = 0.0, report: Report = lambda *_: None) -> Run:
+    """Fold the shards of a run into its recording if no process records into it; return the run as it is.
+
+    Args:
+        seconds: how long to wait for the processes of its shards to end.
+
+    Raises:
+        RecordingError: a recording is damaged; all stay as they are.
+        StorageError: the run's folder cannot be written; all stay as they are.
+    """
+    if not (run.folder / SHARDS_FOLDER).is_dir():
+        return run
+    deadline = time.monotonic() + seconds
+    while not are_over(run_at(run.folder)) and time.monotonic() < deadline:
+        time.sleep(_POLL_SECONDS)
+    with shards_locked(run):
+        run = run_at(run.folder)
+        if not are_over(run):
+            return handed_over(run)
+        with storage_errors(run.folder, "free some disk; `dualtaxi repair` folds its shards in then"):
+            return _fold(run, report)
+
+
+def _fold(run: Run, report: Report) -> Run:
+    fresh = run.folder / f".{RECORDING_FILE}.folding"
+    fresh.unlink(missing_ok=True)
+    with ExitStack() as stack:
+        sources = open_sources(run, stack)
+        if not sources:
+            return run
+        if sources[0].recording.shards:  # it was folded by a process that was killed before it said so
+            text = sources[0].recording.metadata("result").get("json")
+            summary = json_object(text, f"{run.recording}: the result")
+        else:
+            summary = _Fold(run, sources, report).write(fresh)
+    if fresh.exists():
+        fresh.replace(run.folder / RECORDING_FILE)
+    forget_upload(run)
+    facts = {key: value for key, value in run.facts.items() if key != ENDS_AS}
+    summary = {**run.file.summary, **summary}
+    folded = Run(run.folder, facts).update(status=_ending_of_run(run), summary=summary)
+    shutil.rmtree(run.folder / SHARDS_FOLDER)
+    return folded
+
+
+class _Fold:
     """Writes the recordings of several processes into one.
 
     Args:
@@ -70,7 +129,7 @@ class Fold:
         with create_recording(fresh, schema.KINDS[first.kind]) as file:
             file.add_metadata("run", facts)
             for name in first.metadata_names:
-                if name not in _KEPT:
+                if name not in _NOT_COPIED:
                     file.add_metadata(name, first.metadata(name))
             for name, maker in self._own_makers().items():
                 file.add_metadata(f"{SHARD_MAKER}/{name}", maker.to_metadata())
@@ -96,7 +155,7 @@ class Fold:
                 result["rewards_off_table"] = off_table
             if errors := self._errors():
                 result["error"] = truncated_message("; ".join(errors))
-            write_result(file, ending_of_run(self._run), result)
+            write_result(file, _ending_of_run(self._run), result)
             before = self._run.file.summary.seconds or 0.0
             return result | {"seconds": before + round(time.monotonic() - started, 3), "bytes": file.size}
 
@@ -310,7 +369,7 @@ class Fold:
             yield place, encode(topic.message, fields)
 
 
-def ending_of_run(run: Run) -> str:
+def _ending_of_run(run: Run) -> str:
     """Return how a run ended whose processes are gone."""
     status = str(run.facts.get(ENDS_AS) or run.file.status)
     return status if status in ("finished", "failed") else "interrupted"

@@ -20,7 +20,7 @@ from runner.client.outbox import Follower, connect, is_server, outbox_folder
 from runner.config.job import NOT_CONTENT
 from runner.errors import ConfigError, RunnerError, StorageError, truncated_message
 from runner.loops.description import Described
-from runner.loops.folding import OWNER_WAITS, fold_if_over
+from runner.loops.fold import OWNER_WAITS, fold_if_over
 from runner.loops.options import Options
 from runner.loops.outcomes import Outcomes
 from runner.recording import schema

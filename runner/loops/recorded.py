@@ -215,7 +215,7 @@ def _close_abandoned(loop: Loop[R]) -> None:
     loop.close(*(("interrupted", "") if error is None or is_interactive else ending_of(error)))
 
 
-def given(**arguments: object) -> Arguments:
+def without_none(**arguments: object) -> Arguments:
     """Return the arguments that are not None: an environment's `reset` may not have the others."""
     return {name: value for name, value in arguments.items() if value is not None}
 
@@ -243,7 +243,7 @@ class RecordedAlone(Recorded[S]):
         with self._loop.lock:  # another thread may be committing steps
             steps = self._rows.place[0]
         state = self._watch.before(steps) if seed is None else None
-        result: ResetResult = self.env.reset(**given(seed=seed, options=options))
+        result: ResetResult = self.env.reset(**without_none(seed=seed, options=options))
         try:
             state = self._watch.after(state, seed)
             observation, info = result

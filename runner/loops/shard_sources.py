@@ -6,16 +6,24 @@ A unit is a reset of one environment, and the steps that it took up to its next 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
 from typing import Final
 
 import numpy as np
+from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.messages import Message
-from runner.recording.reader import Recording
+from runner.recording.reader import Recording, open_recording
+from runner.recording.repair import DamagedFile
 from runner.recording.schema import STEP_NANOSECONDS
+from runner.runs.run import RECORDING_FILE, Run
+from runner.runs.shards import shards_of
 from runner.util.arrays import Ints, Records
+from runner.util.files import open_regular
 
 PHASES: Final = tuple(schema.PHASES)
 UNIT: Final = np.dtype(
@@ -194,3 +202,34 @@ class Source:
         at = int(np.searchsorted(units["first"][low:high], step, side="right"))
         unit: np.void = units[low + max(at - 1, 0)]
         return unit
+
+
+def open_sources(run: Run, stack: ExitStack) -> list[Source]:
+    """Open what each process of a run recorded; leave out those that joined and recorded nothing.
+
+    Raises:
+        RecordingError: a recording is damaged, and holds messages.
+    """
+    sources: list[Source] = []
+    first = 0
+    for name, part in [("", run), *((shard.run_id, shard) for shard in shards_of(run))]:
+        try:
+            recording = stack.enter_context(open_recording(part.folder / RECORDING_FILE))
+        except RecordingError:
+            if _has_messages(part.folder / RECORDING_FILE):
+                raise
+            continue
+        has_content = any(recording.has_messages(topic.name) for topic in recording.topics if topic.digested)
+        if name and not has_content:
+            continue
+        sources.append(Source(name, recording, len(sources), first, part.facts.get("placed") is True))
+        first += recording.environments
+    return sources
+
+
+def _has_messages(path: Path) -> bool:
+    """Return whether a damaged recording holds any message."""
+    if not path.is_file() or not path.stat().st_size:
+        return False
+    with open_regular(path) as stream:
+        return any(opcode == Opcode.CHUNK for opcode, _, _ in DamagedFile(stream, path).good_records())

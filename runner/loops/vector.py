@@ -21,7 +21,7 @@ from runner.loops.generators import States, VectorWatch
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, vector_maker_of
 from runner.loops.options import RecordOptions, options_of
-from runner.loops.recorded import Recorded, given, require_pictures
+from runner.loops.recorded import Recorded, require_pictures, without_none
 from runner.loops.values import check_phase, frozen_options
 from runner.loops.vector_counts import Flags
 from runner.loops.vector_rows import VectorRows
@@ -140,7 +140,7 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
         which = np.ones(n, np.bool_) if mask is None else np.array(mask, np.bool_)
         seeds = [seed + i for i in range(n)] if isinstance(seed, int) else list(seed or ())
         states = self._watch.before_reset(which, seeds)
-        result = self.env.reset(**given(seed=seed, options=options))
+        result = self.env.reset(**without_none(seed=seed, options=options))
         states = self._watch.after_reset(states, which, seeds)
         try:
             self.record_reset(*result, seeds, which, states, others)

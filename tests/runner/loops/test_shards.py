@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import runner
 from runner.execution.redo import verify_by_redoing
 from runner.execution.verify import verify
-from runner.loops.folding import fold_if_over
+from runner.loops.fold import fold_if_over
 from runner.recording.reader import open_recording
 from runner.runs.listing import run_at
 from runner.runs.shards import shards_of
@@ -312,13 +312,13 @@ def test_a_fold_that_was_killed_is_done_again(tmp_path, monkeypatch):
     rec = runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="fold")
     work(rec.run, "w", 100, 1)
     play(rec, 100, 2)
-    from runner.loops import folding
+    from runner.loops import fold
 
-    real = folding.shutil.rmtree
-    monkeypatch.setattr(folding.shutil, "rmtree", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    real = fold.shutil.rmtree
+    monkeypatch.setattr(fold.shutil, "rmtree", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         rec.close()  # all was written, but the shards are still there
-    monkeypatch.setattr(folding.shutil, "rmtree", real)
+    monkeypatch.setattr(fold.shutil, "rmtree", real)
     (rec.run.folder / ".recording.mcap.folding").write_bytes(b"half")
     run = fold_if_over(run_at(rec.run.folder))
     assert not shards_of(run)
