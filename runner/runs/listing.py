@@ -73,6 +73,18 @@ def run_in(folder: Path) -> Run | None:
     return None
 
 
+def listed_run(folder: Path, run_id: str) -> Run:
+    """Return the run in a folder, which had this id when the folder was listed.
+
+    Raises:
+        RunNotFound: it was removed in the meantime.
+    """
+    run = run_in(folder)
+    if run is None:
+        raise RunNotFound(f"run {run_id} was removed just now.")
+    return run
+
+
 def _is_run(facts: dict[str, object]) -> bool:
     """Return whether facts have the id of a run; the others may be damaged."""
     run_id = facts.get("run_id")

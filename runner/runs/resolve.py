@@ -5,9 +5,8 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from runner.errors import RunNotFound, nearest
 from runner.recording.run_file import RUN_ID, run_title
@@ -17,6 +16,7 @@ from runner.util.values import RUN_NAME_PATTERN
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.index import Index
+    from runner.runs.catalogue.rows import Candidate
 
 LATEST: Final = "@latest"
 """Names the newest run; after a name, the newest run of that name."""
@@ -25,42 +25,6 @@ _MAX_SUGGESTED: Final = 1000
 """The newest runs, whose names are compared with one that was not found."""
 
 Report = Callable[[str], None]
-
-
-def listed_run(folder: Path, run_id: str) -> Run:
-    """Return the run in a folder, which had this id when the folder was listed.
-
-    Raises:
-        RunNotFound: it was removed in the meantime.
-    """
-    run = run_in(folder)
-    if run is None:
-        raise RunNotFound(f"run {run_id} was removed just now.")
-    return run
-
-
-class Candidate(NamedTuple):
-    """A run as the index has it."""
-
-    root: str
-    entry: str
-    run_id: str
-    name: str
-    seed: int | None
-    milliseconds: int
-
-    @property
-    def created(self) -> datetime:
-        """When the run began, in UTC."""
-        return datetime.fromtimestamp(self.milliseconds / 1000, UTC)
-
-    def run(self) -> Run:
-        """Return the run.
-
-        Raises:
-            RunNotFound: it was removed in the meantime.
-        """
-        return listed_run(Path(self.root, self.entry), self.run_id)
 
 
 def find_run(
@@ -133,11 +97,11 @@ def matching(name: str, index: Index, exclude: str = "") -> list[Candidate]:
     """Return the runs that a name, but no path, may stand for, the newest first; `choose` picks one."""
     if not name:
         return []
-    rows = []
+    newest = []
     if name.endswith(LATEST):
-        rows = index.newest(name.removesuffix(LATEST), 2 if exclude else 1)
-    found = [run for run in map(Candidate._make, rows or index.named(name)) if run.run_id != exclude]
-    return found[:1] if rows else found
+        newest = index.newest(name.removesuffix(LATEST), 2 if exclude else 1)
+    found = [run for run in newest or index.named(name) if run.run_id != exclude]
+    return found[:1] if newest else found
 
 
 def of_name(name: str, index: Index) -> list[Candidate]:
@@ -172,7 +136,7 @@ def choose(name: str, candidates: Sequence[Candidate]) -> Candidate:
 
 def not_found(name: str, index: Index, recordings: Path) -> RunNotFound:
     """Return the error for a name that no run matches, with the most similar name."""
-    runs = [Candidate(*row) for row in index.newest(limit=_MAX_SUGGESTED)]
+    runs = index.newest(limit=_MAX_SUGGESTED)
     if not runs:
         return RunNotFound(
             f"no run {name!r}: there are no runs in {recordings} yet. `dualtaxi run` makes one."
@@ -197,7 +161,7 @@ def completions(beginning: str, recordings: Path) -> dict[str, str]:
 
     def work(index: Index) -> dict[str, str]:
         found = {LATEST: "the newest run"} if index.newest() else {}
-        found |= {row[2]: run_title(*row[3:5]) for row in index.with_id_prefix(beginning)}
+        found |= {run.run_id: run_title(run.name, run.seed) for run in index.with_id_prefix(beginning)}
         for name, count in index.names_from(beginning.rpartition("@")[0] or beginning):
             if count == 1:
                 found[name] = "the run of this name"

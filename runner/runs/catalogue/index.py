@@ -21,7 +21,7 @@ from runner.runs.catalogue.columns import SETTING, IndexRow, Kind, field_of, wit
 from runner.runs.catalogue.database import Report, create, index_path, open_index, renew, tuples_of, version
 from runner.runs.catalogue.filters import ANY_RUN, Filter, matches, setting_path
 from runner.runs.catalogue.folders import Folders
-from runner.runs.catalogue.rows import Expression, Row, SqlRow, text
+from runner.runs.catalogue.rows import Candidate, Expression, Row, SqlRow, text
 from runner.runs.run import check_folder_name
 
 Result = TypeVar("Result")
@@ -169,15 +169,12 @@ class Index:
 
         return node(top)
 
-    def named(self, name: str) -> list[SqlRow]:
-        """Return the runs of a name, or whose ids begin with it, the newest first.
-
-        Each is root, entry, id, name, seed and creation (ms).
-        """
+    def named(self, name: str) -> list[Candidate]:
+        """Return the runs of a name, or whose ids begin with it, the newest first."""
         return self._names(_begins(Row.id, name) | (Row.name == text(name)))
 
-    def with_id_prefix(self, beginning: str) -> list[SqlRow]:
-        """Return runs whose ids begin with a text, at most the 1,000 newest, as `named` does."""
+    def with_id_prefix(self, beginning: str) -> list[Candidate]:
+        """Return runs whose ids begin with a text, at most the 1,000 newest."""
         return self._names(_begins(Row.id, beginning), _MAX_VALUES)
 
     def names_from(self, beginning: str) -> list[tuple[str, int]]:
@@ -185,14 +182,14 @@ class Index:
         query = self._of(Filter(_begins(Row.name, beginning)), Row.name, fn.COUNT(Row.entry))
         return [(name, count) for name, count in self._tuples(query.group_by(Row.name).limit(_MAX_VALUES))]
 
-    def newest(self, name: str = "", limit: int = 1) -> list[SqlRow]:
-        """Return the newest runs, of a name if one is given, as `named` does."""
+    def newest(self, name: str = "", limit: int = 1) -> list[Candidate]:
+        """Return the newest runs, of a name if one is given."""
         return self._names(Row.name == text(name) if name else None, limit)
 
-    def _names(self, condition: Expression, limit: int | None = None) -> list[SqlRow]:
+    def _names(self, condition: Expression, limit: int | None = None) -> list[Candidate]:
         columns = (Row.root, Row.entry, Row.id, Row.name, Row.seed, Row.created)
         query = self._of(Filter(condition), *columns).order_by(Row.created.desc(), Row.id.desc())
-        return list(query.limit(limit).tuples().bind(self._database))
+        return [Candidate(*row) for row in query.limit(limit).tuples().bind(self._database)]
 
     def _of(self, chosen: Filter, *columns: Expression) -> Expression:
         known = Row.root.in_(self.roots) & Row.id.is_null(False)

@@ -25,8 +25,8 @@ from runner.runs.catalogue.filters import ANY_RUN, Filter
 from runner.runs.catalogue.index import Index
 from runner.runs.catalogue.rows import Row, row_of
 from runner.runs.catalogue.usage import REMOVED, Contents, belongs, contents_of, strays
+from runner.runs.listing import listed_run
 from runner.runs.locking import locked
-from runner.runs.resolve import listed_run
 from runner.runs.run import Run
 from runner.runs.store import Store
 from runner.util.humanize import listed

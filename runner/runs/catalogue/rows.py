@@ -7,8 +7,10 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
+from datetime import UTC, datetime
 from itertools import islice
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
 from peewee import BigIntegerField, BooleanField, CompositeKey, Field, FloatField, Model, TextField
 
@@ -17,6 +19,7 @@ from runner.recording.metrics import METRICS
 from runner.recording.run_file import EvaluationMetrics
 from runner.runs.branches import origin_in
 from runner.runs.catalogue.columns import COLUMNS, Kind
+from runner.runs.listing import listed_run
 from runner.runs.run import Run
 
 SEEDS: Final = 2**64
@@ -192,3 +195,27 @@ def _flat(value: object, path: str = "", depth: int = 0) -> Iterator[tuple[str, 
         yield path, text(value)
     elif value is None or isinstance(value, bool) or number(value) is not None:
         yield path, value
+
+
+class Candidate(NamedTuple):
+    """A run as the index has it."""
+
+    root: str
+    entry: str
+    run_id: str
+    name: str
+    seed: int | None
+    milliseconds: int
+
+    @property
+    def created(self) -> datetime:
+        """When the run began, in UTC."""
+        return datetime.fromtimestamp(self.milliseconds / 1000, UTC)
+
+    def run(self) -> Run:
+        """Return the run.
+
+        Raises:
+            RunNotFound: it was removed in the meantime.
+        """
+        return listed_run(Path(self.root, self.entry), self.run_id)
