@@ -12,7 +12,7 @@ from runner.analysis.diff import can_compare_steps
 from runner.analysis.diff.causes import find_cause
 from runner.analysis.diff.divergence import training_divergence
 from runner.analysis.diff.sections import where_in_words
-from runner.analysis.diff.updates import Update, replay_to
+from runner.analysis.diff.updates import replay_to
 from runner.archive.places import at_hand
 from runner.config import from_mapping
 from runner.config.job import Job, identity_of
@@ -24,11 +24,13 @@ from runner.errors import RunnerError
 from runner.execution.session import run_job
 from runner.recording import schema
 from runner.recording.labels import Labels
-from runner.recording.reader import Recording, open_recording
+from runner.recording.reader import open_recording
 from runner.runs.catalogue.removal import plan, remove
 from runner.runs.listing import list_runs
 from runner.runs.run import UNLISTED, Run, new_run
 
+Place = tuple[int, int, int]
+"""A training step: its number, its episode and its t."""
 _EPISODES: Final = (100, 1000, 10_000)
 """Training episodes in which the step is looked for, one after the other."""
 
@@ -80,9 +82,11 @@ def first_step(
                         _discard(run, folder)
                         raise KeyboardInterrupt("what was trained is kept")
                 runs.append(run)
-            found = _found(runs[0], runs[1], setting, what)
-            if found.sentences:
-                return found
+            without, changed = runs
+            place, sentences = _difference(without, changed, what)
+            if sentences:
+                step, episode, t = place or (None, None, None)
+                return FirstStep(setting, without.run_id, changed.run_id, step, episode, t, sentences)
             for run in runs:
                 made.pop(identity_of(run.file.config, run.seed), None)
                 _discard(run, folder)
@@ -98,50 +102,37 @@ def _discard(run: Run, folder: Path) -> None:
         remove(plan(run, folder))
 
 
-def _found(before: Run, after: Run, setting: str, what: str) -> FirstStep:
-    """Return where two runs differ first; without a step and sentences if they do not."""
+def _difference(before: Run, after: Run, what: str) -> tuple[Place | None, tuple[str, ...]]:
+    """Return where two runs differ first, and what is known of it; no sentences if they do not differ."""
     with (
         open_recording(at_hand(before).recording) as a,
         open_recording(at_hand(after).recording) as b,
     ):
         if not can_compare_steps(a, b):
-            text = f"{what} changes the states or actions, so that no steps can be compared."
-            return FirstStep(setting, before.run_id, after.run_id, None, None, None, (text,))
-        divergence, sentences, update = training_divergence(a, b), [], None
+            return None, (f"{what} changes the states or actions, so that no steps can be compared.",)
+        divergence, sentences = training_divergence(a, b), []
         if divergence is not None and divergence.a_step is not None and divergence.b_step is not None:
             cause = find_cause(divergence, a, b)
-            sentences = [f"Training diverges {where_in_words(divergence)}: {cause.text}."]
-            update = cause.update
-            if update is None:
-                place = divergence.step, divergence.episode, divergence.t
-                return _at(place, setting, before, after, what, sentences)
+            sentences.append(f"Training diverges {where_in_words(divergence)}: {cause.text}.")
+            update, place = cause.update, (divergence.step, divergence.episode, divergence.t)
+        elif a.agents == b.agents:  # the first update that differs though all steps are the same
+            steps = min(recording.count(schema.TRAIN_STEP) for recording in (a, b))
+            update = replay_to(a, b, steps)[1]
         else:
-            update = _other_update(a, b)
-        if update is None:
-            return FirstStep(setting, before.run_id, after.run_id, None, None, None, ())
-        record = next(a.blocks(schema.TRAIN_STEP, update.step, update.step + 1))[0]
-        place = update.step, update.episode, int(record["t"])
-        own = [
-            f"{spoken(update.agent)}'s value of {update.action} in the state ({update.state}) became "
-            f"{update.b:.6g} instead of {update.a:.6g}: {'; '.join(update.reasons)}."
-        ]
-        return _at(place, setting, before, after, what, [*own, *sentences])
-
-
-def _at(
-    place: tuple[int, int, int], setting: str, before: Run, after: Run, what: str, sentences: list[str]
-) -> FirstStep:
+            update = None
+        if update is not None:
+            record = next(a.blocks(schema.TRAIN_STEP, update.step, update.step + 1))[0]
+            place = update.step, update.episode, int(record["t"])
+            sentences.insert(
+                0,
+                f"{spoken(update.agent)}'s value of {update.action} in the state ({update.state}) became "
+                f"{update.b:.6g} instead of {update.a:.6g}: {'; '.join(update.reasons)}.",
+            )
+        if not sentences:
+            return None, ()
     step, episode, t = place
     first = (
         f"{what} first changed an update at training step {step:,}, in episode {episode:,} at t = {t} "
         f"(runs {before.run_id} without it and {after.run_id} with it, which are recorded)."
     )
-    return FirstStep(setting, before.run_id, after.run_id, step, episode, t, (first, *sentences))
-
-
-def _other_update(a: Recording, b: Recording) -> Update | None:
-    """Return the first update that differs though all steps are the same; None if there is none."""
-    steps = min(recording.count(schema.TRAIN_STEP) for recording in (a, b))
-    if a.agents != b.agents:
-        return None
-    return replay_to(a, b, steps)[1]
+    return place, (first, *sentences)
