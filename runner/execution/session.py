@@ -108,9 +108,9 @@ def run_job(
         file = create_recording(run.folder / runs.RECORDING_FILE)
     with file:
         with _failing(run):
-            made_by = provenance_entries(with_command=job.config.recording.code)
-            describe(file, job, run, learner, made_by)
-            run = run.update(provenance={key: made_by[key] for key in runs.MADE_BY if key in made_by})
+            provenance = provenance_entries(with_command=job.config.recording.code)
+            describe(file, job, run, learner, provenance)
+            run = run.update(provenance=runs.made_by(provenance))
         beat = code.beat(run, file)
         recorder = recorder_for(job, learner, file, beat=beat, threads=threads, packed=packed)
         return execute(Session(job, learner, recorder, report, stop, observer), file, run, started, code)

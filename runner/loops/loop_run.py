@@ -34,12 +34,11 @@ from runner.recording.recorder import Recorder
 from runner.recording.schema import Topic
 from runner.recording.syncing import SYNCER
 from runner.recording.writer import create_recording
-from runner.runs import run as runs
 from runner.runs.code import CodeCollector
 from runner.runs.listing import run_at
 from runner.runs.provenance import provenance_entries
 from runner.runs.redaction import LineRedactor
-from runner.runs.run import RECORDING_FILE, Run, new_run, recordings_folder, unless_empty
+from runner.runs.run import RECORDING_FILE, Run, made_by, new_run, recordings_folder, unless_empty
 from runner.runs.shards import RUN_VARIABLE, new_shard
 from runner.util.values import JsonView
 
@@ -59,9 +58,8 @@ class LoopRun:
         self._is_described = False
         self.is_settled = not can_widen(described.action)
         """Whether the dtypes of all values are known."""
-        self._made_by = provenance_entries(with_command=options.packing.code)
-        made_by = {key: self._made_by[key] for key in runs.MADE_BY if key in self._made_by}
-        facts = {"provenance": made_by, "spaces": described.common}
+        self._provenance = provenance_entries(with_command=options.packing.code)
+        facts = {"provenance": made_by(self._provenance), "spaces": described.common}
         self.run = self._new_run(outbox_folder() if client else None, facts)
         self._code = CodeCollector(self.run.folder.parent, options.packing.code and not is_shard)
         path = self.run.folder / RECORDING_FILE
@@ -155,7 +153,7 @@ class LoopRun:
         if not self._is_described:
             self._is_described = self.is_settled = True
             environment = self.described.attachments(), self._maker
-            write_description(self._file, self._facts, self._config, self._made_by, *environment)
+            write_description(self._file, self._facts, self._config, self._provenance, *environment)
 
     def settle(self, action: object) -> bool:
         """Fix the dtype of all actions by the first one; return whether it is not the space's own."""

@@ -26,7 +26,7 @@ from runner.runs.checkpoints import read_checkpoints
 from runner.runs.listing import run_at
 from runner.runs.locking import locked
 from runner.runs.resolve import run_with_id
-from runner.runs.run import MADE_BY, PREVIEW, RECORDING_FILE, RUN_FILE, Run, new_run_id
+from runner.runs.run import PREVIEW, RECORDING_FILE, RUN_FILE, Run, made_by, new_run_id
 from runner.runs.store import Store
 from runner.util.files import storage_errors, sync, write_object
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN, Json, JsonView
@@ -177,7 +177,7 @@ def checked_facts(recording: Recording, details: JsonView) -> Json:
     try:
         facts = run_facts(recording, details)
         problems = parse_run_file(facts).problems
-        made_by = recording.provenance
+        provenance = made_by(recording.provenance)
     except (ValueError, TypeError, KeyError) as error:
         raise RecordingError(f"{recording.path}: its description of the run is invalid ({error}).") from error
     if problems:
@@ -190,7 +190,7 @@ def checked_facts(recording: Recording, details: JsonView) -> Json:
             f"{recording.path}: found the run {facts['run_id'][:100]!r} ({facts['name'][:100]!r}, seed "
             f"{facts['seed']}), expected an id of {NAME_EXPECTED}; a seed of 64 bits."
         )
-    return facts | {"provenance": {key: made_by[key] for key in MADE_BY if key in made_by}}
+    return facts | {"provenance": provenance}
 
 
 def _existing_run(target: Path) -> Run | None:

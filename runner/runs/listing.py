@@ -9,7 +9,7 @@ from typing import Final
 
 from runner.errors import RecordingError, RunNotFound, StorageError
 from runner.recording.run_file import RUN_ID
-from runner.runs.run import MADE_BY, RECORDING_FILE, RUN_FILE, Run, recordings_folder
+from runner.runs.run import RECORDING_FILE, RUN_FILE, Run, made_by, recordings_folder
 from runner.util.files import read_object
 
 MAX_RUN_FILE_BYTES: Final = 8 << 20
@@ -97,8 +97,7 @@ def _from_recording(path: Path) -> Run:
     with open_recording(path) as recording:
         facts = {**recording.run_facts(), "recording": path.name}
         with contextlib.suppress(RecordingError):
-            made_by = recording.provenance
-            facts["provenance"] = {key: made_by[key] for key in MADE_BY if key in made_by}
+            facts["provenance"] = made_by(recording.provenance)
     if not _is_run(facts):
         raise RecordingError(f"{path}: is damaged: its description of the run is invalid.")
     return Run(path.parent, facts)

@@ -43,8 +43,7 @@ SHARDS_FOLDER: Final = "shards"
 """The folder, in that of a run, of what processes that joined it record until the run is over."""
 UNLISTED: Final = Path(".explain", "runs")
 """The folder, in that of recordings, of runs that are found by their ids alone: those of explanations."""
-MADE_BY: Final = ("host", "git", "dualtaxi")
-"""The provenance in `run.json`; the recording has all of it."""
+_MADE_BY: Final = ("host", "git", "dualtaxi")
 RECORDINGS_VARIABLE: Final = "DUALTAXI_RECORDINGS"
 
 _ID_ALPHABET: Final = "abcdefghjkmnpqrstvwxyz23456789"
@@ -324,6 +323,11 @@ def unless_empty(run: Run) -> Iterator[None]:
             shutil.rmtree(run.folder, ignore_errors=True)
             error.add_note(f"Nothing was recorded; the empty run {run.run_id} was removed.")
         raise
+
+
+def made_by(provenance: Mapping[str, str]) -> dict[str, str]:
+    """Return the provenance that `run.json` has; the recording has all of it."""
+    return {key: provenance[key] for key in _MADE_BY if key in provenance}
 
 
 def recordings_folder(chosen: str | os.PathLike[str] | None = None) -> Path:
