@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import stat
 import sys
 import sysconfig
 import threading
@@ -27,6 +26,7 @@ from runner.runs.git import GIT_SECONDS, NotRecorded, Repository, read_repositor
 from runner.runs.provenance import is_code_wanted
 from runner.runs.redaction import is_secret_name, redacted_text
 from runner.runs.run import Run
+from runner.util.files import open_regular
 from runner.util.values import as_utf8
 
 MAX_FILE_BYTES: Final = 256 << 10
@@ -73,19 +73,14 @@ class _Sources:
             self.left_out.append(path)
             return
         try:
-            descriptor = os.open(
-                root / path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
-            )
-            with os.fdopen(descriptor, "rb") as stream:
-                about = os.fstat(descriptor)
-                if not stat.S_ISREG(about.st_mode):
-                    return
-                if about.st_size > min(self.budget, MAX_FILE_BYTES):
-                    self.left_out.append(f"{path} ({about.st_size:,} bytes)")
+            with open_regular(root / path, follow_link=False) as stream:
+                size = os.fstat(stream.fileno()).st_size
+                if size > min(self.budget, MAX_FILE_BYTES):
+                    self.left_out.append(f"{path} ({size:,} bytes)")
                     return
                 data = stream.read(MAX_FILE_BYTES + 1)
         except OSError:
-            return  # it was removed, is a link, or may not be read
+            return  # it was removed, is a link or a pipe, or may not be read
         if b"\0" not in data:
             self.add(path, data.decode(errors="replace"))
 
@@ -144,12 +139,10 @@ class CodeCollector:
     def made_by(self, run: Run) -> dict[str, str]:
         """Return the provenance in `run.json`, with the commit if it is known."""
         found = run.facts.get("provenance")  # of a resumed run, whose file may hold anything
-        own = (
-            {key: text for key, text in found.items() if isinstance(text, str)}
-            if isinstance(found, dict)
-            else {}
-        )
-        return own | {key: self.entries[key] for key in ("git",) if key in self.entries}
+        own = found.items() if isinstance(found, dict) else ()
+        return {key: text for key, text in own if isinstance(text, str)} | {
+            key: self.entries[key] for key in ("git",) if key in self.entries
+        }
 
     def write(self, file: RecordingFile, wait: bool = False) -> None:
         """Write the code into a recording, once, if it is known; nothing else may write into it meanwhile.

@@ -36,15 +36,16 @@ def cache_folder() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "dualtaxi"
 
 
-def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
-    """Return a regular file, opened for reading; a link is followed.
+def open_regular(path: str | os.PathLike[str], follow_link: bool = True) -> BinaryIO:
+    """Return a regular file, opened for reading.
 
     Anything else is refused: opening a pipe would wait for its writer, and a device never ends.
 
     Raises:
         OSError: it cannot be read, or is not a regular file.
     """
-    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | _BINARY)
+    flags = getattr(os, "O_NONBLOCK", 0) | (0 if follow_link else getattr(os, "O_NOFOLLOW", 0))
+    descriptor = os.open(path, os.O_RDONLY | flags | _BINARY)
     if stat.S_ISREG(os.fstat(descriptor).st_mode):
         return os.fdopen(descriptor, "rb")
     os.close(descriptor)
