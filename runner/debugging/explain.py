@@ -22,10 +22,7 @@ from blake3 import blake3
 
 from runner.config import ExperimentConfig, from_mapping, load
 from runner.config.shipped import shipped
-from runner.debugging.explanation import (
-    Explanation,
-    Side,
-)
+from runner.debugging.explanation import Explanation, Side
 from runner.debugging.explanation_files import FOLDER, LOCK, write_explanation
 from runner.debugging.factors import MAX_ALL, Mixing, mix
 from runner.debugging.first_step import first_step

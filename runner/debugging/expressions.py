@@ -149,10 +149,7 @@ class Parser:
     def _span(self, node: ast.expr) -> tuple[int, int]:
         """Return where the text of a node begins and ends, in characters; the parser counts bytes."""
         data = self.text.encode()
-        return (
-            len(data[: node.col_offset].decode()),
-            len(data[: node.end_col_offset].decode()),
-        )
+        return len(data[: node.col_offset].decode()), len(data[: node.end_col_offset].decode())
 
     def _error(self, start: int, end: int, message: str) -> RunnerError:
         marks = " " * start + "^" * max(end - start, 1)
@@ -307,16 +304,15 @@ class Parser:
                 raise self.error(node, f"found {what} {given}, expected one of 0 to {len(names) - 1}.")
             return value
         if constant is not node or not isinstance(value, str):
-            raise self.error(
-                node,
-                f"found {self.text_of(node)}, expected a whole number or a name of {_article(what)} {what}.",
-            )
+            article = "an" if what == "action" else "a"
+            found = self.text_of(node)
+            raise self.error(node, f"found {found}, expected a whole number or a name of {article} {what}.")
         wanted = _plain(value)
-        found = [k for k, name in enumerate(names) if _plain(name) == wanted]
-        if len(found) == 1:
-            return found[0]
-        if found:
-            raise self.error(node, f"found a name of {len(found)} {what}s, expected a number.")
+        named = [k for k, name in enumerate(names) if _plain(name) == wanted]
+        if len(named) == 1:
+            return named[0]
+        if named:
+            raise self.error(node, f"found a name of {len(named)} {what}s, expected a number.")
         parts = names[0].count(" + ") + 1
         hint = nearest(value, names) or nearest(" + ".join([value] * parts), names)
         raise self.error(
@@ -338,10 +334,6 @@ def _is_text(node: ast.expr) -> bool:
 def _plain(name: str) -> str:
     """Return a name of a state or action in one spelling."""
     return spoken(" + ".join(part.strip() for part in name.split("+")))
-
-
-def _article(what: str) -> str:
-    return "an" if what[0] in "aeiou" else "a"
 
 
 def _called(node: ast.expr) -> str:

@@ -162,6 +162,9 @@ def sections_of(found: Why) -> list[Section]:
     off = "It equals the table's value."
     if found.total != found.value:
         off = f"It differs from the table's value by {abs(found.total - found.value):.1g}, by rounding."
+    headings = ("step", "state", "action", "reward", *columns, "steps away")
+    steps = [_step(part, cells(part)) for part in found.steps]
+    none = [] if steps else ["No reward adds to the value or takes from it."]
     episodes = [part for part in found.episodes if part.weight or part.contribution]
     without = len(found.episodes) - len(episodes)
     left_out = (
@@ -171,18 +174,7 @@ def sections_of(found: Why) -> list[Section]:
         Section(
             "The sum", [off, EXPLANATION, *([found.note] if found.note else [])], [Grid(("", *columns), sums)]
         ),
-        Section(
-            "The steps that add or take most",
-            [] if found.steps else ["No reward adds to the value or takes from it."],
-            [
-                Grid(
-                    ("step", "state", "action", "reward", *columns, "steps away"),
-                    [_step(part, cells(part)) for part in found.steps],
-                )
-            ]
-            if found.steps
-            else [],
-        ),
+        Section("The steps that add or take most", none, [Grid(headings, steps)] if steps else []),
         Section("By reward", [], [Grid(("reward", "events", *columns), rewards)]),
         Section(
             "By episode",

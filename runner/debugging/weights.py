@@ -138,7 +138,6 @@ def _updates(
         first = replay.step
         updates = replay.updates(min(first + STEPS_AT_ONCE, stop), learner)
         episodes = updates["episode"]
-        # Compiled code uses the numbers of episodes as indices.
         if episodes[0] < episode or (episodes[1:] < episodes[:-1]).any():
             raise RecordingError(
                 f"{recording.path}: found decreasing numbers of episodes from training step {first} on; "

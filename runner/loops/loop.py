@@ -68,9 +68,9 @@ class Loop(Generic[R]):
         make_rows: Callable[[Recorder, Described, str, Callable[[object], None]], R],
         batch: tuple[int, ...] = (),
     ) -> None:
-        self._opened = LoopRun(described, options, maker)
-        self.started = self._opened.started
-        self._recorder = self._opened.recorder
+        self._loop_run = LoopRun(described, options, maker)
+        self.started = self._loop_run.started
+        self._recorder = self._loop_run.recorder
         self._make_rows = make_rows
         self._rows: dict[str, R] = {}
         self.active: R | None = None
@@ -89,7 +89,7 @@ class Loop(Generic[R]):
         self.messages = Messages(
             self,
             self._recorder,
-            self._opened.outcomes,
+            self._loop_run.outcomes,
             options,
             {topic.name: topic for topic in schema.KINDS[described.kind]},
             options.join.folder if options.join else self.run.folder,
@@ -99,16 +99,16 @@ class Loop(Generic[R]):
     @property
     def run(self) -> Run:
         """The run, or the shard of the run that is joined."""
-        return self._opened.run
+        return self._loop_run.run
 
     @property
     def described(self) -> Described:
         """The environment and its spaces."""
-        return self._opened.described
+        return self._loop_run.described
 
     def _first_action(self, action: object) -> None:
         """Record all actions in the dtype of the first one, if the space's own cannot hold it exactly."""
-        if self._opened.settle(action):
+        if self._loop_run.settle(action):
             for rows in self._rows.values():
                 rows.reshape(self.described)
 
@@ -126,7 +126,7 @@ class Loop(Generic[R]):
         """Note how the environment of a phase was made, if it is another one than the first."""
         with self.lock:
             if not self.closed:
-                self._opened.own_makers[phase] = maker
+                self._loop_run.own_makers[phase] = maker
 
     def activate(self, rows: R) -> None:
         """Record the next steps in these rows. The caller holds the lock."""
@@ -206,7 +206,7 @@ class Loop(Generic[R]):
                     "expected a process that only evaluates or logs."
                 )
             if "placed" not in self.run.facts:
-                self._opened.run = self.run.update(placed=True)
+                self._loop_run.run = self.run.update(placed=True)
             taken["elsewhere"] = steps
 
     def records(self) -> bool:
@@ -277,10 +277,10 @@ class Loop(Generic[R]):
                 self._commit()
                 self.extras.finish()
                 off_table = sum(rows.off_table for rows in self._rows.values())
-                summary = self._opened.finish(status, error, off_table)
+                summary = self._loop_run.finish(status, error, off_table)
             except BaseException as failure:
                 reason = truncated_message(self._failure or failure)
-                self._opened.abandon(reason)
+                self._loop_run.abandon(reason)
                 if self.options.on_error == "raise" or not isinstance(failure, Exception):
                     raise
                 if not self._failure:
@@ -289,22 +289,22 @@ class Loop(Generic[R]):
             finally:
                 self.closed, self.active = True, None
                 self._rows.clear()
-                self._opened.close_file()
+                self._loop_run.close_file()
             try:
-                self._opened.write_status(status, summary)
+                self._loop_run.write_status(status, summary)
             except StorageError as failure:
                 if self.options.on_error == "raise":
                     raise
                 self.warn_once(f"run {self.run.run_id}: its status could not be written: {failure}")
         try:
-            self._opened.fold()
+            self._loop_run.fold()
         except RunnerError as failure:
             run = self.options.join or self.run
             warn_user(
                 f"run {run.run_id}: what its processes recorded was not put together: {failure} All of it is "
                 f"kept in {run.folder}; `dualtaxi show {run.run_id}` tries again."
             )
-        self._opened.finish_following()
+        self._loop_run.finish_following()
         return self.run
 
     def _commit(self) -> None:
@@ -313,7 +313,7 @@ class Loop(Generic[R]):
             rows.commit()
         self.extras.commit()
         self.messages.commit()
-        self._opened.commit()
+        self._loop_run.commit()
 
     def flush(self) -> bool:
         """Write what is half a second old, also while the loop does something else.
@@ -329,7 +329,7 @@ class Loop(Generic[R]):
             age = time.monotonic() - self.started
             if age < FLUSH_SECONDS:
                 return True
-            if not self._opened.is_settled and not self.messages.has_logged and age < _UNDECIDED_SECONDS:
+            if not self._loop_run.is_settled and not self.messages.has_logged and age < _UNDECIDED_SECONDS:
                 self.run.beat()  # the description waits for the dtype of the first action
                 return True
             self._commit()

@@ -158,7 +158,7 @@ class ArrayRows(BlockRows):
         """Put down a step."""
         row = self.filled
         if not row:
-            require_reset(self._reset_count + len(self._reset_rows), self._phase)
+            require_reset(self.resets, self._phase)
         try:
             reward = float(reward)
         except (TypeError, ValueError):
@@ -213,7 +213,7 @@ class AgentRows(BlockRows):
         over: bool,
     ) -> None:
         """Put down a step; agents that are missing took no part in it."""
-        require_reset(self._reset_count + len(self._reset_rows), self._phase)
+        require_reset(self.resets, self._phase)
         if not self._is_settled:
             self._is_settled = True
             self._first_action(actions)
@@ -265,7 +265,7 @@ class VariableRows(Rows):
     ) -> None:
         """Put down a step."""
         row, reward = self.filled, lone_number(reward, "reward")
-        require_reset(self._reset_count, self._phase)
+        require_reset(self.resets, self._phase)
         if not self._is_settled:
             self._is_settled = True
             self._first_action(action)

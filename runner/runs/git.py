@@ -107,15 +107,8 @@ def read_repository(
             known = {*text.split("\0"), *repository.untracked}
             repository.untracked += [path for path in paths if path not in known]
         if repository.commit and repository.changed:
-            options = (
-                "--no-color",
-                "--no-ext-diff",
-                "--no-textconv",
-                _IGNORE_SUBMODULES,
-                "-U3",
-                "--no-renames",
-            )
-            repository.patch = git.run("diff", *options, "HEAD", "--", limit=MAX_PATCH_BYTES)
+            options = ("--no-color", "--no-ext-diff", "--no-textconv", "-U3", "--no-renames", "HEAD", "--")
+            repository.patch = git.run("diff", _IGNORE_SUBMODULES, *options, limit=MAX_PATCH_BYTES)
     except NotRecorded as problem:
         repository.problems.append(str(problem))
     return repository

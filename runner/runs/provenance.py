@@ -37,17 +37,8 @@ VARIABLES: Final = (
     *("CUDA_*", "CUBLAS_*", "CUDNN_*", "NVIDIA_*", "NCCL_*", "ROCR_*", "HIP_*", "HSA_*", "TPU_*"),
     *("TORCH_*", "TORCHINDUCTOR_*", "PYTORCH_*", "XLA_*", "JAX_*", "TF_XLA_*", "TF_CUDNN_*", "LIBTPU_*"),
     *("TF_DETERMINISTIC_OPS", "TF_ENABLE_ONEDNN_OPTS", "TF_FORCE_GPU_ALLOW_GROWTH"),
-    *(
-        "RANK",
-        "LOCAL_RANK",
-        "WORLD_SIZE",
-        "MUJOCO_GL",
-        "PYOPENGL_PLATFORM",
-        "SDL_VIDEODRIVER",
-        "LC_ALL",
-        "LANG",
-        "TZ",
-    ),
+    *("RANK", "LOCAL_RANK", "WORLD_SIZE", "MUJOCO_GL", "PYOPENGL_PLATFORM", "SDL_VIDEODRIVER"),
+    *("LC_ALL", "LANG", "TZ"),
     *("SLURM_JOB_ID", "SLURM_PROCID", "SLURM_NTASKS", "SLURM_CPUS_PER_TASK", "SLURM_JOB_PARTITION"),
     *("KUBERNETES_SERVICE_HOST", "RAY_ADDRESS", "DUALTAXI_CODE"),
 )
@@ -60,13 +51,8 @@ _TORCH_FLAGS: Final = {
     "seed": "initial_seed",
 }
 _JAX_FLAGS: Final = (
-    *(
-        "jax_enable_x64",
-        "jax_default_matmul_precision",
-        "jax_default_prng_impl",
-        "jax_threefry_partitionable",
-    ),
-    *("jax_disable_jit", "jax_platforms", "jax_numpy_dtype_promotion"),
+    *("jax_enable_x64", "jax_default_matmul_precision", "jax_default_prng_impl"),
+    *("jax_threefry_partitionable", "jax_disable_jit", "jax_platforms", "jax_numpy_dtype_promotion"),
 )
 _CONTAINERS: Final = re.compile(r"docker|podman|kubepods|containerd|lxc|garden")
 _INSTALLED: Final = re.compile(r"(?P<name>[^-]+)-(?P<version>[^-]+)(?:-py[\d.]+)?\.(?:dist-info|egg-info)")

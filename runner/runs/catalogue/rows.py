@@ -115,6 +115,7 @@ def row_of(run: Run, size: int | None) -> dict[str, object]:
     last, recent = summary.last_evaluation or EvaluationMetrics(), summary.recent_training
     done = summary if summary.episodes is not None else {**_recorded(run), **summary}
     episodes, train, evaluation = (done.get(key) for key in ("episodes", "train_steps", "eval_steps"))
+    logged = islice(summary.logged.items(), _LOGGED)
     config_name, environment, origin = text(config.get("name")), config.get("env"), origin_in(config)
     return {
         "id": run.run_id,
@@ -134,13 +135,7 @@ def row_of(run: Run, size: int | None) -> dict[str, object]:
         "eval_steps": evaluation,
         **{metric.name: last.values.get(metric.name) for metric in METRICS},
         **({} if summary.last_evaluation or not recent else {"mean_return": recent.mean_return}),
-        "logged": json.dumps(
-            {
-                name: value
-                for name, value in islice(summary.logged.items(), _LOGGED)
-                if text(name, _NAME) == name
-            }
-        ),
+        "logged": json.dumps({name: value for name, value in logged if text(name, _NAME) == name}),
         "seconds": summary.seconds,
         "bytes": size,
         "digest": summary.content_digest,
