@@ -45,6 +45,7 @@ require_tested("ray", "rllib", ("2.60", "2.60"))
 from ray.rllib.algorithms.algorithm import Algorithm  # noqa: E402
 from ray.rllib.callbacks.callbacks import RLlibCallback  # noqa: E402
 from ray.rllib.env.vector.vector_multi_agent_env import VectorMultiAgentEnv  # noqa: E402
+from ray.tune.registry import ENV_CREATOR, _global_registry  # noqa: E402
 
 _RESULTS: Final = ("training_iteration", "env_runners", "learners", "evaluation")
 """What is logged of an iteration's result, in this order: plots and pages show the first names."""
@@ -293,12 +294,19 @@ def _described(make: str, env_runner: Any) -> tuple[Described, EnvironmentMaker]
 
 
 def _game(env_runner: Any, env: object) -> MultiAgent:
-    """Return an environment of several agents as a game, with the arguments of its class if it is known."""
+    """Return an environment of several agents as a game, with the class or registered function that made it.
+
+    RLlib calls either with `env_config`, which a recording has to name.
+    """
     kind = env_runner.config.env
-    if not isinstance(kind, type):
-        return MultiAgent(env, kind if isinstance(kind, str) else None)
-    parameter = next(iter(inspect.signature(kind).parameters), "config")
-    return MultiAgent(env, arguments={parameter: dict(env_runner.config.env_config)})
+    name = kind if isinstance(kind, str) else None
+    creator = kind
+    if name is not None and _global_registry.contains(ENV_CREATOR, name):
+        creator = _global_registry.get(ENV_CREATOR, name)
+    first = next(iter(inspect.signature(creator).parameters.values()), None) if callable(creator) else None
+    if first is None or first.kind not in (first.POSITIONAL_OR_KEYWORD, first.KEYWORD_ONLY):
+        return MultiAgent(env, name)
+    return MultiAgent(env, name, creator, {first.name: dict(env_runner.config.env_config)})
 
 
 def _why_not_joined(join: _Join, env_runner: object) -> str:

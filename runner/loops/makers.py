@@ -208,16 +208,20 @@ def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
         is_converted = getattr(outer, "env", None) is None and hasattr(outer, "aec_env")
         if outer is not base and not (has_function and (is_converted or is_in_turns)):
             foreign.append(outer)
-        if foreign:
+        if foreign and not is_of_rllib:
             raise CannotBeMade(f"the wrapper {class_name(foreign[0])} does not record its arguments")
         arguments = env.arguments if is_of_rllib else getattr(base, "_ezpickle_kwargs", None)
-        if is_of_rllib and arguments is None:
-            raise CannotBeMade("a function that is registered with RLlib made it")
+        if is_of_rllib and env.creator is None:
+            raise CannotBeMade("it is not known what made it")
         if arguments is None:
             assumed = default_arguments(type(base), ())
         elif getattr(base, "_ezpickle_args", ()):
             arguments = inspect.signature(type(base)).bind(*base._ezpickle_args, **arguments).arguments
-        entry_point = f"{module}:{function}" if has_function else entry_point_of(type(base))
+        if is_of_rllib:
+            entry_point = entry_point_of(env.creator)
+            top = top_package(entry_point)
+        else:
+            entry_point = f"{module}:{function}" if has_function else entry_point_of(type(base))
         kwargs = plain_kwargs(arguments or {}, f"the game {class_name(base)}")
     except CannotBeMade as reason:
         return _with_versions(maker, [top], reason)

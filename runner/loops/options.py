@@ -165,7 +165,7 @@ def options_of(
     options: Arguments = dict(given)
     if unknown := sorted(set(options) - {*valid}):
         names = [name for name in valid if name != "run_id"]
-        hint = nearest(unknown[0], (*names, *_ARGUMENTS))
+        hint = "" if unknown[0] in _ARGUMENTS else nearest(unknown[0], (*names, *_ARGUMENTS))
         raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {', '.join(names)}.{hint}")
     packing: Arguments = {name: options[name] for name in PACKING if name in options}
     if options.get("steps") == "actions":  # an index of messages would take more than they do

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from runner.environments.gym_types import Space
@@ -114,14 +114,19 @@ class MultiAgent:
     Args:
         env: a `MultiAgentEnv`, which may have wrappers of Gymnasium.
         name: its name; that of its class unless given.
-        arguments: of its class, if they are known.
+        creator: the class or function that made it, if it is known.
+        arguments: with which that was called.
     """
 
     def __init__(
-        self, env: Any, name: str | None = None, arguments: Mapping[str, object] | None = None
+        self,
+        env: Any,
+        name: str | None = None,
+        creator: Callable[..., object] | None = None,
+        arguments: Mapping[str, object] | None = None,
     ) -> None:
         self.env = env
-        self.arguments = arguments
+        self.creator, self.arguments = creator, arguments
         self.unwrapped = env.unwrapped
         agents = self.unwrapped.possible_agents
         self.possible_agents = sorted(agents, key=lambda agent: (isinstance(agent, str), agent))

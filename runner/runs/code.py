@@ -148,7 +148,8 @@ class CodeCollector:
         """Write the code into a recording, once, if it is known; nothing else may write into it meanwhile.
 
         Args:
-            wait: wait for it, up to `WAIT_SECONDS` after the start; then write that it is not known.
+            wait: wait for it, up to `WAIT_SECONDS` after the start; then write that it is not known, except
+                for commit, branch and remote if these are.
         """
         if not self._is_wanted or self.entries:
             return
@@ -158,7 +159,11 @@ class CodeCollector:
         if found is None:
             if not wait:
                 return
-            found = RecordedCode({"code.not_recorded": f"reading it took more than {WAIT_SECONDS:g} s"})
+            entries = {"code.not_recorded": f"reading it took more than {WAIT_SECONDS:g} s"}
+            if commit := _recent.commit(self._deadline - WAIT_SECONDS):
+                missing = f"what differs from the commit: reading it took more than {WAIT_SECONDS:g} s"
+                entries |= commit | {"git.not_recorded": missing}
+            found = RecordedCode(entries)
         try:
             file.add_metadata(CODE_RECORD, found.entries)
             self.entries = found.entries  # from here on it is not tried again
@@ -181,6 +186,8 @@ class _Recent:
         self.read_at = 0.0
         self.code = RecordedCode({})
         self.recordings = Path()
+        self._commit: tuple[float, dict[str, str]] = 0.0, {}
+        """When commit, branch and remote of the code that is being read were known, and their entries."""
 
     def unlock(self) -> None:
         """Replace the lock, in a forked process."""
@@ -201,11 +208,20 @@ class _Recent:
         with self.lock:
             if (found := self.fresh(cells, recordings)) is not None:
                 return found
-            code = collect(folder, script, cells, recordings)
+            self._commit = 0.0, {}
+            code = collect(folder, script, cells, recordings, self._note_commit)
             # In this order: `fresh` is called without the lock.
             self.key, self.code, self.recordings = (), code, recordings
             self.key, self.read_at = key, time.monotonic()
             return code
+
+    def _note_commit(self, entries: dict[str, str]) -> None:
+        self._commit = time.monotonic(), entries
+
+    def commit(self, began: float) -> dict[str, str]:
+        """Return the entries of commit, branch and remote that were read since a run began, if any."""
+        known_at, entries = self._commit
+        return entries if known_at >= began - _FRESH_SECONDS else {}
 
     @staticmethod
     def _place(cells: str) -> tuple[Path, Path | None, tuple[str, ...]]:
@@ -221,13 +237,18 @@ if hasattr(os, "register_at_fork"):
 
 
 def collect(
-    folder: Path, script: Path | None = None, cells: str = "", recordings: Path | None = None
+    folder: Path,
+    script: Path | None = None,
+    cells: str = "",
+    recordings: Path | None = None,
+    on_commit: Callable[[dict[str, str]], None] = lambda _: None,
 ) -> RecordedCode:
     """Return the code in a folder.
 
     Args:
         cells: the cells of a notebook that were executed.
         recordings: a folder whose untracked files are no code.
+        on_commit: called with the entries of commit, branch and remote before the rest is read.
     """
 
     def used(root: Path) -> list[str]:
@@ -237,7 +258,7 @@ def collect(
 
     repository, problems = Repository(folder), []
     try:
-        repository = read_repository(folder, used)
+        repository = read_repository(folder, used, on_commit=lambda found: on_commit(_place_in_git(found)))
         problems += repository.problems + ([] if repository.commit else ["there is no commit yet"])
     except NotRecorded as reason:
         problems.append(str(reason))
@@ -255,10 +276,8 @@ def collect(
         sources.add_file(root, path)
     new = set(sources.files) & {*untracked, _CELLS} if repository.commit else set(sources.files)
     is_dirty = repository.commit and (repository.changed or others)
-    entries = {
+    entries = _place_in_git(repository) | {
         "git": repository.commit + ("-dirty" if is_dirty else ""),
-        "git.branch": repository.branch,
-        "git.remote": redacted_text(repository.remote),
         "code.script": "" if script is None else _within(root, script),
         "git.not_recorded": "; ".join(problems),
         "code.left_out": _named(sources.left_out),
@@ -269,6 +288,16 @@ def collect(
         code.to_attachment() if code.files or code.patch else b"",
         root,
     )
+
+
+def _place_in_git(repository: Repository) -> dict[str, str]:
+    """Return the entries of commit, branch and remote, where there is one."""
+    entries = {
+        "git": repository.commit,
+        "git.branch": repository.branch,
+        "git.remote": redacted_text(repository.remote),
+    }
+    return {key: as_utf8(text) for key, text in entries.items() if text}
 
 
 def _named(left_out: list[str]) -> str:

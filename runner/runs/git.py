@@ -69,13 +69,17 @@ class Repository:
 
 
 def read_repository(
-    folder: Path, used: Callable[[Path], Sequence[str]] = lambda _: (), seconds: float = GIT_SECONDS
+    folder: Path,
+    used: Callable[[Path], Sequence[str]] = lambda _: (),
+    seconds: float = GIT_SECONDS,
+    on_commit: Callable[[Repository], None] = lambda _: None,
 ) -> Repository:
     """Return the state of the repository that a folder is in.
 
     Args:
         used: returns the paths of files in the repository, whose root it gets: those that are ignored count
             as untracked.
+        on_commit: called as soon as commit, branch and remote are known, before changes are searched for.
 
     Raises:
         NotRecorded: there is none, or it cannot be read; after its commit is known, what cannot be read is
@@ -99,6 +103,7 @@ def read_repository(
     git.folder = root
     try:
         _read_remote_and_filters(git, repository)
+        on_commit(repository)
         status = ("--porcelain=v1", "-z", "--untracked-files=all", "--no-renames", _IGNORE_SUBMODULES)
         for entry in filter(None, git.run("status", *status, limit=_MAX_STATUS_BYTES).split("\0")):
             (repository.untracked if entry[:2] == "??" else repository.changed).append(entry[3:])

@@ -159,8 +159,10 @@ def test_a_trial_of_tune_is_a_run(recordings):
     assert all(run.summary.train_steps >= 400 for run in runs)
 
 
-@pytest.mark.parametrize("game", [rllib_games.at_once, rllib_games.in_turns])
-def test_agents_with_policies_of_their_own_and_a_shared_one(recordings, game):
+@pytest.mark.parametrize(
+    ("game", "make"), [(rllib_games.at_once, rllib_games.at_once), (rllib_games.in_turns, None)]
+)
+def test_agents_with_policies_of_their_own_and_a_shared_one(recordings, game, make):
     from ray.tune.registry import register_env
 
     from runner.integrations.rllib import Recording
@@ -178,7 +180,7 @@ def test_agents_with_policies_of_their_own_and_a_shared_one(recordings, game):
             with ended_episodes.open("a") as file:
                 file.write(json.dumps(list(returns.values())) + "\n")
 
-    recording = Recording(recordings, make=game, checkpoint_every=1)
+    recording = Recording(recordings, make=make, checkpoint_every=1)
     config = (
         configured(recording)
         .callbacks(recording, on_episode_end=note_returns)
@@ -226,16 +228,19 @@ def test_what_an_env_runner_cannot_record_is_an_error_of_the_algorithm(recording
     assert run.status == "failed"
 
 
-def test_an_environment_class_of_several_agents_is_made_again_from_its_configuration(recordings):
+@pytest.mark.parametrize("is_registered", [False, True])
+def test_a_game_is_made_again_from_its_configuration(recordings, is_registered):
     from ray.rllib.algorithms.ppo import PPOConfig
     from ray.rllib.connectors.env_to_module.flatten_observations import FlattenObservations
     from ray.rllib.examples.envs.classes.multi_agent.rock_paper_scissors import RockPaperScissors
+    from ray.tune.registry import register_env
 
     from runner.integrations.rllib import Recording
 
+    register_env("game", lambda config: RockPaperScissors(config))  # noqa: PLW0108 - a function without a name
     config = (
         PPOConfig()
-        .environment(RockPaperScissors, env_config={"sheldon_cooper_mode": True})
+        .environment("game" if is_registered else RockPaperScissors, env_config={"sheldon_cooper_mode": True})
         .env_runners(
             num_env_runners=0,
             env_to_module_connector=lambda *_, **__: FlattenObservations(multi_agent=True),
@@ -249,6 +254,12 @@ def test_an_environment_class_of_several_agents_is_made_again_from_its_configura
     algorithm.train()
     algorithm.stop()
     (run,) = runner.list_runs(recordings)
-    assert (run.name, run.summary.train_steps) == ("PPO-RockPaperScissors", 100)
+    name = "PPO-game" if is_registered else "PPO-RockPaperScissors"
+    assert (run.name, run.summary.train_steps) == (name, 100)
+    if is_registered:  # by a function that has no name
+        assert (
+            'name a function that makes it: make="module:function"' in verify_by_redoing(run.recording).reason
+        )
+        return
     assert "is imported only if you trust" in verify_by_redoing(run.recording).reason
     assert verify_by_redoing(run.recording, trust=True).verdict == "reproduced"

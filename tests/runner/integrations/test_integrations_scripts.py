@@ -147,6 +147,8 @@ def test_the_nearest_of_all_arguments_is_suggested():
         runner.record(make(), seeds=1)
     with pytest.raises(ConfigError, match=r"Did you mean 'recordings'\?"):
         SummaryWriter(recording="here")
+    with pytest.raises(ConfigError, match=r"found the argument 'frames_of', expected one of [^?]*\.$"):
+        runner.record(make(), frames_of=0)
 
 
 def test_each_writer_has_a_run_of_its_own_with_its_own_environment():

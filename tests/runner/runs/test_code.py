@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -207,6 +208,38 @@ def test_a_hanging_git_is_stopped(project, monkeypatch):
     with pytest.raises(NotRecorded, match=r"was stopped: reading the repository took 0\.2 s"):
         read_repository(project, seconds=0.2)
     assert time.monotonic() - began < 30  # not the minute that it sleeps
+
+
+def test_commit_branch_and_remote_are_known_before_slow_changes(project, monkeypatch):
+    from runner.recording.writer import create_recording
+    from runner.runs import code as module
+
+    program, reached = project.parent / "bin" / "git", project.parent / "reached"
+    program.parent.mkdir()
+    program.write_text(
+        f'#!/bin/sh\ncase "$*" in *" status "*) touch {reached}; sleep 60;; esac\n'
+        f'exec {shutil.which("git")} "$@"\n'
+    )
+    program.chmod(0o755)
+    git(project, "remote", "add", "origin", "https://user:secret@example.org/project.git")
+    monkeypatch.setenv("PATH", f"{program.parent}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.delenv("DUALTAXI_CODE")
+    monkeypatch.chdir(project)
+    monkeypatch.setattr(module, "user_script", lambda: None)
+    monkeypatch.setattr(module, "WAIT_SECONDS", 0.01)
+    monkeypatch.setattr(module, "read_repository", partial(read_repository, seconds=60))
+    collector = module.CodeCollector(project / "recordings")
+    while not reached.exists():
+        time.sleep(0.01)
+    with create_recording(project / "recording.mcap") as file:
+        collector.write(file, wait=True)
+    assert collector.entries == {
+        "git": git(project, "rev-parse", "HEAD"),
+        "git.branch": "main",
+        "git.remote": "https://[redacted]@example.org/project.git",
+        "git.not_recorded": "what differs from the commit: reading it took more than 0.01 s",
+        "code.not_recorded": "reading it took more than 0.01 s",
+    }
 
 
 def test_nothing_that_the_repository_configures_is_executed(project, tmp_path):
