@@ -105,8 +105,8 @@ def _send(server: Connection, upload_id: str, source: Json, path: Path, report: 
                 if upload.offset > furthest:
                     furthest = upload.offset
                     backoff.reset()
-                report(upload.offset, source["size"])
                 upload = append_upload(server, upload, path, source["size"])
+                report(upload.offset, source["size"])
             if upload.is_over:
                 return upload
             time.sleep(pause)

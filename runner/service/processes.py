@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing import forkserver
-from typing import Any, Final, ParamSpec, Self, TypeVar
+from typing import Final, ParamSpec, Self, TypeVar
 
 from runner.service.errors import Busy
 from runner.util.processes import CallFailed, ChildProcess, ProcessDied, process_context
@@ -128,28 +128,29 @@ class ProcessPool:
         if not self._places.acquire(blocking=False):
             raise Busy
         try:
-            future = self._threads.submit(self._call, seconds, function, args, keywords)
+            future = self._threads.submit(
+                self._call, lambda child: child.call(function, seconds, *args, **keywords)
+            )
         except BaseException:
             self._places.release()
             raise
         future.add_done_callback(lambda _: self._places.release())
         return future
 
-    def _call(self, seconds: float, function: Callable[..., Any], args: object, keywords: object) -> Any:
+    def _call(self, call: Callable[[ChildProcess], Result]) -> Result:
+        """Return the result of a call in the process of this thread, or in a new one."""
         child: ChildProcess | None = self._thread.__dict__.pop("child", None)
         if child is not None and time.monotonic() - self._thread.used < self._keep_seconds:
             with contextlib.suppress(ProcessDied):  # perhaps while it was idle; a new process shows why
-                return self._call_in(child, seconds, function, args, keywords)
+                return self._call_in(child, call)
         elif child is not None:
             self._end(child)
-        return self._call_in(self._start(), seconds, function, args, keywords)
+        return self._call_in(self._start(), call)
 
-    def _call_in(
-        self, child: ChildProcess, seconds: float, function: Callable[..., Any], args: Any, keywords: Any
-    ) -> Any:
+    def _call_in(self, child: ChildProcess, call: Callable[[ChildProcess], Result]) -> Result:
         is_reusable = self._keep_seconds > 0
         try:
-            return child.call(function, seconds, *args, **keywords)
+            return call(child)
         except CallFailed:
             is_reusable = False
             raise

@@ -18,9 +18,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final, Generic, TypeVar
 
 from filelock import FileLock
+from pydantic import Field, TypeAdapter
 
 from runner.errors import RunnerError, StorageError
 from runner.util.files import read_object, storage_errors, write_object
@@ -46,15 +47,18 @@ _MAX_FILE_BYTES: Final = 1 << 20
 _LOCK_SECONDS: Final = 10
 
 
+Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+
 @dataclass(frozen=True)
 class Token:
     """What is stored of a token."""
 
     id: str
     name: str
-    scopes: tuple[str, ...]
+    scopes: tuple[Annotated[str, Field(pattern=f"^({'|'.join(SCOPES)})$")], ...]
     created: str
-    sha256: str
+    sha256: Digest
 
     @property
     def can_write(self) -> bool:
@@ -70,22 +74,18 @@ class Token:
 class Session:
     """What is stored of a session."""
 
-    sha256: str
+    sha256: Digest
     token_id: str
     expires: float
     """In seconds since 1970."""
 
 
 class _RecordsFile(Generic[Record]):
-    """A file `{"KEY": [record, ...]}`, readable by its owner only, that several processes may change.
+    """A file `{"KEY": [record, ...]}`, readable by its owner only, that several processes may change."""
 
-    `parse` returns a record from its JSON object; it raises `ValueError`, `KeyError`, `TypeError` or
-    `AttributeError` if it is none.
-    """
-
-    def __init__(self, path: Path, key: str, parse: Callable[[object], Record]) -> None:
+    def __init__(self, path: Path, key: str, kind: type[Record]) -> None:
         self.path = path
-        self._key, self._parse = key, parse
+        self._key, self._adapter = key, TypeAdapter(tuple[kind, ...])  # type: ignore[valid-type]
         self._version: tuple[int, int, int] | None = None
         self._records: tuple[Record, ...] = ()
 
@@ -100,12 +100,12 @@ class _RecordsFile(Generic[Record]):
             version = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
             if version != self._version:
                 entries = read_object(self.path, _MAX_FILE_BYTES)[self._key]
-                self._records, self._version = tuple(self._parse(entry) for entry in entries), version
+                self._records, self._version = self._adapter.validate_python(entries), version
         except FileNotFoundError:
             self._records, self._version = (), None
         except OSError as error:
             raise StorageError(f"{self.path}: cannot be read ({error.strerror}).") from error
-        except (ValueError, KeyError, TypeError, AttributeError):
+        except (ValueError, KeyError):
             message = f"{self.path}: found no file of {self._key}; remove it, and create them again."
             raise StorageError(message) from None
         return self._records
@@ -123,7 +123,7 @@ class Tokens:
     """The tokens in a file."""
 
     def __init__(self, path: Path) -> None:
-        self._file = _RecordsFile(path, "tokens", _parse_token)
+        self._file = _RecordsFile(path, "tokens", Token)
         self.path = path
 
     def all(self) -> tuple[Token, ...]:
@@ -181,7 +181,7 @@ class Sessions:
 
     def __init__(self, tokens: Tokens) -> None:
         self._tokens = tokens
-        self._file = _RecordsFile(tokens.path.with_name(SESSIONS_FILE), "sessions", _parse_session)
+        self._file = _RecordsFile(tokens.path.with_name(SESSIONS_FILE), "sessions", Session)
 
     def begin(self, token: Token) -> str:
         """Return the secret of a new session of a token."""
@@ -207,17 +207,6 @@ class Sessions:
         """Return the sessions that have not ended and whose token exists."""
         ids, now = {token.id for token in self._tokens.all()}, time.time()
         return [session for session in sessions if session.token_id in ids and session.expires > now]
-
-
-def _parse_token(entry: Any) -> Token:
-    token = Token(**entry | {"scopes": tuple(entry["scopes"])})
-    if not set(token.scopes) <= set(SCOPES) or len(token.sha256) != 64:
-        raise ValueError("it is no token")
-    return token
-
-
-def _parse_session(entry: Any) -> Session:
-    return Session(str(entry["sha256"]), str(entry["token_id"]), float(entry["expires"]))
 
 
 def _digest(secret: str) -> str:

@@ -13,8 +13,7 @@ from runner.runs.run import Run
 from runner.service.api.jobs import JobResponse, job_response
 from runner.service.dependencies import JobsOf, RecordedRun
 from runner.service.errors import Refused
-from runner.service.jobs.branches import BranchQuestion, check_branch
-from runner.service.jobs.checking import CheckedJob
+from runner.service.jobs.checking import BranchQuestion, CheckedJob, check_branch
 from runner.service.jobs.explanations import ExplainQuestion, check_explanation
 from runner.service.jobs.queue import JobQueue
 from runner.service.jobs.store import Job

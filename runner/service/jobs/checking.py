@@ -1,4 +1,4 @@
-"""Checks of submitted texts, in child processes with limits on time and memory.
+"""Checks of submitted texts and branches, in child processes with limits on time and memory.
 
 A check imports the environment, whose code and memory have no place in the server.
 """
@@ -12,14 +12,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, ParamSpec
 
+from pydantic import BaseModel, Field
+
 from runner.config import from_text
 from runner.config.document import Document, Problem, read_yaml
 from runner.config.loading import MAX_BYTES
 from runner.config.problems import refuse
 from runner.environments.loading import load_mdp
 from runner.errors import ConfigError, RunnerError
+from runner.execution.branching import branch_job, branch_name
 from runner.execution.estimate import estimate, step_limit
 from runner.execution.initial_tables import resolve_initial_q
+from runner.recording.reader import open_recording
+from runner.runs.run import Run
 from runner.service.errors import Busy
 from runner.service.jobs.store import Kind
 from runner.service.processes import ProcessPool
@@ -130,6 +135,28 @@ def is_path(name: str) -> bool:
     return "/" in name or "\\" in name or name.endswith((".mcap", ".yaml", ".yml"))
 
 
+class BranchQuestion(BaseModel, extra="forbid", frozen=True):
+    """A change of a training step; the fields are the arguments of `runner.branch`."""
+
+    at: str | int = Field(description="The first step that may differ: `EPISODE:T`, or its number.")
+    action: str | int | dict[str, str | int] | None = Field(
+        default=None, description="A joint action, or one by agent; names or numbers. Null: as recorded."
+    )
+    overrides: tuple[str, ...] = Field(default=(), description="`KEY=VALUE` each, as for `--set`.")
+    episodes: int | None = Field(default=None, description="Training episodes in all.")
+    name: str | None = Field(default=None, description="Name of the new run; `NAME.branch` by default.")
+
+
+def check_branch(run: Run, question: BranchQuestion) -> CheckedJob:
+    """Return the job of a branch of a run."""
+    with open_recording(run.recording) as recording:
+        recording.require_job("a branch of training", "`dualtaxi branch` plays an episode of a loop on.")
+        job, _ = branch_job(recording, question.at, question.action, question.overrides, question.episodes)
+        limit = recording.mdp.step_limit
+    size = estimate(job.config, limit).typical_bytes if limit else 0
+    return CheckedJob("branch", branch_name(run, question.name), 1, size, job.config.to_mapping())
+
+
 class JobChecker:
     """Checks texts in a few child processes; thread-safe."""
 
@@ -157,24 +184,17 @@ class JobChecker:
         done, _ = await asyncio.wait({waiting}, timeout=QUEUE_SECONDS)
         if not done and future.cancel():
             raise Busy
-        with _limits_as_config_errors(source):
+        try:
             return await waiting
-
-
-@contextlib.contextmanager
-def _limits_as_config_errors(source: str) -> Iterator[None]:
-    """Raise as a mistake of the text that its check exceeded a limit, or ended its process."""
-    try:
-        yield
-    except TimedOut:
-        message = f"took longer than {CHECK_SECONDS:g} s to check; is env.kwargs sound?"
-    except OutOfMemory:
-        message = f"its environment needs more than {MEMORY_BYTES / (1 << 30):g} GiB of memory to be made."
-    except ProcessDied:
-        message = "its environment ended the process that was checking it."
-    else:
-        return
-    raise ConfigError(f"{source}: {message}")
+        except TimedOut:
+            message = f"took longer than {CHECK_SECONDS:g} s to check; is env.kwargs sound?"
+        except OutOfMemory:
+            message = (
+                f"its environment needs more than {MEMORY_BYTES / (1 << 30):g} GiB of memory to be made."
+            )
+        except ProcessDied:
+            message = "its environment ended the process that was checking it."
+        raise ConfigError(f"{source}: {message}")
 
 
 def _check_as_config_errors(text: str, source: str, recordings: Path) -> CheckedJob:

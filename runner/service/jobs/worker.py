@@ -9,16 +9,19 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Final
 
+from runner.archive.places import at_hand
 from runner.client.jobs import LogEvent, RunEvent, RunProgress
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
 from runner.errors import RunnerError
+from runner.execution.branching import train_branch
 from runner.execution.resume import resume
 from runner.execution.session import Progress, evaluation_brief, run_job
 from runner.learning.numba_cache import MESSAGE, announced
+from runner.recording.reader import open_recording
 from runner.runs.listing import run_at
+from runner.runs.resolve import run_of_id
 from runner.runs.run import Run, create_run
-from runner.service.jobs.branches import parent_of, run_branch
 from runner.service.jobs.channel import (
     REPORT_SECONDS,
     JobChannel,
@@ -74,15 +77,25 @@ def run_seed(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed:
         run = resume(run, spec.accept_changes, reporter.report, channel.stop)
     else:
         job = Job(config, seed)
-        parent = parent_of(job, spec.recordings) if spec.kind == "branch" else None
+        parent = _parent_of(job, spec.recordings) if spec.kind == "branch" else None
         run = create_run(spec.recordings, config, seed, spec.name, spec.run_ids[seed])
         reporter = Reporter(channel, run.run_id, config, seed)
         if parent is None:
             run = run_job(job, run, reporter.report, channel.stop)
         else:
-            run = run_branch(parent, job, run, reporter.report, channel.stop)
+            with open_recording(parent.recording) as recording:
+                run = train_branch(recording, job, run, reporter.report, channel.stop)
     reporter.end()
     return run.status
+
+
+def _parent_of(job: Job, recordings: Path) -> Run:
+    """Return the run that a branch changes, which must still be there."""
+    run_id = job.config.branches[-1].run
+    parent = run_of_id(run_id, recordings)
+    if parent is None:
+        raise RunnerError(f"run {run_id}, the parent of this branch, is no longer there.")
+    return at_hand(parent)
 
 
 def _existing_run(folder: Path) -> Run | None:

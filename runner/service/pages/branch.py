@@ -17,7 +17,7 @@ from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service.api.questions import queue_branch
 from runner.service.dependencies import JobsOf, RecordedRun
-from runner.service.jobs.branches import BranchQuestion
+from runner.service.jobs.checking import BranchQuestion
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import Form, message_of, number_in, page
 

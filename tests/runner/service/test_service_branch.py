@@ -12,7 +12,7 @@ import runner
 from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
 from runner.runs.run import Run
-from runner.service.jobs.branches import BranchQuestion, check_branch
+from runner.service.jobs.checking import BranchQuestion, check_branch
 from runner.service.jobs.store import JobStore
 from runner.service.settings import Settings
 
