@@ -250,15 +250,19 @@ def _training_record(metrics: Message, agents: Sequence[str]) -> TrainingRecord:
     )
 
 
+def recent_episodes(recording: Recording) -> NDArray[np.void]:
+    """Return the records of the last `RECENT_EPISODES` training episodes."""
+    total = recording.count(schema.TRAIN_EPISODE)
+    return recording.episodes("train", max(0, total - RECENT_EPISODES), total)
+
+
 def loop_summary(recording: Recording) -> Summary:
     """Return the last results of a loop, computed from its recording.
 
     It has `last_evaluation` (None without one), `recent_training`, over the last `RECENT_EPISODES`, and
     `logged`, the last value logged under each name. A value that is unknown or not finite is None.
     """
-    total = recording.count(schema.TRAIN_EPISODE)
-    evaluations = evaluation_records(recording)
-    recent = recording.episodes("train", max(0, total - RECENT_EPISODES), total)
+    evaluations, recent = evaluation_records(recording), recent_episodes(recording)
     logged = (
         recording.result.logged
         if "logged" in recording.result

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from runner.analysis.axes import EPISODES, STEPS, Axis, Positions, edges_of, positions
 from runner.analysis.evaluations import (
-    RECENT_EPISODES,
     EvaluationRecord,
     TrainingRecord,
     evaluation_records,
+    recent_episodes,
     training_records,
 )
 from runner.environments.naming import event_in_words, spoken
@@ -334,10 +334,9 @@ def _mean_episodes(
 
 def _recent_training(recording: Recording) -> tuple[Readings, int]:
     """Return mean length and return of the last training episodes of a loop, and how many these are."""
-    total = recording.count(schema.TRAIN_EPISODE)
-    if not total:
+    episodes, agents = recent_episodes(recording), recording.agents
+    if not len(episodes):
         return {}, 0
-    episodes, agents = recording.episodes("train", max(0, total - RECENT_EPISODES), total), recording.agents
     lines = agents if len(agents) > 1 else [""]
     means = {"training.mean_length": {"": finite_mean(episodes["length"])}}
     means["training.mean_return"] = dict(zip(lines, map(finite_mean, episodes["returns"].T), strict=True))

@@ -5,20 +5,24 @@
             ...
 
 Where the environment must be made again, that is done in a child process, which ends with the iterator.
+Reports contain some of them, made small.
 """
 
 from __future__ import annotations
 
+import base64
 import io
 from collections.abc import Generator
 from contextlib import closing
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.errors import CannotRedo
+from runner.errors import CannotRedo, RunnerError
+from runner.export.painting import decoded
 from runner.export.pictures import Source, paint, source_of
 from runner.export.reports.rendering import sentence
 from runner.recording.reader import Recording, open_recording
@@ -28,6 +32,11 @@ from runner.util.extras import require
 _SMALL: Final = 256 * 256
 """Pictures of at most this number of pixels are encoded as PNG, which is exact; larger ones as JPEG."""
 _JPEG_QUALITY: Final = 88
+MAX_PICTURES: Final = 300
+"""Pictures of an episode in a report."""
+_MAX_SIDE: Final = 320
+"""Pixels of the longer side of a picture."""
+_WEBP_QUALITY: Final = 75
 
 
 def picture_note(recording: Recording, phase: str) -> tuple[bool, str]:
@@ -78,3 +87,58 @@ def encoded_picture(pixels: NDArray[np.uint8]) -> bytes:
     else:
         image.save(buffer, "JPEG", quality=_JPEG_QUALITY)
     return buffer.getvalue()
+
+
+# --- thumbnails ---------------------------------------------------------------------------------------
+
+
+@dataclass
+class Thumbnails:
+    """Some pictures of an episode, and which of them each frame shows."""
+
+    pictures: list[str] = field(default_factory=list)
+    """Addresses that contain the pictures: `data:image/webp;base64,...`."""
+    picture: list[int] = field(default_factory=list)
+    """The index of each frame's picture: that of its own step, or of one before it."""
+    picture_note: str = ""
+    """Why there are none, or no further ones."""
+
+
+def thumbnails(path: Path, phase: str, episode: int, frames: int) -> Thumbnails:
+    """Return pictures of the first frames of an episode."""
+    require("PIL.Image", extra="plots", purpose="the pictures of a report")
+    found, every = Thumbnails(), -(-frames // MAX_PICTURES)
+    latest = b""
+    try:
+        with closing(encoded_pictures(path, phase, episode)) as pictures:
+            for data in pictures:
+                if isinstance(data, str):
+                    found.picture_note = data
+                    continue
+                k = len(found.picture)
+                if k == frames:
+                    break
+                latest = data or latest
+                if k % every == 0 and latest:
+                    found.pictures.append(_small(latest))
+                    latest = b""
+                found.picture.append(len(found.pictures) - 1)
+    except RunnerError as error:
+        found.picture_note = str(error)
+    if found.pictures:
+        found.picture += [len(found.pictures) - 1] * (frames - len(found.picture))
+    return found
+
+
+def _small(data: bytes) -> str:
+    """Return a picture as an address that contains it, made small.
+
+    Raises:
+        RecordingError: it is no picture, or too large.
+    """
+    image = decoded(data, "A recorded frame")
+    image.thumbnail((_MAX_SIDE, _MAX_SIDE))
+    buffer = io.BytesIO()
+    options: dict[str, object] = {"quality": _WEBP_QUALITY, "method": 2}
+    image.save(buffer, "WEBP", **options)
+    return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}"

@@ -37,7 +37,7 @@ class Episode:
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
     acted: NDArray[np.uint32] | None = None
-    """[T]: bit i, whether agent i took part; None in a job, where all do."""
+    """[T]: bit i, whether agent i took part; None where all always do."""
     seed: int | None = None
     """That of its reset, if it had one."""
 
@@ -84,8 +84,7 @@ def _job_episodes(recording: Recording, phase: str, ranges: Ranges) -> Iterator[
             for episode in whole:
                 states = np.append(episode["state"], episode["next_state"][-1:]).astype(np.int64)
                 actions = episode["action"].astype(np.int64)
-                outcomes = (episode["rewards"], episode["terminated"], episode["truncated"])
-                yield Episode(states, actions, *outcomes)
+                yield Episode(states, actions, **_outcomes(episode))
 
 
 class _Resets:
@@ -190,14 +189,13 @@ def _episode(recording: Recording, steps: Steps, first: Value, seed: int | None)
 
 
 def _outcomes(steps: Steps) -> dict[str, Any]:
-    names = ("rewards", "terminated", "truncated", "acted")
-    return {name: np.array(_column(steps, name)) for name in names}
+    names = steps[0] if isinstance(steps, list) else steps.dtype.names or ()
+    fields = ("rewards", "terminated", "truncated", "acted")
+    return {name: np.array(_column(steps, name)) for name in fields if name in names}
 
 
 def _column(steps: Steps, name: str) -> Value:
-    if isinstance(steps, list):
-        return [step[name] for step in steps]
-    return steps[name] if name in (steps.dtype.names or ()) else np.ones(len(steps), np.uint32)
+    return [step[name] for step in steps] if isinstance(steps, list) else steps[name]
 
 
 def _split(description: Description, values: NDArray[Any]) -> Value:

@@ -9,7 +9,7 @@ import io
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.reader import Recording
 from runner.replay.steps import check_steps, recorded_frames, reset_of, transitions_of
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 SCENE_SIZE: Final = 480
 """The largest width and height of the picture of a scene."""
@@ -52,27 +55,26 @@ def paint_recorded(recording: Recording, phase: str, episode: int) -> Painted:
     shown: Pixels | None = None
     for frame in recorded_frames(recording, phase, episode):
         if shown is None or frame is not last:
-            last, shown = frame, _pixels(recording, frame, shown)
+            where = f"{recording.path}: the frame at {frame['log_time']} ns"
+            last, shown = frame, _like(np.asarray(decoded(frame["data"], where)), shown)
         yield shown
 
 
-def _pixels(recording: Recording, frame: Message, before: Pixels | None) -> Pixels:
-    """Return a recorded frame in the size of the one before it, if there is one.
+def decoded(data: bytes, where: str) -> Image.Image:
+    """Return a recorded frame as an RGB image.
 
     Raises:
-        RecordingError: it is no picture, or too large.
+        RecordingError: it is no picture, or too large; `where` names it.
     """
     from PIL import Image, UnidentifiedImageError
 
-    where = f"{recording.path}: the frame at {frame['log_time']} ns"
     try:
-        with Image.open(io.BytesIO(frame["data"]), formats=("PNG", "JPEG")) as image:
+        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
             if image.width * image.height > MAX_PIXELS:
-                raise RecordingError(f"{where}: has {image.width}x{image.height} pixels, too many to show.")
-            picture = image.convert("RGB")
+                raise RecordingError(f"{where} has {image.width}x{image.height} pixels, too many to show.")
+            return image.convert("RGB")
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
-        raise RecordingError(f"{where}: cannot be shown ({error}).") from error
-    return _like(np.asarray(picture), before)
+        raise RecordingError(f"{where} cannot be shown ({error}).") from error
 
 
 def _like(pixels: Pixels, before: Pixels | None) -> Pixels:

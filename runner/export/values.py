@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
 import numpy as np
@@ -120,14 +120,19 @@ def _count(leaf: Leaf) -> int:
     return 0 if leaf.dtype is None else math.prod(leaf.dtype.shape)
 
 
-def number_names(leaf: Leaf, name: str, skip: int = 0) -> list[str]:
-    """Return a name for each number of a leaf: `position[0]`; of one without a path `name`.
+def number_names(leaf: Leaf, name: str, skip: int = 0) -> Iterator[str]:
+    """Yield a name for each number of a leaf: `position[0]`; of one without a path `name`.
 
     The first `skip` keys of the path are left out.
     """
     own = ".".join(leaf.path[skip:]) or name
-    shape = leaf.dtype.shape if leaf.dtype is not None else ()
-    return [f"{own}[{', '.join(map(str, place))}]" if place else own for place in np.ndindex(shape)]
+    return names_in(own, leaf.dtype.shape if leaf.dtype is not None else ())
+
+
+def names_in(array: str, shape: tuple[int, ...]) -> Iterator[str]:
+    """Yield a name for each number of an array, row by row: `position[0]`; of a single one that of all."""
+    for place in np.ndindex(shape):
+        yield f"{array}[{', '.join(map(str, place))}]" if place else array
 
 
 def is_image(leaf: Leaf) -> bool:

@@ -20,7 +20,6 @@ from runner.analysis.compare.moments import (
     Measured,
     Moment,
     Seed,
-    averaged,
     few_seeds,
     higher_is_better,
     last_episodes,
@@ -29,6 +28,7 @@ from runner.analysis.compare.moments import (
     seed_of,
     seed_order,
     uneven_ends,
+    window_notes,
 )
 from runner.analysis.compare.statistics import Estimate, Values
 from runner.analysis.groups import Group
@@ -192,7 +192,7 @@ def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: 
             f"training is compared, {moment_in_words(moment, [metric for metric, _ in metrics], groups)}; "
             "--moment area takes the mean over all of it"
         )
-    yield from averaged(groups, [metric for metric, _ in metrics], moment)
+    yield from window_notes(groups, [metric for metric, _ in metrics], moment)
     digests = {
         group.label: sorted((run.seed or 0, run.content_digest) for run in group.runs)
         for group in groups

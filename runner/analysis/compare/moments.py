@@ -94,7 +94,7 @@ def last_episodes(metric: str, groups: Sequence[Group]) -> str:
     return f"last {f'{counts[0]} to ' if len(counts) > 1 else ''}{counts[-1]} episodes"
 
 
-def averaged(groups: Sequence[Group], metrics: Sequence[str], moment: Moment) -> list[str]:
+def window_notes(groups: Sequence[Group], metrics: Sequence[str], moment: Moment) -> list[str]:
     """Return a note on the window that a value of training averages, unless only last values are compared."""
     if moment.kind == "last" or not any(name.startswith("training.") for name in metrics):
         return []
@@ -227,7 +227,7 @@ def value_of(
     if not run.finished:
         return None, "not finished; --moment EPISODE takes it as far as it got"
     if moment.kind == "area":
-        return _area(points, _shared_span(metric, line, groups))
+        return _area(points, metric, line, groups)
     if moment.level is not None:
         at = first_crossing(points, moment.level)
         return NEVER if at is None else float(at), ""
@@ -246,16 +246,17 @@ def _at(points: Mapping[float, float], moment: Moment) -> float | None:
     return float(np.interp(moment.number, places, [points[place] for place in places]))
 
 
-def _shared_span(metric: str, line: str, groups: Sequence[Group]) -> tuple[float, float]:
-    """Return the first and the last position that every finished run with the metric covers."""
+def _area(
+    points: Mapping[float, float], metric: str, line: str, groups: Sequence[Group]
+) -> tuple[float | None, str]:
+    """Return the mean of a curve over the positions that every finished run with the metric covers."""
     runs = [run for group in groups for run in group.runs if run.finished]
-    curves = [points for run in runs if (points := points_of(run, metric, line, aligned=True))]
-    return max(map(min, curves)), min(map(max, curves))
-
-
-def _area(points: Mapping[float, float], span: tuple[float, float]) -> tuple[float | None, str]:
-    places = sorted({*(place for place in points if span[0] <= place <= span[1]), *span})
-    if span[0] >= span[1]:
+    curves = [own for run in runs if (own := points_of(run, metric, line, aligned=True))]
+    first, last = max(map(min, curves)), min(map(max, curves))
+    if first >= last:
         return None, "it has no part of training in common with the other runs"
-    known = sorted(points)
+    places, known = (
+        sorted({first, *(place for place in points if first <= place <= last), last}),
+        sorted(points),
+    )
     return mean_height(places, np.interp(places, known, [points[place] for place in known]).tolist()), ""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, Final
 
 import numpy as np
@@ -28,7 +29,7 @@ from runner.export.reports.player_data import (
     short_rows,
     words,
 )
-from runner.export.values import action_in_words, is_image
+from runner.export.values import action_in_words, is_image, names_in, number_names
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, leaves_of
@@ -197,9 +198,8 @@ def _extras(recording: Recording, phase: str, part: range, notes: list[str]) -> 
         if columns.shape[1] > MAX_SERIES:
             notes.append(f"{name}: {_sizes(shape)} numbers with each step")
             continue
-        for k in range(columns.shape[1]):
-            own = f"{name.removeprefix(f'{agent}/')}{_index(k, shape)}"
-            numbers = [None if value is None else short(value) for value in columns[:, k].tolist()]
+        for own, column in zip(names_in(name.removeprefix(f"{agent}/"), shape), columns.T, strict=True):
+            numbers = [None if value is None else short(value) for value in column.tolist()]
             series.append(Series(agent, "extras", own, [*numbers, None]))
     return series
 
@@ -213,8 +213,8 @@ def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
     budget = dict.fromkeys(agents or ("",), left)
     for leaf in leaves:
         agent = leaf.path[0] if leaf.path and leaf.path[0] in agents else ""
-        path = leaf.path[1:] if agent else leaf.path
-        name = ".".join(path)
+        skip = 1 if agent else 0
+        name = ".".join(leaf.path[skip:])
         if leaf.dtype is None:
             shown.append(_ShownPart(agent, (name,), leaf.path, is_text=True))
             continue
@@ -226,7 +226,7 @@ def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
         taken = min(count, budget.get(agent, left))
         budget[agent] = budget.get(agent, left) - taken
         unseen += count - taken
-        names = tuple(f"{name}{_index(i, shape)}" for i in range(taken))
+        names = tuple(islice(number_names(leaf, "", skip), taken))
         if names:
             shown.append(_ShownPart(agent, names, leaf.path, is_text=False))
     if unseen:
@@ -236,11 +236,6 @@ def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
 
 def _sizes(shape: tuple[int, ...]) -> str:
     return " × ".join(map(str, shape))
-
-
-def _index(number: int, shape: tuple[int, ...]) -> str:
-    """Return the index of a number in an array as text; empty for the only one."""
-    return f"[{', '.join(map(str, np.unravel_index(number, shape)))}]" if shape else ""
 
 
 def _frames(

@@ -60,7 +60,7 @@ def _parts(recording: Recording, agent: str = "") -> dict[str, list[Part]]:
         ]
         count = sum(math.prod(leaf.dtype.shape) for leaf in leaves if leaf.dtype is not None)
         if recording.kind != "variable" and 0 < count <= MAX_LINES:
-            names = [number_names(leaf, part, skip=1 if agent else 0) for leaf in leaves]
+            names = [list(number_names(leaf, part, skip=1 if agent else 0)) for leaf in leaves]
             found[part] = [((field, *leaf.path), 0, own) for leaf, own in zip(leaves, names, strict=True)]
     return found
 
