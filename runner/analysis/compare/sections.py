@@ -137,7 +137,7 @@ def profile_grid(
 
 
 def spread_over(count: int) -> list[int]:
-    """Return a few of this number of points, evenly spread from the first to the last."""
+    """Return the indices of a few of `count` points, evenly spread from the first to the last."""
     points: list[int] = np.unique(np.linspace(0, count - 1, _MAX_LEVELS).round().astype(int)).tolist()
     return points
 

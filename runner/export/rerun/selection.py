@@ -80,7 +80,7 @@ class Selection:
     train: list[range] = field(default_factory=list)
     """The numbers of the steps of successive whole episodes."""
     evaluations: list[tuple[Evaluation, range]] = field(default_factory=list)
-    """Evaluations of a job, each with its steps; for a loop stands one that has no meaning."""
+    """Evaluations with their steps; all trials of a loop are one, whose other fields are 0."""
     drawn: dict[str, list[int]] = field(default_factory=dict)
     """Episodes of a loop of which pictures are drawn, by phase."""
     exported: list[str] = field(default_factory=list)
