@@ -161,7 +161,7 @@ def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tupl
     for name in names:
         if name not in known:
             expected = ", ".join(sorted(known))
-            raise RunnerError(f"--metric: found {name!r}, expected one of {expected}.{nearest(name, known)}")
+            raise RunnerError(f"metric: found {name!r}, expected one of {expected}.{nearest(name, known)}")
     return list(dict.fromkeys(pair for name in names for pair in known[name]))
 
 
@@ -246,7 +246,7 @@ def _value_at(path: str, series: Sequence[RunSeries]) -> Callable[[RunSeries], s
     known = {name for run in series for name in paths(run.config)}
     if path not in known:
         raise RunnerError(
-            f"--by: found {path!r}, expected a path of the configuration such as discount or "
+            f"by: found {path!r}, expected a path of the configuration such as discount or "
             f"evaluation.trials; `dualtaxi config check` prints all.{nearest(path, sorted(known))}"
         )
     return lambda run: json.dumps(paths(run.config).get(path), sort_keys=True)

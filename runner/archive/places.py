@@ -17,13 +17,14 @@ from typing import Final
 from runner.errors import RecordingError, StorageError
 from runner.runs.run import RUN_FILE, Run
 from runner.util.files import CACHE_VARIABLE, RESTORED, cache_folder, storage_errors
+from runner.util.humanize import size
 from runner.util.processes import ChildProcess, OutOfMemory, ProcessDied, report_progress
 
 ARCHIVE_VARIABLE: Final = "DUALTAXI_ARCHIVE"
 MAX_CACHED: Final = 8
 """Restored recordings in the cache; those unused for longest are removed."""
 LOCK_SECONDS: Final = 600.0
-MEMORY_BYTES: Final = 4 << 30
+MEMORY_BYTES: Final = 4 * 10**9
 """Memory for restoring an archive, beyond what the process takes at its start."""
 _RESTORE_SECONDS: Final = 7 * 86400.0
 

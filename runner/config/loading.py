@@ -31,6 +31,7 @@ from runner.config.sections import Recording
 from runner.config.shipped import config_path, suggestion
 from runner.config.values import MAX_DEPTH, Path, Section, position_in, value_at
 from runner.errors import ConfigError, shortened
+from runner.util.humanize import size
 from runner.util.packing import Packing
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN, Json, JsonView
 
@@ -137,7 +138,9 @@ def read_text(file: FilePath) -> str:
     except (OSError, ValueError) as error:
         raise ConfigError(f"{file}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if len(content) > MAX_BYTES:
-        raise ConfigError(f"{file}: larger than 1 MiB, expected a configuration of a few kilobytes")
+        raise ConfigError(
+            f"{file}: larger than {size(MAX_BYTES)}, expected a configuration of a few kilobytes"
+        )
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -251,7 +254,7 @@ def put(document: Document, values: Sequence[tuple[tuple[str, ...], Document]]) 
 
 def _parse(text: str) -> tuple[tuple[str, ...], Document]:
     shown = shortened(text, _MAX_SHOWN)
-    source = "--set " + (shown if shown.isprintable() else repr(shown))
+    source = shown if shown.isprintable() else repr(shown)
     key, separator, value = text.partition("=")
     path = tuple(key.strip().split("."))
     if not separator or not all(path):

@@ -123,9 +123,9 @@ def ask(
 ) -> Question:
     """Return what is to be explained; arguments and errors as for `explain`."""
     if not 1 <= seeds <= MAX_SEEDS:
-        raise RunnerError(f"--seeds: found {seeds}, expected 1 to {MAX_SEEDS:,}.")
+        raise RunnerError(f"seeds: found {seeds}, expected 1 to {MAX_SEEDS:,}.")
     if at is not None and at < 1:
-        raise RunnerError(f"--at: found {at}, expected a number of training episodes from 1 on.")
+        raise RunnerError(f"at: found {at}, expected a number of training episodes from 1 on.")
     (side_a, config_a, first), (side_b, config_b, other) = (
         _resolved(source, recordings) for source in (a, b)
     )
@@ -264,7 +264,7 @@ def _metric_of(sides: Sequence[Readings], metric: str | None) -> str:
     if found is None:
         names = ", ".join(sorted(name for name in shared if not name.startswith("training.reward.")))
         raise RunnerError(
-            f"--metric: found {metric or 'none'!r}, expected one that evaluations of both have: {names}."
+            f"metric: found {metric or 'none'!r}, expected one that evaluations of both have: {names}."
             f"{nearest(metric or '', shared)}"
         )
     return found

@@ -21,6 +21,7 @@ from runner.runs.listing import list_runs
 from runner.runs.locking import acquired
 from runner.runs.run import UNLISTED
 from runner.util.files import open_regular, replacing, storage_errors
+from runner.util.humanize import size
 
 FOLDER: Final = ".explain"
 LOCK: Final = "owner.lock"
@@ -110,7 +111,7 @@ def read_explanation(name: str, recordings: Path) -> Explanation:
         with open_regular(path) as file:
             content = file.read(MAX_BYTES + 1)
         if len(content) > MAX_BYTES:
-            raise RunnerError(f"{path}: larger than {MAX_BYTES >> 20} MiB, expected an explanation.")
+            raise RunnerError(f"{path}: larger than {size(MAX_BYTES)}, expected an explanation.")
         explanation = TypeAdapter(Explanation).validate_json(content)
     except (OSError, ValidationError) as error:
         reason = str(error).splitlines()[0]

@@ -15,7 +15,7 @@ from runner.config import ConfigError, ExperimentConfig, from_mapping
 from runner.config.model import LEARNERS, SECTION_OF
 from runner.errors import EnvironmentNotUsable, RunnerError
 from runner.runs.branches import training_branches
-from runner.util.humanize import listed
+from runner.util.humanize import listed, setting
 from runner.util.values import Json, JsonView
 
 MAX_ALL: Final = 8
@@ -52,7 +52,7 @@ class Factor:
         modes = [mode for mode, means in LEARNERS.items() if means == learners]
         if modes:
             del values["tables"], values["rewards"]
-        texts = (_branches(value) if path == "branches" else _text(value) for path, value in values.items())
+        texts = (_branches(value) if path == "branches" else setting(value) for path, value in values.items())
         return ", ".join([*modes, *texts])
 
 
@@ -95,7 +95,7 @@ def mix(a: ExperimentConfig, b: ExperimentConfig, at: int | None = None, exact: 
     for name, config in (("A", a), ("B", b)):
         if at is not None and at > config.episodes:
             raise RunnerError(
-                f"--at: found {at:,}, but {name} trains {config.episodes:,} episodes: choose an episode that "
+                f"at: found {at:,}, but {name} trains {config.episodes:,} episodes: choose an episode that "
                 "both reach."
             )
     ours, theirs = a.to_mapping(), b.to_mapping()
@@ -232,14 +232,3 @@ def _branches(value: object) -> str:
         for branch in training_branches({"branches": value})
     )
     return "; ".join(texts) or "none"
-
-
-def _text(value: object) -> str:
-    """Return a value in a few characters; a schedule as `linear 1 to 0.1 over 5,000`."""
-    if isinstance(value, Mapping) and value.get("schedule") == "linear":
-        return f"linear {value['start']:g} to {value['end']:g} over {value['over']:,}"
-    if value is None:
-        return "not set"
-    if isinstance(value, float):
-        return f"{value:g}"
-    return value if isinstance(value, str) else json.dumps(value, default=str)

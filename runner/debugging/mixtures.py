@@ -209,7 +209,7 @@ class Mixtures:
             if None in row:
                 names = ", ".join(factor.name for factor in self.mixing.chosen(mixture)) or "none"
                 raise RunnerError(
-                    f"--metric: {metric!r} has no finite value in the mixture with these settings of B: "
+                    f"metric: {metric!r} has no finite value in the mixture with these settings of B: "
                     f"{names}. Choose a metric that every mixture has, such as success_percent."
                 )
             rows.append(row)

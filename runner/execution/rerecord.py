@@ -157,7 +157,7 @@ def evaluation_of(
         tables_at(recording, chosen)  # raises here, before there is a new run
         states = recording.mdp.states
         if isinstance(start, int) and not 0 <= start < states:
-            raise RunnerError(f"--start: found state {start}, expected one of 0 to {states - 1}.")
+            raise RunnerError(f"start: found state {start}, expected one of 0 to {states - 1}.")
         starts = int(np.count_nonzero(recording.mdp.start))
         original = from_mapping(recording.config)
     return _with(

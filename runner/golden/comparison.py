@@ -25,6 +25,7 @@ from runner.recording.reader import open_recording
 from runner.replay.environment import redo
 from runner.runs.run import Run
 from runner.util.extras import require
+from runner.util.humanize import setting
 
 MIN_SCORES: Final = 6
 """The fewest seeds whose interquartile mean has a spread that can be estimated."""
@@ -32,7 +33,6 @@ _TRIM: Final = 0.25
 _MAX_CHANGES: Final = 8
 _CIRCUMSTANCES: Final = frozenset({"command", "created", "directory", "host", "user"})
 """Entries of provenance that cannot explain a difference."""
-_NOT_SET: Final = "not set"
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def _in_words(difference: RunDiff) -> str:
         if change.path not in _CIRCUMSTANCES and not change.path.endswith(".state")
     ]
     for change in (*difference.environment.description, *versions)[:_MAX_CHANGES]:
-        lines.append(f"  {change.path}: {change.a} in A, {change.b} in B")
+        lines.append(f"  {change.path}: {setting(change.a)} in A, {setting(change.b)} in B")
     return "\n".join(lines)
 
 
@@ -107,11 +107,10 @@ def _changes(recorded: EnvironmentMaker | None, here: EnvironmentMaker) -> list[
         if maker is not None
     ]
     changes = changes_in(*made) if len(made) == 2 else []
-    rows = [
-        [change.path, *(_NOT_SET if value is None else value for value in (change.a, change.b))]
-        for change in changes
+    return [
+        f"  {change.path}: recorded {setting(change.a)}, here {setting(change.b)}"
+        for change in changes[:_MAX_CHANGES]
     ]
-    return [f"  {path}: recorded {then}, here {now}" for path, then, now in rows[:_MAX_CHANGES]]
 
 
 @dataclass(frozen=True)

@@ -50,19 +50,19 @@ def policy_named(name: str) -> Callable[..., Any]:
     """
     module_name, _, function_name = name.partition(":")
     if not module_name or not function_name:
-        raise ConfigError(f"--policy: found {name!r}, expected module:function")
+        raise ConfigError(f"policy: found {name!r}, expected module:function")
     sys.path.insert(0, str(Path.cwd()))
     try:
         function = getattr(importlib.import_module(module_name), function_name)
     except Exception as error:  # a module of the user's may raise anything
         raise ConfigError(
-            f"--policy: {name!r} cannot be imported ({type(error).__name__}: {error}); it is looked for on "
+            f"policy: {name!r} cannot be imported ({type(error).__name__}: {error}); it is looked for on "
             "Python's path and in the current folder"
         ) from error
     finally:
         sys.path.pop(0)
     if not callable(function):
-        raise ConfigError(f"--policy: found {type(function).__name__} at {name!r}, expected a function")
+        raise ConfigError(f"policy: found {type(function).__name__} at {name!r}, expected a function")
     return function  # type: ignore[no-any-return]
 
 
@@ -172,9 +172,9 @@ def values_along(
     try:
         values = {name: np.stack(each) for name, each in rows.items()}
     except ValueError as error:
-        raise ConfigError(f"--policy: {policy!r} returned arrays of different shapes ({error})") from error
+        raise ConfigError(f"policy: {policy!r} returned arrays of different shapes ({error})") from error
     if any(len(each) != steps for each in values.values()):
-        raise ConfigError(f"--policy: {policy!r} returned other names at some steps, expected the same ones")
+        raise ConfigError(f"policy: {policy!r} returned other names at some steps, expected the same ones")
     return ValuesAlong(found.actions, found.rewards, values)
 
 
@@ -190,10 +190,10 @@ def _named(value: object) -> dict[str, Array]:
         try:
             array = as_array(piece)
         except (TypeError, ValueError, RuntimeError) as error:
-            raise ConfigError(f"--policy: found no numbers for {name!r} ({error})") from error
+            raise ConfigError(f"policy: found no numbers for {name!r} ({error})") from error
         if array.dtype.kind not in "biuf" or not 0 < array.size <= MAX_NUMBERS:
             raise ConfigError(
-                f"--policy: found {array.dtype} of shape {array.shape} for {name!r}, expected 1 to "
+                f"policy: found {array.dtype} of shape {array.shape} for {name!r}, expected 1 to "
                 f"{MAX_NUMBERS} numbers"
             )
         named[str(name)] = array

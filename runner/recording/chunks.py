@@ -27,7 +27,7 @@ from runner.recording.schema import ACTIONS, EXTRA, TOPIC_OF, TRANSITION, UNIFOR
 from runner.util.packing import MAX_CHUNK_STEPS, MAX_LEVEL, Packing
 
 MAX_CHUNK_BYTES: Final = 64 << 20
-"""The largest chunk that is read, packed or unpacked; the recorder's are below 16 MiB."""
+"""The largest chunk that is read, packed or unpacked; the recorder's are below 17 MB."""
 _PLAIN_BYTES: Final = 4 << 20
 """Chunks of up to this size are unpacked without checking their first message."""
 CHUNK_HEAD: Final = struct.Struct("<QQQII")

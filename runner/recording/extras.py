@@ -176,7 +176,7 @@ class Extras(Mapping[str, np.dtype[np.generic]]):
         """Return the extras of steps, given by their numbers, ascending; as `of_episode`.
 
         Raises:
-            RecordingError: they cannot be read, or take more than 128 MiB.
+            RecordingError: they cannot be read, or take more than 134 MB.
         """
         n, width = len(steps), sum(own.itemsize for own in self._dtypes.values())
         if n * width > MAX_READ_BYTES:

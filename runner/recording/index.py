@@ -33,7 +33,7 @@ T = TypeVar("T")
 MAX_CHUNKS: Final = 1 << 21
 """The most chunks that a recording is read with: a chunk of steps holds 256 or more."""
 MAX_RECORD_BYTES: Final = 1 << 16
-"""The largest record of a summary, schema or channel; the recorder's are below 4 KiB."""
+"""The largest record of a summary, schema or channel; the recorder's are below 4 kB."""
 _PIECE: Final = 1 << 20
 _CHUNK_INDEX_HEAD: Final = struct.Struct("<QQQQI")
 _OFFSET_ENTRY: Final = struct.Struct("<HQ")

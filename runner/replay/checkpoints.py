@@ -27,7 +27,7 @@ from runner.util.files import TABLES, cache_folder, replacing
 
 CHECKPOINT_STEPS: Final = 1 << 20
 """Training steps between checkpoints: replayed in well under half a second."""
-MAX_CACHE_BYTES: Final = 2 << 30
+MAX_CACHE_BYTES: Final = 2 * 10**9
 """The most that all checkpoints of all runs take; beyond it the least recently used are removed."""
 
 

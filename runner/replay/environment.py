@@ -29,8 +29,8 @@ from runner.replay.makers import why_not_redone
 from runner.replay.redone import RedoneSteps
 from runner.util.processes import CallFailed, ChildProcess, TimedOut, report_progress
 
-MEMORY_BYTES: Final = 4 << 30
-"""How much a child process may allocate; importing RLlib, which wraps many games, takes 2 GiB of it."""
+MEMORY_BYTES: Final = 4 * 10**9
+"""How much a child process may allocate; importing RLlib, which wraps many games, takes 2.1 GB of it."""
 SECONDS: Final = 60.0
 """How long a child process may take for a block of steps, which is meant to take 0.2 s, or to begin."""
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from runner.util.humanize import counted
+from runner.util.humanize import counted, setting
 from runner.util.values import Json, flatten, is_whole
 
 PATHS: Final = ("config.origin.", "branches")
@@ -66,7 +66,7 @@ class TrainingOrigin:
     def changes(self) -> str:
         """What was changed: `taxi 1 north, epsilon 0.1`."""
         changes = [f"{agent.replace('_', ' ')} {action}" for agent, action in self.actions.items()]
-        changes += [f"{path} {value}" for path, value in flatten(self.settings).items()]
+        changes += [f"{path} {setting(value)}" for path, value in flatten(self.settings).items()]
         total = "" if self.episodes is None else f", {counted(self.episodes, 'episode')} in all"
         return ", ".join(changes) or f"nothing changed{total}"
 

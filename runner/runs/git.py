@@ -19,6 +19,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from runner.util.humanize import size
+
 GIT_SECONDS: Final = 2.0
 """The time limit of all that is read of a repository."""
 MAX_PATCH_BYTES: Final = 8 << 20
@@ -199,7 +201,7 @@ class _Git:
         if is_late.is_set():
             raise NotRecorded(f"git {command} was stopped: reading the repository took {self._seconds:g} s")
         if len(output) > limit:
-            raise NotRecorded(f"git {command} was stopped: it wrote more than {limit >> 20} MiB")
+            raise NotRecorded(f"git {command} was stopped: it wrote more than {size(limit)}")
         if process.returncode and not may_fail:
             raise NotRecorded(_reason(self.message))
         return output.decode(errors="replace")

@@ -231,7 +231,7 @@ def _processor() -> str:
 
 def _memory() -> str:
     try:
-        return f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / (1 << 30):.1f} GiB"
+        return f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 1e9:.1f} GB"
     except (AttributeError, ValueError, OSError):
         return ""
 
@@ -250,7 +250,7 @@ def _containers() -> Iterator[str]:
     if len(limit) == 2 and all(map(str.isdecimal, limit)):
         yield f"{int(limit[0]) / max(1, int(limit[1])):g} processors"
     if (limit_bytes := _text("/sys/fs/cgroup/memory.max").strip()).isdecimal():
-        yield f"{int(limit_bytes) / (1 << 30):.1f} GiB"
+        yield f"{int(limit_bytes) / 1e9:.1f} GB"
 
 
 def _nvidia() -> dict[str, str]:

@@ -1,6 +1,6 @@
 """A pool of child processes for work that is long, needs much memory, or cannot be trusted to end.
 
-    with ProcessPool(processes=2, seconds=600, memory_bytes=4 << 30) as pool:
+    with ProcessPool(processes=2, seconds=600, memory_bytes=4 * 10**9) as pool:
         result = await pool(function, argument)
 
 A thread waits for each busy process: unlike an event loop that waits for a pipe, this works on every

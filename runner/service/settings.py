@@ -61,7 +61,7 @@ class Limits:
     """Steps or episodes in an Arrow response."""
     work_seconds: float = 600.0
     """Time for a comparison, a plot or an export, which are computed in child processes."""
-    work_bytes: int = 4 << 30
+    work_bytes: int = 4 * 10**9
     """Memory that one of them may allocate."""
     cache_bytes: int = 20 * MB
     """Size of the cache of responses."""

@@ -71,6 +71,10 @@ class Range(Section):
         value = Decimal(str(self.low)) + number * Decimal(str(self.step or 1))
         return int(value) if self.is_integer else float(value)
 
+    def nearest(self, value: float) -> int | float:
+        """Return the value of whole steps next to one that was added up in floating point."""
+        return value if self.step is None else self.at(round((value - self.low) / self.step))
+
     @property
     def last(self) -> int | float:
         """The highest value that whole steps reach."""

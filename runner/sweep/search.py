@@ -79,7 +79,9 @@ class Search:
         """Return the next trial of Optuna and its values; choices are JSON there."""
         trial = self._study.ask(self._space)
         return trial, {
-            path: trial.params[path] if isinstance(parameter, Range) else json.loads(trial.params[path])
+            path: parameter.nearest(trial.params[path])
+            if isinstance(parameter, Range)
+            else json.loads(trial.params[path])
             for path, parameter in self._file.parameters.items()
         }
 

@@ -7,6 +7,7 @@ recordings/k3v9m2xq/labels.json      one of its runs: it has the tag sweep=NAME
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
@@ -23,7 +24,7 @@ from runner.sweep import FILE, folder_of, sweeps_in, tag_of
 from runner.sweep.loading import from_values
 from runner.sweep.model import Sweep
 from runner.util.files import read_object, replacing, storage_errors, write_object
-from runner.util.values import flatten
+from runner.util.values import JsonView, flatten
 
 FAILED: Final = "failed.json"
 MAX_FAILED_BYTES: Final = 8 << 20
@@ -126,12 +127,21 @@ def is_over(run: Run) -> bool:
     return run.file.status == "finished" or PRUNED in run.tags
 
 
+def job_identity(config: JsonView, seed: int) -> str:
+    """Return the identity of a job of a sweep, of its configuration with numbers of 15 digits.
+
+    Runs of older sweeps have 0.7000000000000001 where 0.7 is tried now, and belong to the same trial.
+    """
+    rounded = json.loads(json.dumps(config), parse_float=lambda text: float(f"{float(text):.15g}"))
+    return identity_of(rounded, seed)
+
+
 def runs_of(name: str, recordings: Path) -> dict[str, Run]:
     """Return the runs of a sweep by the identity of their job; of two, the one that is over."""
     runs: dict[str, Run] = {}
     for run in list_runs(recordings):
         if tag_of(name) in run.tags:
-            identity = identity_of(run.file.config, run.seed)
+            identity = job_identity(run.file.config, run.seed)
             if identity not in runs or (is_over(run) and not is_over(runs[identity])):
                 runs[identity] = run
     return runs

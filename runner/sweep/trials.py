@@ -12,7 +12,6 @@ from typing import Literal
 import numpy as np
 
 from runner.config import ConfigError
-from runner.config.job import identity_of
 from runner.sweep import state
 from runner.sweep.model import Sweep
 from runner.sweep.objective import Curve, pruning_bounds, value_of
@@ -97,7 +96,7 @@ class Trials:
             except ConfigError as error:
                 batch.append(Trial(number, values, {}, {}, str(error)))
             else:
-                identities = {seed: identity_of(config, seed) for seed in self.sweep.seeds}
+                identities = {seed: state.job_identity(config, seed) for seed in self.sweep.seeds}
                 batch.append(Trial(number, values, config, identities))
         return batch
 

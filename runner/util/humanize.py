@@ -5,8 +5,9 @@ A minus is a hyphen everywhere, in text, tables and pictures, so that numbers ca
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 UNKNOWN: Final = "–"
@@ -74,6 +75,17 @@ def measure(value: float | None) -> str:
     if value is None or not math.isfinite(value):
         return "not finite"
     return f"{value:,.0f}" if 1e4 <= abs(value) < 1e15 else f"{value:,.4g}"
+
+
+def setting(value: object) -> str:
+    """Return a value of a configuration as text, exact: `true`, `0.25`, `linear 1 to 0.1 over 5,000`."""
+    if isinstance(value, Mapping) and value.get("schedule") == "linear":
+        return f"linear {setting(value['start'])} to {setting(value['end'])} over {value['over']:,}"
+    if value is None:
+        return "not set"
+    if isinstance(value, float):
+        return f"{value:g}" if float(f"{value:g}") == value else repr(value)
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
 
 
 def number_column(values: Sequence[float]) -> list[str]:

@@ -1,6 +1,6 @@
 """A child process that calls functions within limits on time and memory.
 
-    with ChildProcess(memory_bytes=1 << 30) as child:
+    with ChildProcess(memory_bytes=10**9) as child:
         result = child.call(function, argument, seconds=60)
 
 For work that is long, needs much memory, or runs code that cannot be trusted to end. The thread that calls
@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, Final, ParamSpec, Self, TypeVar
 
 from runner.errors import RunnerError
+from runner.util.humanize import size
 
 _RESERVE_BYTES: Final = 64 << 20
 """Memory counts as used up if no block of this size is left."""
@@ -171,7 +172,7 @@ class ChildProcess:
                 "the process that worked on this died; it may have run out of memory."
             ) from None
         if kind == "memory":
-            limit = f"{self._memory_bytes / (1 << 30):g} GiB"
+            limit = size(self._memory_bytes)
             raise OutOfMemory(f"this needs more than {limit} of memory, and was given up; ask for less.")
         if kind == "error":
             cls, arguments, attributes = result

@@ -184,13 +184,13 @@ def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: 
     if len({env_id for _, env_id in environments} - {""}) > 1:
         where = ", ".join(f"{env_id} in {label}" for label, env_id in environments if env_id)
         yield (
-            f"the environments differ ({where}): their figures do not measure the same; --normalise minmax, "
-            "or a table of scores, compares algorithms that all ran in the same environments"
+            f"the environments differ ({where}): their figures do not measure the same; normalised, by "
+            "`minmax` or a table of scores, algorithms are compared that all ran in the same environments"
         )
     if moment.kind == "last" and all(metric.startswith("training.") for metric, _ in metrics):
         yield (
             f"training is compared, {moment_in_words(moment, [metric for metric, _ in metrics], groups)}; "
-            "--moment area takes the mean over all of it"
+            "the moment `area` takes the mean over all of it"
         )
     yield from window_notes(groups, [metric for metric, _ in metrics], moment)
     digests = {

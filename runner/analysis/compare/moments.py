@@ -146,7 +146,7 @@ def uneven_ends(groups: Sequence[Group], metric: str, line: str) -> list[str]:
     shared = set.intersection(*(set(points) for _, points in curves))
     if axis is not EPISODES:  # where runs are interpolated
         shared = {min(last.values())}
-    hint = f"; --moment {max(shared):.10g} compares after as many" if shared else ""
+    hint = f"; the moment {max(shared):.10g} compares after as many" if shared else ""
     return [f"the last {what} is {ends}{hint}"]
 
 
@@ -164,7 +164,7 @@ def moment_of(
     if target is not None:
         if moment != "last" or chosen:
             raise RunnerError(
-                "target: it names its metric and when it is read, so it excludes --metric and --moment; "
+                "target: it names its metric and when it is read, so it excludes metric and moment; "
                 "drop it or them."
             )
         metric, level = target
@@ -225,7 +225,7 @@ def value_of(
     if moment.kind == "position":
         return _at(points, moment), f"has none after {moment.axis.moment(moment.number)}"
     if not run.finished:
-        return None, "not finished; --moment EPISODE takes it as far as it got"
+        return None, "not finished; an episode as the moment takes it as far as it got"
     if moment.kind == "area":
         return _area(points, metric, line, groups)
     if moment.level is not None:

@@ -100,9 +100,7 @@ def metric_of_tasks(groups: Sequence[Group], chosen: Sequence[str]) -> tuple[str
         pairs = [pair for pair in pairs if pair[0].endswith("mean_return")] or pairs[:1]
     if len(pairs) > 1:
         names = [".".join(filter(None, pair)) for pair in pairs]
-        raise RunnerError(
-            f"--metric: found {listed(names)}, expected one, as environments are compared by it."
-        )
+        raise RunnerError(f"metric: found {listed(names)}, expected one, as environments are compared by it.")
     return pairs[0]
 
 
@@ -202,7 +200,7 @@ def _common_tasks(found: Mapping[str, Mapping[str, Values]], notes: list[str]) -
         listing = "; ".join(f"{label}: {listed(list(own)) or 'none'}" for label, own in found.items())
         raise RunnerError(
             f"normalise: found no environment that all have a value in ({listing}), expected one at least; "
-            "--by PATH groups the runs otherwise, such as by name."
+            "group the runs otherwise, such as by name."
         )
     if left_out := [task for task in every if task not in tasks]:
         notes.append(f"left out, as not every group has a value there: {listed(left_out)}")

@@ -50,7 +50,7 @@ def metric_diffs(a: Recording, b: Recording, targets: Mapping[str, float]) -> li
     for name in targets:
         if names and name not in names:
             listed = ", ".join(names)
-            raise RunnerError(f"--target: found {name!r}, expected one of {listed}.{nearest(name, names)}")
+            raise RunnerError(f"target: found {name!r}, expected one of {listed}.{nearest(name, names)}")
     return [_metric_diff(name, values[0][name], values[1][name], targets.get(name)) for name in names]
 
 

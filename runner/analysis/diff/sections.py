@@ -15,7 +15,7 @@ from runner.analysis.sections import Grid, Section
 from runner.environments.naming import spoken
 from runner.recording.reader import Recording
 from runner.runs.branches import PATHS
-from runner.util.humanize import UNKNOWN, counted
+from runner.util.humanize import UNKNOWN, counted, setting
 
 _MAX_SETTINGS: Final = 4
 """Settings that are named in the first sentences."""
@@ -25,7 +25,7 @@ def sections(difference: RunDiff, everything: bool = False) -> list[Section]:
     """Return the text of a difference; `everything` includes what does not differ."""
     found = [
         _runs(difference),
-        _values("Configuration", difference, "config"),
+        _values("Configuration", difference, "config", setting),
         _environment(difference),
         _training(difference),
         _evaluation(difference),
@@ -74,8 +74,7 @@ def summary(difference: RunDiff) -> str:
         if change.path.split(".")[0] not in NOT_CONTENT and not (is_branch and change.path.startswith(PATHS))
     ]
     if settings:
-        values = [("not set" if c.a is None else c.a, "not set" if c.b is None else c.b) for c in settings]
-        named = [f"{c.path} ({a} in A, {b} in B)" for c, (a, b) in zip(settings, values, strict=True)]
+        named = [f"{c.path} ({setting(c.a)} in A, {setting(c.b)} in B)" for c in settings]
         more = len(named) - _MAX_SETTINGS
         listed = "; ".join([*named[:_MAX_SETTINGS], *([f"and {more} more"] if more > 0 else [])])
         sentences.append(f"Of the settings, {listed} {'differ' if len(settings) > 1 else 'differs'}.")
@@ -100,7 +99,7 @@ def summary(difference: RunDiff) -> str:
 
 
 def _text(value: object) -> str:
-    return UNKNOWN if value is None else str(value)
+    return UNKNOWN if value is None else setting(value)
 
 
 def _amount(value: object) -> str:

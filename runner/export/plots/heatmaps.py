@@ -19,7 +19,9 @@ _TITLES: Final = {
     "action": "Actions in training",
     "reward": "Rewards in training",
 }
-_LETTERS: Final = 11
+_MAX_LETTERS: Final = 20
+_LETTER: Final = 4.8
+"""The width of a letter of a label, with room for wide ones."""
 EXPLANATION: Final = (
     "In each stretch of training, the share of its values in each range: the lighter, the more; nothing is "
     "drawn where there is none."
@@ -42,7 +44,8 @@ def heatmap_chart(histogram: Histogram) -> Chart:
     totals = counts.sum(axis=1, keepdims=True)
     shares = np.divide(counts, totals, out=np.zeros_like(counts), where=totals > 0)
     rows = counts.shape[1]
-    left = 74.0 if histogram.names else 56.0
+    names = [shortened(name, _MAX_LETTERS) for name in histogram.names]
+    left = max(56.0, 16 + _LETTER * max(map(len, names), default=0))
     x = Scale(0.0, histogram.edges[-1], left, WIDTH - 16)
     low, high = (0.0, float(rows)) if histogram.names else (histogram.values[0], histogram.values[-1])
     y = Scale(low, high, HEIGHT - 34, 34.0)
@@ -62,9 +65,9 @@ def heatmap_chart(histogram: Histogram) -> Chart:
     for tick, text in labelled(ticks, short=histogram.edges[-1] >= 10_000):
         chart.shape([(x.at(tick), y.start), (x.at(tick), y.start + 3)], stroke=palette.INK)
         chart.text(x.at(tick), y.start + 11.5, text, "middle", size=8)
-    named = [(k + 0.5, name) for k, name in enumerate(histogram.names)]
+    named = [(k + 0.5, name) for k, name in enumerate(names)]
     for at, name in named[:: -(-rows // 10)] or [(tick, number_on_axis(tick)) for tick in y.ticks]:
-        chart.text(x.start - 5, y.at(at) + 3, shortened(name, _LETTERS), "end", size=8)
+        chart.text(x.start - 5, y.at(at) + 3, name, "end", size=8)
     chart.text(x.start, 14.0, title, size=9.5, bold=True)
     chart.text(x.start, 26.0, f"{histogram.unit}; lightest: {100 * shares.max():.0f} %", size=SMALL)
     chart.text((x.start + x.end) / 2, HEIGHT - 5, histogram.axis.label, "middle")

@@ -13,7 +13,7 @@ from typing import Any, Final
 from runner.errors import RunnerError, nearest
 from runner.recording.metrics import METRICS
 from runner.runs.run import RECORDING_FILE
-from runner.util.humanize import UNKNOWN, age, duration, measure, number, size
+from runner.util.humanize import UNKNOWN, age, duration, measure, number, setting, size
 
 IndexRow = dict[str, Any]
 """A run as the index has it, by the names of the stored columns."""
@@ -246,7 +246,7 @@ def as_text(row: IndexRow, name: str) -> str:
     if name == "episodes" and row["episodes_to_do"] not in (None, found):
         return f"{UNKNOWN if found is None else f'{found:,}'} of {row['episodes_to_do']:,}"
     if name.startswith(SETTING):
-        return UNKNOWN if found is None else str(found)
+        return UNKNOWN if found is None else setting(found)
     column = _column(name)
     return column.if_empty if found is None or found in ([], {}) else column.show(found)
 

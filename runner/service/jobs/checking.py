@@ -31,14 +31,15 @@ from runner.service.processes import ProcessPool
 from runner.sweep import state, sweeps_in
 from runner.sweep.loading import from_text as sweep_from_text
 from runner.sweep.search import Search, require_optuna
+from runner.util.humanize import size
 from runner.util.processes import OutOfMemory, ProcessDied, TimedOut
 
 Args = ParamSpec("Args")
 PROCESSES: Final = 2
 """Checks that run at the same time."""
 CHECK_SECONDS: Final = 30.0
-MEMORY_BYTES: Final = 1 << 30
-"""Memory limit of a check; the arrays of an environment may have 128 MiB."""
+MEMORY_BYTES: Final = 10**9
+"""Memory limit of a check; the arrays of an environment may have 134 MB."""
 QUEUE_SECONDS: Final = 30.0
 """Time until a check that has not begun is refused."""
 KEEP_SECONDS: Final = 60.0
@@ -172,7 +173,9 @@ class JobChecker:
             ConfigError: as for `check`, or it is too large, or its check took too much time or memory.
         """
         if len(text) > MAX_BYTES or len(text.encode()) > MAX_BYTES:
-            raise ConfigError(f"{source}: larger than 1 MiB, expected a configuration of a few kilobytes")
+            raise ConfigError(
+                f"{source}: larger than {size(MAX_BYTES)}, expected a configuration of a few kilobytes"
+            )
         return await self.call(source, _check_as_config_errors, text, source, self._recordings)
 
     async def call(
@@ -189,9 +192,7 @@ class JobChecker:
         except TimedOut:
             message = f"took longer than {CHECK_SECONDS:g} s to check; is env.kwargs sound?"
         except OutOfMemory:
-            message = (
-                f"its environment needs more than {MEMORY_BYTES / (1 << 30):g} GiB of memory to be made."
-            )
+            message = f"its environment needs more than {size(MEMORY_BYTES)} of memory to be made."
         except ProcessDied:
             message = "its environment ended the process that was checking it."
         raise ConfigError(f"{source}: {message}")

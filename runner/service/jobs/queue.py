@@ -13,6 +13,7 @@ from runner.service.jobs.checking import CheckedJob, JobChecker
 from runner.service.jobs.store import Job, JobStore, now
 from runner.service.jobs.workers import WorkerPool
 from runner.sweep.cluster import require_ray
+from runner.util.humanize import size
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,8 @@ class JobQueue:
         free = free_bytes(self.recordings)
         if checked.bytes > free:
             raise StorageError(
-                f"{checked.name}: its recordings need about {checked.bytes / 1e9:,.1f} GB, and "
-                f"{free / 1e9:,.1f} GB are free: free some, or record less (recording.steps, seeds)."
+                f"{checked.name}: its recordings need about {size(checked.bytes)}, and "
+                f"{size(free)} are free: free some, or record less (recording.steps, seeds)."
             )
         with self.store.lock:
             if checked.kind == "sweep":

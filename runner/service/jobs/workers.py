@@ -21,6 +21,7 @@ from runner.service.jobs.channel import JobSpec, Message, Outcome, Slots
 from runner.service.jobs.store import WITHOUT_RUNS, Job, JobStore, now
 from runner.service.jobs.worker import work
 from runner.service.logs import LOG
+from runner.util.humanize import size
 
 STOP_SECONDS: Final = 15.0
 """How long a worker may take to close its recording before it is killed."""
@@ -204,8 +205,7 @@ class WorkerPool:
         free = free_bytes(self._store.recordings)
         if free >= RESERVE_BYTES:
             return ""
-        needed = f"{RESERVE_BYTES / 1e6:,.0f} MB"
-        return f"disk: {free / 1e6:,.0f} MB are free, and a job is started when {needed} are"
+        return f"disk: {size(free)} are free, and a job is started when {size(RESERVE_BYTES)} are"
 
     def _receive(self) -> None:
         """Receive messages of workers, and handle those that died or do not stop."""

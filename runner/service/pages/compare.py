@@ -307,7 +307,7 @@ def _compared(runs: list[Run], here: str) -> Compared:
 
 
 def _flat(run: Run) -> dict[str, str]:
-    return {key: str(value) for key, value in flat_config(run.file.config).items()}
+    return {key: humanize.setting(value) for key, value in flat_config(run.file.config).items()}
 
 
 def _results(runs: list[Run]) -> Rows:

@@ -193,7 +193,7 @@ def test_grouping_by_a_value_of_the_configuration():
         ("schedule.over = 5", 2),
         ("schedule.over = 9", 2),
     ]
-    with pytest.raises(RunnerError, match=r"--by: found 'schedule.ever'.*Did you mean 'schedule.over'"):
+    with pytest.raises(RunnerError, match=r"by: found 'schedule.ever'.*Did you mean 'schedule.over'"):
         grouped(series, "schedule.ever")
 
 
@@ -253,7 +253,7 @@ def test_interrupted_runs_are_left_out_and_taken_at_an_episode_that_they_have():
 
 def test_groups_of_other_lengths_and_modes_are_compared_as_far_as_they_can_be():
     series = [run(0, [0, 10]), run(0, [0, 10, 20], name="b")]
-    assert "--moment 100 compares" in result(series).metrics[0].notes[0]
+    assert "the moment 100 compares" in result(series).metrics[0].notes[0]
     series = [run(0, [0, 1], metric="mean_return", line=line, mode=line) for line in ("agency", "taxi_1")]
     groups, _ = grouped(series)
     metrics = metrics_of(groups)

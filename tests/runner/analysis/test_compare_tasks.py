@@ -277,7 +277,7 @@ def test_the_command_prints_text_and_json_and_writes_a_page_and_a_figure(folder,
     [
         (["--normalise", "nothing.csv"], "nothing.csv: cannot be read"),
         (["--normalise", "minmax", "--target", "training.mean_return=3"], "found a target as well"),
-        (["--normalise", "minmax", "--metric", "nothing"], "--metric: found 'nothing'"),
+        (["--normalise", "minmax", "--metric", "nothing"], "metric: found 'nothing'"),
         (
             ["--normalise", "minmax", "--metric", "training.mean_return", "--metric", "training.mean_length"],
             "expected one, as environments",
@@ -321,7 +321,7 @@ def test_training_is_compared_by_the_mean_of_the_last_100_episodes(tmp_path):
     values = {group["label"]: group["values"][0] for group in plain["metrics"][0]["groups"]}
     assert sorted(values.values()) == pytest.approx(sorted([0, 0, *mean.values()]))
     assert not any("env_id" in label for label in values)
-    assert any("--normalise minmax" in note for note in plain["notes"])
+    assert any("normalised, by `minmax`" in note for note in plain["notes"])
     text = compared_as("--normalise", "minmax")
     assert "the mean over the last 12 to 100 episodes of training" in text
     assert "last evaluation" not in text

@@ -309,7 +309,7 @@ def test_a_value_that_unpacks_to_more_than_the_memory_limit_is_refused(tmp_path,
     forged = Manifest(manifest.run, manifest.topics, entries_of(folder))
     (folder / layout.MANIFEST).write_bytes(forged.to_json())
     monkeypatch.setattr(places, "MEMORY_BYTES", 256 << 20)
-    with pytest.raises(RecordingError, match=r"needs more than 0\.25 GiB of memory"):
+    with pytest.raises(RecordingError, match=r"needs more than 268 MB of memory"):
         places.restore_to(folder, tmp_path / "back.mcap", manifest.digest, lambda _: None)
     assert not (tmp_path / "back.mcap").exists()
     steps = []

@@ -361,7 +361,7 @@ def test_evaluate(command, copied):
     [
         (("--start", "each", "--trials", 3), "leave out --trials"),
         (("--step", 10**9), "expected at least"),
-        (("--start", 10**7), "--start: found state 10000000, expected one of 0 to 6143."),
+        (("--start", 10**7), "start: found state 10000000, expected one of 0 to 6143."),
         (("--seed", -1), "-1"),
     ],
 )

@@ -113,7 +113,7 @@ def test_a_small_disk_needs_confirmation_on_a_terminal(command, tiny, monkeypatc
 def test_problems_of_a_configuration_are_listed_one_per_line(command, tiny):
     result = command("run", tiny, "--set", "episodez=3", "--set", "epsilon=2")
     assert result.exit_code == 2
-    assert "--set epsilon=2: epsilon: found 2" in result.stderr
+    assert "epsilon=2: epsilon: found 2" in result.stderr
     assert "Did you mean 'episodes'?" in result.stderr
     assert not command.recordings.exists()
 

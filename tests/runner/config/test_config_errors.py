@@ -229,30 +229,30 @@ def test_a_misspelt_key_is_not_reported_as_missing_too(errors_of):
 @pytest.mark.parametrize(
     ("override", "line"),
     [
-        ("epsilon=1.5", "--set epsilon=1.5: epsilon: found 1.5, expected a number from 0 to 1"),
-        ("epsilonn=1", "--set epsilonn=1: epsilonn: unknown key. Did you mean 'epsilon'?"),
+        ("epsilon=1.5", "epsilon=1.5: epsilon: found 1.5, expected a number from 0 to 1"),
+        ("epsilonn=1", "epsilonn=1: epsilonn: unknown key. Did you mean 'epsilon'?"),
         (
             "log.window=0",
-            "--set log.window=0: log.window: found 0, expected a whole number from 1 to 100,000,000",
+            "log.window=0: log.window: found 0, expected a whole number from 1 to 100,000,000",
         ),
         (
             "epsilon.schedule=linear",
-            "--set epsilon.schedule=linear: epsilon.end: missing, expected a number from 0 to 1",
+            "epsilon.schedule=linear: epsilon.end: missing, expected a number from 0 to 1",
         ),
         (
             "seeds=[1, a]",
-            "--set seeds=[1, a]: seeds[1]: found 'a', expected a whole number from 0 to 2^64 - 1",
+            "seeds=[1, a]: seeds[1]: found 'a', expected a whole number from 0 to 2^64 - 1",
         ),
-        ("epsilon", "--set epsilon: expected KEY=VALUE, such as epsilon=0.2 or evaluation.trials=50"),
-        ("=1", "--set =1: expected KEY=VALUE, such as epsilon=0.2 or evaluation.trials=50"),
-        ("a..b=1", "--set a..b=1: expected KEY=VALUE, such as epsilon=0.2 or evaluation.trials=50"),
+        ("epsilon", "epsilon: expected KEY=VALUE, such as epsilon=0.2 or evaluation.trials=50"),
+        ("=1", "=1: expected KEY=VALUE, such as epsilon=0.2 or evaluation.trials=50"),
+        ("a..b=1", "a..b=1: expected KEY=VALUE, such as epsilon=0.2 or evaluation.trials=50"),
         (
             "epsilon=[1",
-            "--set epsilon=[1: cannot be read as YAML: expected ',' or ']', but got '<stream end>'",
+            "epsilon=[1: cannot be read as YAML: expected ',' or ']', but got '<stream end>'",
         ),
-        ("epsilon={a: 1, a: 2}", "--set epsilon={a: 1, a: 2}: epsilon.a: given twice"),
-        ("epsilon=\n2", "--set 'epsilon=\\n2': epsilon: found 2, expected a number from 0 to 1"),
-        ("epsilon=\0", "--set 'epsilon=\\x00': cannot be read as YAML: the character U+0000"),
+        ("epsilon={a: 1, a: 2}", "epsilon={a: 1, a: 2}: epsilon.a: given twice"),
+        ("epsilon=\n2", "'epsilon=\\n2': epsilon: found 2, expected a number from 0 to 1"),
+        ("epsilon=\0", "'epsilon=\\x00': cannot be read as YAML: the character U+0000"),
         ("a." * 60 + "b=1", "expected a key of at most 50 parts"),
     ],
 )
@@ -262,7 +262,7 @@ def test_errors_name_the_override(errors_of, override, line):
 
 def test_an_override_that_contradicts_the_file_is_refused(errors_of):
     assert errors_of("episodes: 1\nmode: cooperative", ["tables=per_agent"]) == [
-        "--set tables=per_agent: tables: found 'per_agent', but mode: cooperative means tables: joint "
+        "tables=per_agent: tables: found 'per_agent', but mode: cooperative means tables: joint "
         "and rewards: team. Remove `mode`, or this key"
     ]
     assert len(errors_of("episodes: 1", ["seed=1", "seeds=[2]"])) == 1

@@ -26,7 +26,7 @@ from runner.errors import ConfigError
         ("a: " + "[" * 5000, "x.yaml:1:53: cannot be read as YAML: nested deeper than 50 levels"),
         ("a: &a [*a]", "x.yaml:1:4: cannot be read as YAML: aliases make it too large: more than 50 levels"),
         ("a: [" + "1," * 100_001 + "]", "cannot be read as YAML: more than 100000 values"),
-        ("a: " + "x" * (1 << 20), "x.yaml: larger than 1 MiB, expected a configuration of a few kilobytes"),
+        ("a: " + "x" * (1 << 20), "x.yaml: larger than 1.0 MB, expected a configuration of a few kilobytes"),
     ],
 )
 def test_text_that_is_not_a_configuration_is_refused(errors_of, text, line):

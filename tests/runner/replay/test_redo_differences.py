@@ -246,8 +246,8 @@ def test_another_space_is_named(tmp_path):
     [
         (loops.hanging, 2, "longer than 2 s"),
         (loops.crashing, 60, "ended its process"),
-        (loops.hungry, 60, "more than 0.5 GiB"),
-        (loops.reticent, 60, "more than 0.5 GiB"),
+        (loops.hungry, 60, "more than 537 MB"),
+        (loops.reticent, 60, "more than 537 MB"),
     ],
 )
 def test_an_environment_of_bad_habits_ends_with_the_reason(make, seconds, reason, tmp_path, monkeypatch):

@@ -100,7 +100,7 @@ def test_the_child_process_returns_the_result_of_the_function(tmp_path):
         with pytest.raises(ConfigError) as caught:
             check_in_child(checker, "episodes: many", "job.yaml")
         assert caught.value.problems == refused("episodes: many", tmp_path).problems
-        with pytest.raises(ConfigError, match="larger than 1 MiB"):
+        with pytest.raises(ConfigError, match="larger than 1.0 MB"):
             check_in_child(checker, "x" * (1 << 20) + "x", "job.yaml")
 
 
@@ -120,7 +120,7 @@ def test_an_environment_that_hangs_or_kills_affects_only_its_own_process(tmp_pat
 def test_an_environment_that_needs_too_much_memory_is_refused(tmp_path, environments, monkeypatch):
     monkeypatch.setattr(checking, "MEMORY_BYTES", 256 << 20)
     with contextlib.closing(JobChecker(tmp_path)) as checker:
-        with pytest.raises(ConfigError, match=r"needs more than 0\.25 GiB of memory"):
+        with pytest.raises(ConfigError, match=r"needs more than 268 MB of memory"):
             check_in_child(checker, environments["greedy"], "job.yaml")
         assert check_in_child(checker, TINY, "tiny.yaml").runs == 2
 

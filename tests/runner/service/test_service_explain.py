@@ -56,7 +56,7 @@ def test_an_explanation_is_queued_and_is_what_python_computes(client, recordings
         ({"a": "first", "b": "CHANGED", "metric": "sucess_percent"}, 400, "Did you mean 'success_percent'"),
         ({"a": "first", "b": "CHANGED", "seeds": 9999}, 422, "expected at most 10,000 in a job"),
         ({"a": "first"}, 422, "b"),
-        ({"a": "first", "b": "CHANGED", "at": 0}, 400, "--at: found 0"),
+        ({"a": "first", "b": "CHANGED", "at": 0}, 400, "at: found 0"),
     ],
 )
 def test_what_is_wrong_is_refused_before_it_is_queued(client, changed, sent, status, message):

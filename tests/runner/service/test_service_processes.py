@@ -44,7 +44,7 @@ def test_results_and_errors_are_those_of_the_function_on_any_event_loop(pool):
 
 
 def test_a_call_that_exceeds_a_limit_or_dies_fails(pool):
-    with pytest.raises(OutOfMemory, match=r"more than 0\.25 GiB"):
+    with pytest.raises(OutOfMemory, match=r"more than 268 MB"):
         pool.submit(bytearray, 2 * MEMORY).result()
     with pytest.raises(ProcessDied):
         pool.submit(os._exit, 3).result()

@@ -42,7 +42,7 @@ def test_a_range_ends_at_its_last_step_in_decimal_arithmetic():
     assert [values["discount"] for values in grid[::4]] == [0.7, 0.8, 0.9]
     assert [values["epsilon"] for values in grid[:4]] == [0.0, 0.1, 0.2, 0.3]
     drawn = searched(strategy="random", trials=30, parameters=parameters).ask(30)
-    assert {round(values["discount"], 6) for values in drawn} == {0.7, 0.8, 0.9}
+    assert {values["discount"] for values in drawn} == {0.7, 0.8, 0.9}
 
 
 def test_choices_may_be_of_any_kind():

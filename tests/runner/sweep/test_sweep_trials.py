@@ -21,7 +21,7 @@ from runner.runs.run import create_run
 from runner.sweep import local, state
 from runner.sweep.loading import from_values
 from runner.sweep.local import LocalWorkers
-from runner.sweep.model import Objective
+from runner.sweep.model import Objective, Range
 from runner.sweep.plan import plan_of
 from runner.sweep.results import ranking, results_of, sections
 from runner.sweep.running import run_sweep
@@ -66,6 +66,22 @@ def test_a_sweep_interrupted_twice_ends_like_an_undisturbed_one(done, sweep, tmp
     assert digests(trials) == digests(done[1])
     assert third.done == 12 - 3 - 4
     assert len(list_runs(tmp_path)) == 12
+
+
+def test_runs_whose_values_were_added_up_in_floating_point_belong_to_their_sweep(tmp_path, monkeypatch):
+    """0.7000000000000001 was recorded where 0.7 is tried now."""
+    parameters = {"epsilon": {"low": 0.1, "high": 0.7, "step": 0.2}}
+    sweep = from_values(described(strategy="random", trials=6, parameters=parameters))
+    with monkeypatch.context() as patched:
+        patched.setattr(Range, "nearest", lambda _, value: value)
+        before, _ = swept(tmp_path, sweep)
+    decimals = {0.1, 0.3, 0.5, 0.7}
+    assert not {run.file.config["epsilon"] for run in list_runs(tmp_path)} <= decimals
+    workers = Here()
+    trials, status = swept(tmp_path, sweep, workers)
+    assert (workers.done, status.failed) == (0, 0)
+    assert [own[1:] for own in digests(trials)] == [own[1:] for own in digests(before)]
+    assert {trial.values["epsilon"] for trial in trials.done} <= decimals
 
 
 def test_resuming_a_run_of_other_code_is_refused(done, sweep, tmp_path, monkeypatch):
