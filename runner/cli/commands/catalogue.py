@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
@@ -81,26 +81,6 @@ def _from_stdin() -> str:
         raise RunnerError(f"stdin: found bytes that are not UTF-8 ({error}), expected text.") from error
 
 
-_FREED_BY: Final = {
-    "same_content": (
-        "recorded before",
-        "the same content is there already: `dualtaxi rm` those with `same as`",
-    ),
-    "unfinished": (
-        "unfinished",
-        "`dualtaxi prune --status interrupted --status failed`, if they are not to be resumed",
-    ),
-    "left_over": ("left over", "damaged originals kept by repairs, and files of interrupted commands"),
-    "cached": ("cached", "made again when needed; remove the folder dualtaxi in your cache"),
-    "explanations": (
-        "explanations",
-        "what `dualtaxi explain` trained; `dualtaxi prune --explanations` removes it",
-    ),
-    "half_removed": ("half removed", "the next `dualtaxi rm` or `prune` removes the rest"),
-}
-"""Reason why bytes can be freed -> its name, and how to free them."""
-
-
 @click.command("du", cls=Command)
 def du_command(
     words: tuple[str, ...] = filter_argument,
@@ -145,7 +125,7 @@ def du_command(
 
 
 def _draw(largest: Sequence[Usage], sums: Sums, freeable: dict[str, int]) -> None:
-    from runner.runs.catalogue.usage import sizes
+    from runner.runs.catalogue.usage import FREED_BY, sizes
 
     total, shown = sums.by_kind(), sizes(largest)
     kinds = [kind for kind, count in total.items() if count or kind == "total"]
@@ -166,7 +146,7 @@ def _draw(largest: Sequence[Usage], sums: Sums, freeable: dict[str, int]) -> Non
     grid.add_row("all", "", "", *cells(total), style="bold")
     draw(grid)
     reasons = {
-        _FREED_BY[kind][0]: f"{size(count)}  {_FREED_BY[kind][1]}"
+        FREED_BY[kind][0].lower(): f"{size(count)}  {FREED_BY[kind][1]}"
         for kind, count in freeable.items()
         if count
     }

@@ -26,6 +26,21 @@ REMOVED: Final = ".removed-"
 """The prefix of a run's folder from the moment it is removed until its files are deleted."""
 KINDS: Final = ("recording", "checkpoints", "exports", "restored", "other")
 """The kinds of bytes, attributes of `Usage` and `Sums`."""
+FREED_BY: Final = {
+    "same_content": ("Duplicates", "The same content was recorded before: `dualtaxi rm` removes runs."),
+    "unfinished": (
+        "Unfinished",
+        "`dualtaxi prune --status interrupted --status failed`, if they are not to be resumed.",
+    ),
+    "left_over": ("Left over", "Damaged originals that a repair kept, and files of interrupted commands."),
+    "cached": ("Cached", "Created again when needed."),
+    "explanations": (
+        "Explanations",
+        "What was trained for them: `dualtaxi prune --explanations` removes it.",
+    ),
+    "half_removed": ("Half removed", "The next `dualtaxi rm` or `prune` removes the rest."),
+}
+"""What could be freed, with its heading and how to do it."""
 
 _OWN: Final = frozenset((RUN_FILE, RECORDING_FILE, LABELS_FILE, LOCK_FILE, RUN_LOCK))
 _LEFT_OVER: Final = re.compile(

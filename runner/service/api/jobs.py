@@ -128,11 +128,9 @@ async def submit(
     checked = await jobs.checker.check(text, source)  # may take long, so no thread waits for it
 
     def add() -> JobResponse:
-        return job_response(jobs.add(text, checked), jobs)
+        return created(jobs.add(text, checked), jobs, request, response)
 
-    job = await run_sync(add)
-    response.headers["location"] = f"{request.url.path}/{job.number}"
-    return job
+    return await run_sync(add)
 
 
 @router.post(
@@ -283,6 +281,12 @@ def _as_text(event: JobEvent) -> str:
     """Return a server-sent event."""
     head = f"id: {event.id}\n" if event.id else ""
     return f"{head}event: {event.kind}\ndata: {json.dumps(event.as_json(), ensure_ascii=False)}\n\n"
+
+
+def created(job: Job, jobs: JobQueue, request: Request, response: Response) -> JobResponse:
+    """Return the response about a new job, with its address in the header `location`."""
+    response.headers["location"] = f"{request.app.url_path_for('list_jobs')}/{job.number}"
+    return job_response(job, jobs)
 
 
 def job_response(job: Job, jobs: JobQueue) -> JobResponse:

@@ -10,7 +10,7 @@ from starlette.concurrency import run_in_threadpool
 
 from runner.config.document import write_yaml
 from runner.runs.run import Run
-from runner.service.api.jobs import JobResponse, job_response
+from runner.service.api.jobs import JobResponse, created
 from runner.service.dependencies import JobsOf, RecordedRun
 from runner.service.errors import Refused
 from runner.service.jobs.checking import BranchQuestion, CheckedJob, check_branch
@@ -35,8 +35,7 @@ async def branch(
 ) -> JobResponse:
     """Queue a branch of training, as `dualtaxi branch` records it; of a run that was trained here."""
     job = await queue_branch(run, jobs, sent)
-    response.headers["location"] = f"{request.app.url_path_for('list_jobs')}/{job.number}"
-    return await run_in_threadpool(job_response, job, jobs)
+    return await run_in_threadpool(created, job, jobs, request, response)
 
 
 @router.post(
@@ -48,8 +47,7 @@ async def branch(
 async def explain(jobs: JobsOf, sent: ExplainQuestion, request: Request, response: Response) -> JobResponse:
     """Queue an explanation, as `dualtaxi explain` computes it."""
     job = await queue_explanation(jobs, sent)
-    response.headers["location"] = f"{request.app.url_path_for('list_jobs')}/{job.number}"
-    return await run_in_threadpool(job_response, job, jobs)
+    return await run_in_threadpool(created, job, jobs, request, response)
 
 
 async def queue_explanation(jobs: JobQueue, question: ExplainQuestion) -> Job:

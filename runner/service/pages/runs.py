@@ -24,7 +24,7 @@ from runner.runs.catalogue.columns import (
 )
 from runner.runs.catalogue.filters import Filter, parse
 from runner.runs.catalogue.index import Index, order_of
-from runner.runs.catalogue.usage import sizes, usage_of
+from runner.runs.catalogue.usage import FREED_BY, sizes, usage_of
 from runner.service.addresses import Paging, link
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf
@@ -47,21 +47,6 @@ USUAL: Final = (
 FOLDED: Final = ("id", "seed", "tag", "episodes")
 """Columns that a narrow screen leaves out, unless the columns were chosen."""
 ROWS: Final = 50
-FREED_BY: Final = {
-    "same_content": ("Duplicates", "The same content was recorded before: `dualtaxi rm` removes runs."),
-    "unfinished": (
-        "Unfinished",
-        "`dualtaxi prune --status interrupted --status failed`, if they are not to be resumed.",
-    ),
-    "left_over": ("Left over", "Damaged originals that a repair kept, and files of interrupted commands."),
-    "cached": ("Cached", "Created again when needed."),
-    "explanations": (
-        "Explanations",
-        "What was trained for them: `dualtaxi prune --explanations` removes it.",
-    ),
-    "half_removed": ("Half removed", "The next `dualtaxi rm` or `prune` removes the rest."),
-}
-"""What could be freed, with its heading and how to do it."""
 _LEFT: Final = (Kind.START, Kind.TEXT, Kind.STATUS, Kind.PROSE, Kind.TAGS, Kind.DATE)
 _FALLING: Final = (Kind.NUMBER, Kind.SIZE, Kind.DATE)
 """Kinds whose largest values come first after a click on the heading."""
@@ -172,7 +157,7 @@ def disk(request: Request, catalogue: CatalogueOf, settings: SettingsOf, jobs: J
     view = _DiskView(
         total=sums.by_kind(),
         free=jobs.status().free_bytes,
-        freeable=[(*FREED_BY[kind], size) for kind, size in freeable.items() if size],
+        freeable=[(*FREED_BY[reason], size) for reason, size in freeable.items() if size],
         rows=[(usage.row, sizes([usage])) for usage in largest],
         others=sums.runs - len(largest),
     )
