@@ -16,7 +16,7 @@ import importlib
 import sys
 from typing import TYPE_CHECKING, Any
 
-from runner.util.version import __version__
+from runner.util import __version__
 
 if TYPE_CHECKING:
     import runner.analysis.frames as frames  # noqa: PLR0402

@@ -17,7 +17,6 @@ from typing import Final
 from runner.errors import RecordingError, StorageError
 from runner.runs.run import RUN_FILE, Run
 from runner.util.files import CACHE_VARIABLE, RESTORED, cache_folder, storage_errors
-from runner.util.humanize import size
 from runner.util.processes import ChildProcess, OutOfMemory, ProcessDied, report_progress
 
 ARCHIVE_VARIABLE: Final = "DUALTAXI_ARCHIVE"
@@ -134,7 +133,7 @@ def restore_to(folder: Path, path: Path | None, digest: str, report: Report) -> 
             path.unlink(missing_ok=True)
         if isinstance(error, OutOfMemory | ProcessDied):
             raise RecordingError(
-                f"{folder}: restoring it needs more than {MEMORY_BYTES / (1 << 30):g} GiB of memory: the "
+                f"{folder}: restoring it needs more than {size(MEMORY_BYTES)} of memory: the "
                 "archive is damaged, or was made to exhaust it."
             ) from error
         raise

@@ -19,7 +19,7 @@ import click
 
 from runner.cli.command import Group
 from runner.errors import ConfigError, ConfigProblem, ExitCode, RunnerError, StorageError
-from runner.util.version import __version__
+from runner.util import __version__
 
 COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     "Run": {

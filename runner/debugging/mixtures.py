@@ -35,9 +35,9 @@ from runner.recording import schema
 from runner.recording.blocks import blank_records, topic_dtype
 from runner.sweep.local import Workers
 from runner.sweep.objective import readings
+from runner.util import __version__
 from runner.util.files import storage_errors
 from runner.util.values import Json, finite
-from runner.util.version import __version__
 
 VALUES: Final = "values.jsonl"
 MAX_LINE: Final = 1 << 20

@@ -38,7 +38,7 @@ from runner.recording.index import FOOTER_BODY_BYTES, FOOTER_HEAD, checksum
 from runner.recording.messages import file_descriptor_set
 from runner.recording.records import Contents
 from runner.recording.schema import ALL_TOPICS, KINDS, MESSAGES, PROFILE, Topic
-from runner.util.version import __version__
+from runner.util import __version__
 
 _LIBRARY = f"dualtaxi {__version__}"
 _TWO = struct.Struct("<QQ")

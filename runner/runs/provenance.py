@@ -26,8 +26,8 @@ from blake3 import blake3
 
 from runner.recording.metadata import packed_provenance
 from runner.runs.redaction import is_secret_name, redacted_arguments, redacted_text
+from runner.util import __version__
 from runner.util.values import as_utf8
-from runner.util.version import __version__
 
 CODE_VARIABLE: Final = "DUALTAXI_CODE"
 """Set to `off`, no run records the user's code."""

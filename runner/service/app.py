@@ -34,7 +34,7 @@ from runner.service.sweep_fragments import load_sweep_libraries
 from runner.service.tokens import Sessions, Tokens
 from runner.service.uploads import Upload, Uploads
 from runner.sweep import sweeps_in
-from runner.util.version import __version__
+from runner.util import __version__
 
 API: Final = "/api/v1"
 THREADS: Final = 8

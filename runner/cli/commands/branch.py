@@ -120,8 +120,7 @@ def branch_command(
     from runner.execution.branching import TrainingBranch
 
     action, stop = _action(actions, run), Interrupt()
-    changes = actions or options["overrides"] or options["episodes"] or options["policy"] != "recorded"
-    if not changes:
+    if not (actions or overrides or episodes or policy != "recorded"):
         say(
             f"Note: nothing is changed, so the branch repeats run {run.run_id}. --action changes a step, "
             f"{'--set and --episodes what follows' if run.can_train_again else '--policy what follows'}."

@@ -11,9 +11,8 @@ from typing import Final
 from runner.export.rerun.selection import Request, Selection, select
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
-from runner.util import files
+from runner.util import __version__, files
 from runner.util.files import CACHE_VARIABLE, EXPORTS, RUN_SEPARATOR, storage_errors
-from runner.util.version import __version__
 
 MAX_CACHED: Final = 20
 """Exports in the cache; those that were not used for longest are removed."""

@@ -7,6 +7,7 @@ from fastapi import APIRouter
 from runner.service.pages import (
     branch,
     compare,
+    debugging,
     environments,
     episodes,
     explanations,
@@ -20,9 +21,6 @@ from runner.service.pages import (
     static,
     submit,
     sweeps,
-    what_if,
-    when,
-    why,
 )
 from runner.service.pages.rendering import add_error_handlers, refused
 
@@ -30,7 +28,7 @@ __all__ = ["add_error_handlers", "refused", "router"]
 
 router = APIRouter(include_in_schema=False)
 for _module in (
-    *(runs, rerun, run, setup, replay, when, why, what_if, branch, environments, episodes),
+    *(runs, rerun, run, setup, replay, debugging, branch, environments, episodes),
     *(compare, machine, submit, jobs, sweeps, explanations, static),
 ):
     router.include_router(_module.router)

@@ -29,8 +29,8 @@ from runner.service.api.reading import AxisName
 from runner.service.dependencies import CatalogueOf, ComputationOf
 from runner.service.fragments import ShownDifference
 from runner.service.pages.frame import RunHead, has_tables, head_of, last_evaluation
-from runner.service.pages.panels import Panel, panel_of
 from runner.service.pages.rendering import page
+from runner.service.pages.replay import Panel, panel_of
 from runner.util import humanize
 
 router = APIRouter(prefix="/compare", include_in_schema=False)

@@ -14,9 +14,8 @@ from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.dependencies import EPISODES, RecordedRun
 from runner.service.pages.frame import RunView, head_of
-from runner.service.pages.panels import Panel, panel_of
 from runner.service.pages.rendering import page
-from runner.service.pages.replay import T
+from runner.service.pages.replay import Panel, T, panel_of
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
 

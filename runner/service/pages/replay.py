@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from itertools import islice
-from typing import Annotated, ClassVar, Final, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
 from fastapi import APIRouter, Depends, Query, Request, Response
@@ -19,6 +19,7 @@ from runner.analysis.evaluations import evaluations_of
 from runner.analysis.step_reference import StepRef, reference_to
 from runner.drawing import svg
 from runner.errors import RunnerError
+from runner.export.encoded import picture_note
 from runner.export.reports.rendering import Link, View
 from runner.recording.reader import Recording, open_recording
 from runner.runs.branches import BranchOrigin, Origin, origin_in
@@ -29,7 +30,6 @@ from runner.service.api.replay import STEPS, prepare_pictures
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import EPISODES, CatalogueOf, PicturesOf, RecordedRun, RunComputationOf
 from runner.service.pages.frame import RunView, head_of
-from runner.service.pages.panels import Panel, panel_of
 from runner.service.pages.rendering import message_of, page
 from runner.util.values import JsonView
 
@@ -41,6 +41,31 @@ BEFORE: Final = 250
 """Steps before the requested one in the part that a page shows first, as in `parts.js`."""
 
 T = Annotated[int, Query(ge=0, lt=2**62)]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One of several replays on a page, which one slider moves."""
+
+    label: str
+    number: int | None
+    """Number of its colour, if it has one."""
+    source: str
+    """Address of the episode's data."""
+    pictures: str
+    """Address of its pictures."""
+    scene: str
+    """The grid, as SVG, whose things the script moves; empty without a scene."""
+    has_pictures: bool = False
+    """Whether pictures are fetched."""
+    note: str = ""
+    """Why there is no picture, or no better one."""
+    offset: int = 0
+    """The common step at which the episode begins."""
+    address: str = ""
+    """Address of the page of its replay alone."""
+    episode: str = ""
+    """Path of the episode below the run's replays, where another one may follow it."""
 
 
 @dataclass(frozen=True)
@@ -289,3 +314,13 @@ def _whole(text: str) -> int:
     if text and not (text.isdecimal() and len(text) < 16):
         raise RunnerError(f"found {text[:40]!r}, expected a number of an episode or a trial, from 0.")
     return int(text or 0)
+
+
+def panel_of(
+    recording: Recording, phase: str, source: str, label: str, number: int | None = None, **more: Any
+) -> Panel:
+    """Return the replay of an episode of a phase, whose data has the address `source`."""
+    drawing = svg.drawing_of(recording.mdp) if recording.tabular else None
+    has_pictures, note = picture_note(recording, phase)
+    scene = "" if drawing is None else drawing.frame(None, f"The grid of {label}", style="")
+    return Panel(label, number, source, f"{source}/pictures", scene, has_pictures, note, **more)

@@ -100,7 +100,7 @@ def test_the_child_process_returns_the_result_of_the_function(tmp_path):
         with pytest.raises(ConfigError) as caught:
             check_in_child(checker, "episodes: many", "job.yaml")
         assert caught.value.problems == refused("episodes: many", tmp_path).problems
-        with pytest.raises(ConfigError, match="larger than 1.0 MB"):
+        with pytest.raises(ConfigError, match=r"larger than 1\.0 MB"):
             check_in_child(checker, "x" * (1 << 20) + "x", "job.yaml")
 
 

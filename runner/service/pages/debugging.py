@@ -1,0 +1,146 @@
+"""Questions about how a run learned: when something held, where a Q-value comes from, where actions lead."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from http import HTTPStatus
+from typing import Annotated, ClassVar, Final
+
+from fastapi import APIRouter, Query, Request, Response
+from pydantic import Field
+from starlette.concurrency import run_in_threadpool
+
+from runner.analysis.step_reference import StepRef
+from runner.debugging.expressions import MAX_CHARACTERS
+from runner.errors import RunnerError
+from runner.service import fragments
+from runner.service.api.debugging import At
+from runner.service.api.replay import STEPS
+from runner.service.dependencies import ComputationOf, OpenRecording, RecordedRun, RunComputationOf
+from runner.service.fragments import ShownBranches, ShownWhen
+from runner.service.pages.frame import RunView, head_of
+from runner.service.pages.rendering import message_of, page
+from runner.service.pages.replay import BEFORE, ShownStep, T, shown_step
+
+router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
+
+INTERVALS: Final = 200
+"""The most intervals that the page of `when` lists."""
+WHY_STEPS: Final = 30
+"""Steps that the page of `why` lists."""
+StepField = Annotated[str, Query(max_length=40)]
+Name = Annotated[str, Query(max_length=1000)]
+Action = Annotated[str, Field(max_length=200)]
+
+
+@dataclass(frozen=True)
+class _WhenView(RunView):
+    TEMPLATE: ClassVar = "run_when.html"
+    expression: str
+    every: bool
+    first: str
+    last: str
+    found: ShownWhen | None = None
+    problem: str = ""
+
+
+@router.get("/when")
+async def when(
+    request: Request,
+    run: RecordedRun,
+    compute: RunComputationOf,
+    expression: Annotated[str, Query(max_length=MAX_CHARACTERS)] = "",
+    every: Annotated[bool, Query(alias="all")] = False,
+    first: Annotated[StepField, Query(alias="from")] = "",
+    last: Annotated[StepField, Query(alias="to")] = "",
+) -> Response:
+    """Show the form, and the steps after which its expression holds."""
+    form = (head_of(run), "when", expression, every, first, last)
+    if not expression.strip():
+        return page(request, _WhenView(*form))
+    options = (expression, every, first or None, last or None, INTERVALS)
+    try:
+        found = await compute.shown(ShownWhen, fragments.when, *options)
+    except RunnerError as error:
+        return page(request, _WhenView(*form, None, message_of(error, request)), HTTPStatus.BAD_REQUEST)
+    return page(request, _WhenView(*form, found))
+
+
+@dataclass(frozen=True)
+class _WhyView(RunView):
+    TEMPLATE: ClassVar = "run_why.html"
+    learners: tuple[str, ...]
+    state: str
+    action: str
+    agent: str
+    at: str
+    body: str
+    problem: str
+
+
+@router.get("/why")
+async def why(
+    request: Request,
+    run: RecordedRun,
+    recording: OpenRecording,
+    compute: RunComputationOf,
+    state: Name = "",
+    action: Name = "",
+    agent: Name = "",
+    at: Annotated[str, Query(max_length=60)] = "",
+) -> Response:
+    """Show the form, and the parts of the value that it names."""
+    body, problem = b"", ""
+    if state or action or at:
+        given = (text.strip() or None for text in (state, action, agent, at))
+        try:
+            body = await compute(fragments.why, *given, WHY_STEPS, alone=True)
+        except RunnerError as error:
+            problem = message_of(error, request)
+    view = _WhyView(head_of(run), "why", recording.agents, state, action, agent, at, body.decode(), problem)
+    return page(request, view, HTTPStatus.BAD_REQUEST if problem else HTTPStatus.OK)
+
+
+@dataclass(frozen=True)
+class _WhatIfView(RunView):
+    TEMPLATE: ClassVar = "run_what_if.html"
+    at: str
+    title: str
+    found: ShownBranches
+    step: ShownStep
+    source: str
+    """Address of the branch's data."""
+    recorded: str
+    """Address of the recorded episode at the step."""
+
+
+@router.get("/what-if/{at}")
+@router.get("/what-if/{at}/{action}")
+async def what_if(
+    request: Request,
+    run: RecordedRun,
+    compute: ComputationOf,
+    at: At,
+    action: Action | None = None,
+    t: T | None = None,
+) -> Response:
+    """Show where each joint action leads, and the replay of one: the recorded one unless it is named."""
+    step = StepRef.parse(at)
+    shown_t = step.t if t is None else t
+    start = max(0, shown_t - BEFORE)
+    found = await compute.shown(ShownBranches, fragments.what_if_page, run, step, action, start, STEPS)
+
+    def show() -> Response:
+        view = _WhatIfView(
+            run=head_of(run),
+            here="replay",
+            at=str(step),
+            title=f"What if? {step.episode_name}, step {step.t:,}",
+            found=found,
+            step=shown_step(found.part, shown_t),
+            source=f"/api/v1/runs/{run.run_id}/what-if/{step}/{found.action}",
+            recorded=f"/runs/{run.run_id}/replay/{step.episode_path}?t={step.t}",
+        )
+        return page(request, view)
+
+    return await run_in_threadpool(show)
