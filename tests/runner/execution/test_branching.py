@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,6 +15,7 @@ import runner
 from runner.analysis.diff import diff
 from runner.analysis.diff.sections import summary
 from runner.analysis.step_reference import reference_to, training_step
+from runner.cli import cli
 from runner.config import from_mapping
 from runner.config.job import Job
 from runner.errors import ConfigError, RecordingError, RunnerError
@@ -363,6 +365,14 @@ def test_what_cannot_be_branched_leaves_no_run(parent, tmp_path, error, message,
     with pytest.raises(error, match=message):
         branch_training(parent, recordings=tmp_path, **options)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_command_says_that_nothing_is_changed(parent, tmp_path):
+    words = ["branch", str(parent.folder), "--at", str(middle_of(parent)), "--recordings", str(tmp_path)]
+    same, other = (CliRunner().invoke(cli, [*words, *more]) for more in ((), ("--set", "epsilon=0.9")))
+    assert (same.exit_code, other.exit_code) == (0, 0), same.output + other.output
+    assert f"nothing is changed, so the branch repeats run {parent.run_id}" in same.stderr
+    assert "nothing is changed" not in other.stderr
 
 
 def test_a_branch_that_only_goes_on_says_for_how_long(parent, tmp_path):

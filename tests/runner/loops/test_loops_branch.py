@@ -178,6 +178,8 @@ def test_the_command_and_what_show_lists(runs, tmp_path):
     refused = CliRunner().invoke(cli, words)
     assert refused.exit_code == 2
     assert "each action is a branch of its own" in refused.output
+    repeated = CliRunner().invoke(cli, ["branch", run.run_id, "--at", "0:3", "--recordings", str(tmp_path)])
+    assert f"nothing is changed, so the branch repeats run {run.run_id}" in repeated.stderr
     text = command("branch", run.run_id, "--at", "0:3", "--action", "0", "--policy", "constant")
     assert re.search(r"parent +\w+ .*terminated\nbranch +\w+ .*terminated", text)
     assert f"dualtaxi diff {run.run_id}" in text
