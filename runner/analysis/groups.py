@@ -11,7 +11,7 @@ from runner.analysis.axes import Axis
 from runner.analysis.series import RunSeries
 from runner.errors import RunnerError, nearest
 from runner.recording.metrics import METRICS, SHARES
-from runner.util.humanize import listed
+from runner.util.humanize import listed, setting
 from runner.util.values import flatten
 
 _NOT_CONTENT: Final = ("seeds", "recording", "name")
@@ -227,7 +227,7 @@ def _labelled(runs_of: Sequence[Sequence[RunSeries]], names: Sequence[str]) -> l
                     for values in same
                 )
             ]
-        values = ", ".join(f"{key}={own[key]}" for key in differing if key in own)
+        values = ", ".join(f"{key}={setting(own[key])}" for key in differing if key in own)
         groups.append(_group(f"{name}, {values}" if values else name, runs))
     return groups
 

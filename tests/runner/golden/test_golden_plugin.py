@@ -126,4 +126,4 @@ def test_the_examples_of_the_guide_pass_and_find_an_environment_that_changed(tmp
     assert "2 failed, 3 passed" in output
     assert "train episode 0, t 0: reward: recorded 1.0, got 0.0" in output
     assert "train episode 0, t 3: observation: recorded 214, got 314" in output
-    assert "spec.kwargs.is_rainy: recorded not set, here True" in output
+    assert "spec.kwargs.is_rainy: recorded not set, here true" in output
