@@ -17,6 +17,7 @@ from typing import Final
 from runner.errors import RecordingError, StorageError
 from runner.runs.run import RUN_FILE, Run
 from runner.util.files import CACHE_VARIABLE, RESTORED, cache_folder, storage_errors
+from runner.util.humanize import size
 from runner.util.processes import ChildProcess, OutOfMemory, ProcessDied, report_progress
 
 ARCHIVE_VARIABLE: Final = "DUALTAXI_ARCHIVE"
