@@ -156,7 +156,8 @@ def summary(explanation: Explanation) -> list[str]:
         sentences.append("The interval includes 0: there is no clear difference to explain with these seeds.")
     elif explanation.smallest is not None:
         own = explanation.smallest
-        names = " and ".join(own.settings) if len(own.settings) < 3 else ", ".join(own.settings)
+        *others, last = own.settings
+        names = f"{', '.join(others)} and {last}" if others else last
         part = explanation.part(own.mean.value - explanation.value_a.value)
         of = f" of the {len(settings)} settings" if len(settings) > 1 else ""
         make = "alone makes" if len(own.settings) == 1 else "together make"
@@ -249,12 +250,12 @@ def _mixtures_section(explanation: Explanation) -> Section:
     rows = []
     for one in mixtures:
         sides = ("B" if name in one.settings else "A" for name in names)
-        rows.append((*sides, number(one.mean.value), _interval(one.mean)))
+        rows.append((number(one.mean.value), _interval(one.mean), *sides))
     text = f"{counted(explanation.runs, 'run')}, {len(explanation.mixtures)} mixtures of the settings"
     text += f"; {len(mixtures)} of them are listed." if len(mixtures) < len(explanation.mixtures) else "."
     if explanation.trained:
         text += f" {counted(explanation.trained, 'run')} trained now; {duration(explanation.seconds)} in all."
-    return Section("Mixtures", [text], [Grid((*names, explanation.metric, "95 %"), rows)])
+    return Section("Mixtures", [text], [Grid((explanation.metric, "95 %", *names), rows)])
 
 
 def _percent(part: float) -> str:

@@ -86,7 +86,9 @@ def action_in_words(recording: Recording, phase: str, agent: str = "") -> Callab
     """
     if len(recording.agents) > 1 and not agent:
         by_agent = {each: action_in_words(recording, phase, each) for each in recording.agents}
-        return lambda actions: ", ".join(f"{each} {by_agent[each](own)}" for each, own in actions.items())
+        return lambda actions: ", ".join(
+            f"{spoken(each)} {by_agent[each](own)}" for each, own in actions.items()
+        )
     space = recording.spaces["action"]
     start = (space["spaces"][agent] if agent else space).get("start")
     least = start if isinstance(start, int) else 0

@@ -273,7 +273,7 @@ class Recording(TopicReader):
                 start += int(np.count_nonzero(first["t"] == schema.RESET_ONLY))
         if not 0 <= start < stop <= total:
             raise NotInRecording(
-                f"{self.path}: has no {phase_name} episode {episode}; there are {ended}, from 0."
+                f"{self.path}: has no {phase_name} episode {episode:,}; there are {ended:,}, from 0."
             )
         return range(start, stop, stride)
 

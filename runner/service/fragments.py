@@ -251,7 +251,9 @@ def system(path: Path) -> bytes:
     if clock is None:
         return str(shown.paragraphs(["Its recording has no clock: an earlier version made it."])).encode()
     facts = machine_facts(clock, host)
-    text = "Use of the machine was not recorded." if host is None else ""
+    text = ""
+    if host is None:
+        text = "No use of the machine was recorded: it is measured once a second, unless `system` is off."
     html = shown.pairs("Time and machine", facts)
     return str(html + shown.charts("machine", "Over time", text, machine_plots(clock, host))).encode()
 

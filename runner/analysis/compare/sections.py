@@ -12,8 +12,10 @@ from runner.analysis.compare import Comparison, GroupResult, MetricResult, PairR
 from runner.analysis.compare.statistics import FEWEST_TOGETHER, Estimate
 from runner.analysis.compare.tasks import AlgorithmResult
 from runner.analysis.sections import Grid, Section
-from runner.util.humanize import listed
+from runner.util.humanize import counted, listed
 
+_MAX_PAIRS: Final = 6
+"""Pairs of groups whose outcome is a sentence."""
 _MAX_LEVELS: Final = 5
 """Points of a performance profile, or of a curve, that are printed."""
 EXPLANATION: Final = (
@@ -43,10 +45,13 @@ def sections(comparison: Comparison) -> list[Section]:
 
 
 def summary(comparison: Comparison) -> list[str]:
-    """Return the outcome of the first metric, a sentence for each pair of groups."""
+    """Return the outcome of the first metric, a sentence for each of the first pairs of groups."""
     for metric in comparison.metrics:
         if metric.pairs:
-            return [_pair_in_words(metric, pair) for pair in metric.pairs if pair.seeds]
+            pairs = [pair for pair in metric.pairs if pair.seeds]
+            more = len(pairs) - _MAX_PAIRS
+            left_out = [f"The table has {counted(more, 'more pair')}."] if more > 0 else []
+            return [_pair_in_words(metric, pair) for pair in pairs[:_MAX_PAIRS]] + left_out
     return []
 
 

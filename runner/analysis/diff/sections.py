@@ -123,7 +123,7 @@ def _changes_grid(changes: Sequence[Change], text: Callable[[object], str] = _te
 def made_sections(a: Recording, b: Recording) -> tuple[str, Section, Section]:
     """Return how differently two runs were made: in a sentence, the code, and all of the provenance."""
     files, changes = code_changes(a, b), changes_in(a.provenance, b.provenance)
-    provenance = Section("Provenance", grids=_changes_grid(changes))
+    provenance = Section("Provenance", [] if changes else ["the same"], _changes_grid(changes))
     missing = [f"{name} has no recorded code." for name, one in (("A", a), ("B", b)) if not one.code.files]
     code = _code(files)
     if not code.sentences:

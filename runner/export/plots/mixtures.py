@@ -72,5 +72,9 @@ def mixtures_chart(title: str, names: Sequence[str], columns: Sequence[Column]) 
 
 
 def _short(name: str) -> str:
-    """Return a name that fits left of a chart."""
-    return name if len(name) <= _MAX_NAME else f"{name[: _MAX_NAME - 1]}…"
+    """Return a name that fits left of a chart; of a pair of settings the longer one is shortened."""
+    parts = name.split(" x ")
+    if (excess := len(name) - _MAX_NAME) > 0:
+        at = max(range(len(parts)), key=lambda i: len(parts[i]))
+        parts[at] = f"{parts[at][: max(len(parts[at]) - excess - 1, 3)]}…"
+    return " x ".join(parts)

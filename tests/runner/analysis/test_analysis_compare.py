@@ -186,6 +186,18 @@ def test_a_run_done_twice_counts_once_and_is_reported():
     assert "a0x" in notes[0]
 
 
+def test_the_outcomes_of_many_pairs_are_left_to_the_table():
+    series = [
+        run(seed, [0, 50 + i], name=name, discount=i / 10)
+        for i, name in enumerate("abcde")
+        for seed in (0, 1)
+    ]
+    compared = result(series)
+    *outcomes, more = summary(compared)
+    assert len(outcomes) == 6
+    assert more == "The table has 4 more pairs."
+
+
 def test_grouping_by_a_value_of_the_configuration():
     series = [run(seed, [1, seed], schedule={"over": over}) for seed in (0, 1) for over in (5, 9)]
     groups, _ = grouped(series, "schedule.over")

@@ -286,7 +286,7 @@ def test_a_run_without_evaluations_shows_its_last_training_episode(pictured, tmp
 
 
 REFUSED = {
-    "no such episode": (("--episode", 9999), "has no training episode 9999; there are 40, from 0"),
+    "no such episode": (("--episode", 9999), "has no training episode 9,999; there are 40, from 0"),
     "no such evaluation": (("--eval", "7:0"), r"no evaluation after 7 episodes.*nearest after 0"),
     "no such trial": (("--eval", "40:99"), "no trial 99 of the evaluation after 40 episodes; it has 6"),
     "no trial at all": (("--eval", "x"), "expected N:TRIAL"),

@@ -208,7 +208,7 @@ def test_games_and_vectors_have_pictures(tmp_path):
         assert shown.source is Source.REDRAWN
         last = list(shown)[-1]
         assert last.pixels.shape == (700, 700, 3)
-        assert last.action == "agent_0 left, agent_1 left, agent_2 left"
+        assert last.action == "agent 0 left, agent 1 left, agent 2 left"
         assert len(last.returns) == 3
         np.testing.assert_allclose(last.returns, recording.episodes("train")[0]["returns"])
     envs = runner.record_vector(gymnasium.make_vec("CartPole-v1", 3), tmp_path, name="vector")

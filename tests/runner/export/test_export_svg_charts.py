@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from runner.analysis.axes import EPISODES
+from runner.analysis.compare.statistics import Estimate
 from runner.export.plots.chart import Scale
 from runner.export.plots.curves import panel_chart
 from runner.export.plots.metrics import Curve, CurveStyle, Panel, not_drawn, smoothed
+from runner.export.plots.mixtures import bars_chart
 from runner.recording.metrics import SHARES
 
 
@@ -117,3 +119,10 @@ def test_shares_are_stacked_up_to_the_top():
 )
 def test_ticks_are_round_and_few(low, high, log, ticks):
     assert Scale(low, high, 0, 1, log).ticks == pytest.approx(ticks)
+
+
+def test_pairs_with_a_long_name_can_be_told_apart():
+    names = [f"mode + quirks.second_table_uses_first_action x {other}" for other in ("discount", "epsilon")]
+    drawn = bars_chart("together", [(name, Estimate(1.0, 0.5, 1.5)) for name in names]).svg()
+    assert "… x discount" in drawn
+    assert "… x epsilon" in drawn

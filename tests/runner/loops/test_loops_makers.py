@@ -244,7 +244,7 @@ def test_the_agents_of_a_game_have_names_of_actions(tmp_path):
         assert recording.action_names("train") == ()
         described, _ = describer(recording, "train")(next(recording.transitions("train")))
         (first, *_) = Episode(recording, named_episode(recording, "train", 0), "").steps()
-    assert described == "agent_0 no action, agent_1 right, agent_2 up"
+    assert described == "agent 0 no action, agent 1 right, agent 2 up"
     assert first["action_in_words"] == {"agent_0": "no action", "agent_1": "right", "agent_2": "up"}
 
 

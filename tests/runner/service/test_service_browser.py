@@ -155,13 +155,13 @@ def test_seeds_are_one_line_and_single_runs_are_drawn_on_request(page, folder):
     config = {"name": "several", "env": {"id": "FrozenLake-v1"}, "episodes": 60, "seeds": [0, 1, 2, 3]}
     runs = list(runner.run_all(config | {"evaluation": {"every": 20, "trials": 5}}, recordings=folder))
     browser = page("/compare?run=first&" + "&".join(f"run={run.run_id}" for run in runs))
-    wait(browser, lambda: "B C D E: several" in text_of(browser, ".key"))
+    wait(browser, lambda: "B, C, D, E: several" in text_of(browser, ".key"))
     looks = "return [...document.querySelectorAll('.legend .swatch')].map((one) => one.className)"
     first, *others = browser.execute_script(looks)
     assert first not in others
     assert len(set(others)) == 1
     set_field(browser, "lines", True)
-    wait(browser, lambda: "D: several" in text_of(browser, ".key").split("B C D E: several")[0])
+    wait(browser, lambda: "D: several" in text_of(browser, ".key").split("B, C, D, E: several")[0])
 
 
 def test_a_narrow_screen_shows_the_open_tab_the_results_and_both_sides(page):

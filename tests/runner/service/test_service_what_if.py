@@ -45,7 +45,7 @@ def test_the_api_returns_what_python_does(client, recordings):
     ("path", "status", "message"),
     [
         ("first/what-if/eval:60:1:9999", 404, "found no step 9,999"),
-        ("first/what-if/9999:0", 404, "has no training episode 9999"),
+        ("first/what-if/9999:0", 404, "has no training episode 9,999"),
         ("first/what-if/eval:61:1:2", 404, "found no evaluation after 61"),
         ("first/what-if/eval:60:1:2/nrth", 422, "expected a joint action"),
         ("first/what-if/eval:60:1:2/36", 422, "a number from 0 to 35"),

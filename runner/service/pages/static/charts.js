@@ -98,7 +98,7 @@ const named = (id) => runs.find((run) => run.id === id)?.label ?? id;
 function groupName(number) {
   const { label, runs: own } = last.groups[number];
   if (own.length === 1) return named(own[0]);
-  const letters = own.map((id) => named(id).split(": ")[0]).join(" ");
+  const letters = own.map((id) => named(id).split(": ")[0]).join(", ");
   return own.length <= 5 ? `${letters}: ${label}` : `${label}, ${own.length} runs`;
 }
 
@@ -115,18 +115,18 @@ function seriesOf(panel, state) {
     left += keep.filter((kept) => !kept).length;
     const only = (values) => values.filter((_, i) => keep[i]).map((value) => logy && value <= 0 ? null : value);
     const positions = curve.positions.filter((_, i) => keep[i]);
-    const base = { stroke: colour(several ? curve.group : at), dash: DASHES[at % DASHES.length], width: 1.8, points: positions.length < 80 };
+    const base = { stroke: colour(several ? curve.group : at), dash: DASHES[at % DASHES.length], width: 1.8, points: positions.length > 80 ? 0 : positions.length > 1 ? 4 : 9 };
     const add = (values, style) => series.push({ ...base, positions, values, label: "", ...style });
     if (curve.low) {
-      add(only(curve.high), { width: 0, points: false, fill: `${base.stroke}33` });
-      add(only(curve.low), { width: 0, points: false });
+      add(only(curve.high), { width: 0, points: 0, fill: `${base.stroke}33` });
+      add(only(curve.low), { width: 0, points: 0 });
     }
-    curve.runs.forEach((values, i) => add(only(values), { width: 0.7, points: false, stroke: `${base.stroke}aa`, label: `${named(last.groups[curve.group].runs[i])}${curve.line && lines.length > 1 ? `, ${spoken(curve.line)}` : ""}` }));
+    curve.runs.forEach((values, i) => add(only(values), { width: 0.7, points: 0, stroke: `${base.stroke}aa`, label: `${named(last.groups[curve.group].runs[i])}${curve.line && lines.length > 1 ? `, ${spoken(curve.line)}` : ""}` }));
     const values = only(curve.values), label = labelOf(curve, lines);
     if (!curve.smoothed) add(values, { label });
     else {
-      add(values, { stroke: `${base.stroke}55`, width: 1, points: false });
-      add(only(curve.smoothed), { label, points: false });
+      add(values, { stroke: `${base.stroke}55`, width: 1, points: 0 });
+      add(only(curve.smoothed), { label, points: 0 });
     }
   }
   return { series, left, logy };
@@ -242,7 +242,7 @@ function options(panel, series, state, logy, place, key) {
     ticks: { show: false }, font: "12px system-ui, sans-serif", values: (_, ticks) => ticks.map(tick),
   };
   const scale = (log, range) => ({ distr: log ? 3 : 1, range: (_, low, high) => log ? uPlot.rangeLog(low > 0 ? low : 0.1, high > 0 ? high : 1, 10, false) : range(low, high) });
-  const lines = series.map(({ label, stroke, dash, width, points }) => ({ label, stroke, dash, width, spanGaps: true, points: { show: points, size: 4 } }));
+  const lines = series.map(({ label, stroke, dash, width, points }) => ({ label, stroke, dash, width, spanGaps: true, points: { show: points > 0, size: points } }));
   return {
     width: place.clientWidth, height: 216, padding: [8, 22, 0, 0],
     scales: {
