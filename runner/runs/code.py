@@ -107,12 +107,14 @@ class CodeCollector:
         """The entries of the metadata record; empty until it is written."""
         self._is_wanted = is_wanted and is_code_wanted()
         self._found: RecordedCode | None = None
+        self._folder = Path()
         self._deadline = time.monotonic() + WAIT_SECONDS
         if not self._is_wanted:
             return
         cells = _cells()
         with contextlib.suppress(OSError):  # there is no current folder: the thread notes it
             recordings = recordings.absolute()
+            self._folder = _recent.place(cells)[0]
             self._found = _recent.fresh(cells, recordings)
         if self._found is None:
             self._thread = threading.Thread(
@@ -160,7 +162,7 @@ class CodeCollector:
             if not wait:
                 return
             entries = {"code.not_recorded": f"reading it took more than {WAIT_SECONDS:g} s"}
-            if commit := _recent.commit(self._deadline - WAIT_SECONDS):
+            if commit := _recent.commit(self._folder, self._deadline - WAIT_SECONDS):
                 missing = f"what differs from the commit: reading it took more than {WAIT_SECONDS:g} s"
                 entries |= commit | {"git.not_recorded": missing}
             found = RecordedCode(entries)
@@ -186,8 +188,8 @@ class _Recent:
         self.read_at = 0.0
         self.code = RecordedCode({})
         self.recordings = Path()
-        self._commit: tuple[float, dict[str, str]] = 0.0, {}
-        """When commit, branch and remote of the code that is being read were known, and their entries."""
+        self._commit: tuple[Path, float, dict[str, str]] = Path(), 0.0, {}
+        """The folder of the code that is being read, when its commit was known, and the entries of that."""
 
     def unlock(self) -> None:
         """Replace the lock, in a forked process."""
@@ -195,7 +197,7 @@ class _Recent:
 
     def fresh(self, cells: str, recordings: Path) -> RecordedCode | None:
         """Return the code of this process, if it was read a few seconds ago."""
-        _, _, key = self._place(cells)
+        _, _, key = self.place(cells)
         code, before = self.code, self.recordings
         if key != self.key or time.monotonic() - self.read_at > _FRESH_SECONDS:
             return None
@@ -204,27 +206,28 @@ class _Recent:
 
     def read(self, cells: str, recordings: Path) -> RecordedCode:
         """Return the code of this process, read now or a few seconds ago."""
-        folder, script, key = self._place(cells)
+        folder, script, key = self.place(cells)
         with self.lock:
             if (found := self.fresh(cells, recordings)) is not None:
                 return found
-            self._commit = 0.0, {}
-            code = collect(folder, script, cells, recordings, self._note_commit)
+
+            def note(commit: dict[str, str]) -> None:
+                self._commit = folder, time.monotonic(), commit
+
+            self._commit = folder, 0.0, {}
+            code = collect(folder, script, cells, recordings, note)
             # In this order: `fresh` is called without the lock.
             self.key, self.code, self.recordings = (), code, recordings
             self.key, self.read_at = key, time.monotonic()
             return code
 
-    def _note_commit(self, entries: dict[str, str]) -> None:
-        self._commit = time.monotonic(), entries
-
-    def commit(self, began: float) -> dict[str, str]:
-        """Return the entries of commit, branch and remote that were read since a run began, if any."""
-        known_at, entries = self._commit
-        return entries if known_at >= began - _FRESH_SECONDS else {}
+    def commit(self, folder: Path, began: float) -> dict[str, str]:
+        """Return the entries of commit, branch and remote of a folder that were read for a run, if any."""
+        read, known_at, entries = self._commit
+        return entries if read == folder and known_at >= began - _FRESH_SECONDS else {}
 
     @staticmethod
-    def _place(cells: str) -> tuple[Path, Path | None, tuple[str, ...]]:
+    def place(cells: str) -> tuple[Path, Path | None, tuple[str, ...]]:
         """Return the folder of the user's script, the script, and a key of what is collected."""
         script = user_script()
         folder = Path.cwd() if script is None else script.parent

@@ -214,10 +214,11 @@ def test_commit_branch_and_remote_are_known_before_slow_changes(project, monkeyp
     from runner.recording.writer import create_recording
     from runner.runs import code as module
 
-    program, reached = project.parent / "bin" / "git", project.parent / "reached"
+    program, reached, released = (project.parent / name for name in ("bin/git", "reached", "released"))
     program.parent.mkdir()
     program.write_text(
-        f'#!/bin/sh\ncase "$*" in *" status "*) touch {reached}; sleep 60;; esac\n'
+        f'#!/bin/sh\ncase "$*" in *" status "*) touch {reached}\n'
+        f"while [ ! -e {released} ]; do sleep 0.05; done;; esac\n"
         f'exec {shutil.which("git")} "$@"\n'
     )
     program.chmod(0o755)
@@ -233,6 +234,10 @@ def test_commit_branch_and_remote_are_known_before_slow_changes(project, monkeyp
         time.sleep(0.01)
     with create_recording(project / "recording.mcap") as file:
         collector.write(file, wait=True)
+    released.touch()
+    for thread in threading.enumerate():
+        if thread.name == "recording-code":
+            thread.join()
     assert collector.entries == {
         "git": git(project, "rev-parse", "HEAD"),
         "git.branch": "main",
