@@ -250,15 +250,17 @@ class Uploads:
 
     def _store(self, upload: Upload) -> None:
         """Write an upload to disk; remove what is not needed any more when it is over."""
-        self._uploads[upload.owner, upload.id] = upload
         body = self._body(upload)
-        with storage_errors(self._folder):
-            body.parent.mkdir(exist_ok=True)
-            body.touch()
-            write_object(body.with_name(STATE_FILE), _STORED.dump_python(upload, mode="json"))
-            if upload.is_over:
-                self._previews.remove(upload.id, upload.run_id)
-                body.unlink()
+        try:
+            with storage_errors(self._folder):
+                body.parent.mkdir(exist_ok=True)
+                body.touch()
+                write_object(body.with_name(STATE_FILE), _STORED.dump_python(upload, mode="json"))
+                if upload.is_over:
+                    self._previews.remove(upload.id, upload.run_id)
+                    body.unlink()
+        finally:  # clients see it when it is on disk
+            self._uploads[upload.owner, upload.id] = upload
 
     def _require_place(self, owner: str) -> None:
         """Refuse a new upload if too many are open."""
