@@ -13,11 +13,13 @@ import yaml
 from loop_replays import record_loops, serving
 from served import Served
 from starlette.testclient import TestClient
+from uploading import start
 
 import runner
 from runner.client.outbox import outbox_folder
 from runner.service.app import create_app
 from runner.service.settings import Settings
+from runner.service.uploads import Uploads
 
 if TYPE_CHECKING:
     from selenium import webdriver
@@ -129,3 +131,11 @@ def outbox(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     return outbox_folder()
+
+
+@pytest.fixture
+def uploads(tmp_path: Path) -> Iterator[Uploads]:
+    """Return the uploads of a service without runs."""
+    made = start(tmp_path / "runs", spare_bytes=0)
+    yield made
+    made.close()

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
-import secrets
 import shutil
-import threading
-import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from blake3 import blake3
+from uploading import ANNA, BEN, begin, grow, over, send, source, start, visible
 
 from runner.config.job import Job
-from runner.errors import RunnerError, RunNotFound, StorageError
+from runner.errors import RunnerError, RunNotFound
 from runner.execution.resume import resume
 from runner.execution.session import run_job
 from runner.export.mcap import export_mcap
@@ -24,54 +19,9 @@ from runner.recording.labels import Labels, change_labels
 from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run
-from runner.service.errors import Busy, TooManyUploads, UploadConflict, UploadTooLarge
-from runner.service.settings import Limits
-from runner.service.uploads import FOLDER, Uploads, UploadSource
+from runner.service.errors import UploadConflict, UploadTooLarge
+from runner.service.uploads import FOLDER
 from tests.runner.recording.making import TAXIS, experiment, make_run, stopping_after, with_id
-from tests.waiting import until
-
-ANNA, BEN = "anna", "ben"
-
-
-@pytest.fixture
-def uploads(tmp_path):
-    made = start(tmp_path / "runs", spare_bytes=0)
-    yield made
-    made.close()
-
-
-def start(folder: Path, **limits) -> Uploads:
-    return Uploads(folder, Limits(**limits), lambda _: None)
-
-
-def source(data: bytes, **more) -> UploadSource:
-    return UploadSource(digest=blake3(data).hexdigest(), size=len(data), **more)
-
-
-def begin(uploads, owner, data, **more):
-    """Begin the upload of bytes, or find the one that has begun."""
-    return uploads.put(owner, blake3(data).hexdigest(), source(data, **more))
-
-
-def grow(uploads, owner, **known):
-    """Begin an upload of unknown bytes."""
-    return uploads.put(owner, secrets.token_hex(32), UploadSource(**known))
-
-
-def send(uploads, data, owner=ANNA, labels=None, **details):
-    """Upload bytes in one go, and return the upload when its verification is over."""
-    upload = begin(uploads, owner, data, run=details, labels=labels or {})
-    if upload.state == "receiving" and data:
-        upload = uploads.append(owner, upload.id, 0, data)
-    return over(uploads, upload)
-
-
-def over(uploads, upload):
-    return until(lambda upload: upload.state != "verifying", lambda: uploads.get(upload.owner, upload.id))
-
-
-def visible(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir() if path.name[0] != ".")
 
 
 def test_a_recording_becomes_its_run(uploads, taxis, tmp_path):
@@ -300,124 +250,3 @@ def test_a_file_that_became_shorter_is_sent_from_its_beginning(uploads, lake):
     again = uploads.put(ANNA, upload.id, source(data))
     assert (again.id, again.offset) == (upload.id, 0)
     assert over(uploads, uploads.append(ANNA, upload.id, 0, data)).state == "stored"
-
-
-def test_uploads_beyond_the_limits_are_refused(lake, tmp_path):
-    uploads = start(tmp_path / "runs", upload_bytes=1_000, uploads=2)
-    with pytest.raises(UploadTooLarge, match="1,000"):
-        grow(uploads, ANNA, size=1_001)
-    first = grow(uploads, ANNA)
-    with pytest.raises(UploadTooLarge):
-        uploads.append(ANNA, first.id, 0, bytes(1_001))
-    grow(uploads, ANNA)
-    with pytest.raises(TooManyUploads):
-        grow(uploads, BEN)
-    uploads.delete(ANNA, first.id)
-    grow(uploads, BEN)
-    uploads.close()
-    full = start(tmp_path / "full", spare_bytes=1 << 60)
-    with pytest.raises(StorageError, match="room for 0 bytes"):
-        grow(full, ANNA, size=10)
-    full.close()
-
-
-def test_a_full_disk_keeps_what_is_there(uploads, lake, monkeypatch):
-    data = lake.recording.read_bytes()
-    upload = begin(uploads, ANNA, data)
-    real, room = os.write, [6_000]
-
-    def full(descriptor, view):
-        if room[0] == 0:
-            raise OSError(28, "No space left on device")
-        written = real(descriptor, view[: room[0]])
-        room[0] -= written
-        return written
-
-    monkeypatch.setattr("runner.service.uploads.os.write", full)
-    with pytest.raises(StorageError, match="No space left"):
-        uploads.append(ANNA, upload.id, 0, data)
-    monkeypatch.undo()
-    assert uploads.get(ANNA, upload.id).offset == 6_000
-    assert over(uploads, uploads.append(ANNA, upload.id, 6_000, data[6_000:])).state == "stored"
-
-
-def test_the_disk_reserve_holds_for_uploads_of_unknown_size(tmp_path, monkeypatch):
-    uploads = start(tmp_path / "runs", spare_bytes=5_000)
-    upload = grow(uploads, ANNA)
-    free = iter((7_000, 6_000))
-    usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr("runner.service.uploads.shutil.disk_usage", lambda _: usage._replace(free=next(free)))
-    uploads.append(ANNA, upload.id, 0, bytes(2_000))
-    with pytest.raises(StorageError, match="room for 1,000 bytes"):
-        uploads.append(ANNA, upload.id, 2_000, bytes(2_000))
-    assert uploads.get(ANNA, upload.id).offset == 2_000
-    uploads.close()
-
-
-def test_a_limited_number_of_results_is_remembered(lake, tmp_path):
-    shutil.copytree(lake.folder, tmp_path / "runs" / lake.run_id)
-    uploads = start(tmp_path / "runs", uploads=3)
-    for _ in range(9):
-        upload = grow(uploads, ANNA, run_id=lake.run_id, content_digest=lake.summary["content_digest"])
-        assert upload.state == "stored"
-    assert len(uploads.all()) == len(list((tmp_path / "runs" / FOLDER).glob("*/upload.json"))) == 4
-    assert uploads.get(ANNA, upload.id).already
-    uploads.close()
-
-
-def test_old_results_and_abandoned_uploads_are_forgotten(lake, tmp_path):
-    uploads = start(tmp_path / "runs")
-    stored = send(uploads, lake.recording.read_bytes())
-    idle, fresh = grow(uploads, ANNA, name="idle"), grow(uploads, ANNA, name="fresh")
-    uploads.close()
-    for upload, days in ((stored, 2), (idle, 8)):
-        folder = tmp_path / "runs" / FOLDER / upload.folder
-        state = json.loads((folder / "upload.json").read_text())
-        (folder / "upload.json").write_text(json.dumps(state | {"created": "2020-01-01T00:00:00.000+00:00"}))
-        for path in folder.iterdir():
-            os.utime(path, (time.time() - days * 86400,) * 2)
-    (tmp_path / "runs" / FOLDER / ("0" * 32)).mkdir()
-    again = start(tmp_path / "runs")
-    assert [upload.id for upload in again.all()] == [fresh.id]
-    assert [path.name for path in (tmp_path / "runs" / FOLDER).iterdir() if path.is_dir()] == [fresh.folder]
-    assert visible(tmp_path / "runs") == [lake.run_id]
-    again.close()
-
-
-def test_removing_an_upload_does_not_block_others(uploads, lake, monkeypatch):
-    """The event loop of the server reads uploads: it must not wait for the disk."""
-    data, go_on = lake.recording.read_bytes(), threading.Event()
-    given_up, upload = grow(uploads, ANNA, name="given up"), begin(uploads, ANNA, data)
-    monkeypatch.setattr("runner.service.uploads.shutil.rmtree", lambda *_, **__: go_on.wait(60))
-    with ThreadPoolExecutor(2) as threads:
-        removal = threads.submit(uploads.delete, ANNA, given_up.id)
-        try:
-            until(lambda known: len(known) == 1, uploads.all)
-            assert threads.submit(uploads.get, ANNA, upload.id).result(20) == upload
-            assert not removal.done()
-        finally:
-            go_on.set()
-
-
-def test_an_upload_whose_verification_fails_unexpectedly_can_be_completed_again(uploads, lake, monkeypatch):
-    data = lake.recording.read_bytes()
-    with monkeypatch.context() as broken:
-        broken.setattr("runner.service.processes.ChildProcess", lambda *_: json.loads("no process"))
-        failed = send(uploads, data)
-    assert failed.state == "receiving"
-    assert failed.problem == "something unexpected went wrong while it was verified; try again."
-    with pytest.raises(Busy, match="went wrong"):
-        begin(uploads, ANNA, data)
-    assert over(uploads, begin(uploads, ANNA, data)).state == "stored"
-
-
-def test_one_client_cannot_hold_all_uploads(tmp_path):
-    uploads = start(tmp_path / "runs", uploads=3, uploads_each=2)
-    for _ in range(2):
-        grow(uploads, ANNA)
-    with pytest.raises(TooManyUploads, match="2 of your uploads are open"):
-        grow(uploads, ANNA)
-    grow(uploads, BEN)
-    with pytest.raises(TooManyUploads, match="3 uploads are open"):
-        grow(uploads, BEN)
-    uploads.close()
