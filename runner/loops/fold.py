@@ -335,7 +335,8 @@ class _Fold:
                 step, position = source.step_place(phase, fields["step"])
                 yield position, encode(schema.INFO, fields | {"step": step})
             return
-        for unit in source.resets_at(phase, fields["step"]):
+        units = source.units[phase]
+        for unit in units[units["first"] - units["environment"] == fields["step"]]:
             own = fields | {"step": int(unit["new_step"])}
             yield int(unit["new_position"]), encode(schema.INFO, own)
 
@@ -343,7 +344,7 @@ class _Fold:
         environment, is_reset = frame_place(fields)
         step = source.phase_steps(phase, position)
         if is_reset:
-            place = int(source.unit_begun(phase, environment, step)["new_position"])
+            place = int(source.unit(phase, environment, step + environment)["new_position"])
         else:
             _, place = source.step_place(phase, max(step - source.n, 0) + environment)
         return place, encode_image(fields["data"], fields["format"], place, frame_id(phase, None, is_reset))

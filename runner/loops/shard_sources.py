@@ -5,7 +5,7 @@ A unit is a reset of one environment, and the steps that it took up to its next 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
@@ -181,22 +181,14 @@ class Source:
 
     def step_place(self, phase: str, step: int) -> tuple[int, int]:
         """Return number and position in the run of a step, by its number in the phase of its process."""
-        unit = self._unit(phase, step % self.n, step)
+        unit = self.unit(phase, step % self.n, step)
         is_only_reset = bool(np.isin(unit["first"], self.only_resets[phase]))
         offset = (step - int(unit["first"])) // self.n - is_only_reset
         offset = min(max(offset, 0), max(int(unit["steps"]) - 1, 0))
         return int(unit["new_step"]) + offset, int(unit["new_position"]) + offset + 1
 
-    def resets_at(self, phase: str, step: int) -> Sequence[np.void]:
-        """Return the units that began after this number of steps of a phase."""
-        units = self.units[phase]
-        return list(units[units["first"] - units["environment"] == step])
-
-    def unit_begun(self, phase: str, environment: int, step: int) -> np.void:
-        """Return the last unit of an environment that had begun by a step."""
-        return self._unit(phase, environment, step + environment)
-
-    def _unit(self, phase: str, environment: int, step: int) -> np.void:
+    def unit(self, phase: str, environment: int, step: int) -> np.void:
+        """Return the unit that a step of an environment belongs to: the last one that had begun by it."""
         units = self.units[phase]
         low, high = np.searchsorted(units["environment"], [environment, environment + 1])
         at = int(np.searchsorted(units["first"][low:high], step, side="right"))
