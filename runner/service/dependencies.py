@@ -162,21 +162,6 @@ class Computation:
 ComputationOf = Annotated[Computation, Depends()]
 
 
-class RunComputation(Computation):
-    """Functions of the recording of the run that the path names."""
-
-    def __init__(self, run: RecordedRun, cache: CacheOf, processes: ProcessesOf, spooling: Spooling) -> None:
-        super().__init__(cache, processes, spooling)
-        self._path = run.recording
-
-    async def __call__(self, function: Callable[..., bytes], *args: object, alone: bool = False) -> bytes:
-        """Return the result of a function of the recording's path and further arguments."""
-        return await super().__call__(function, self._path, *args, alone=alone)
-
-
-RunComputationOf = Annotated[RunComputation, Depends()]
-
-
 def json_response(body: bytes) -> Response:
     """Return a response of JSON that is encoded already."""
     return Response(body, media_type="application/json")

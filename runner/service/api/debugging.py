@@ -16,7 +16,7 @@ from runner.debugging.when import when_in
 from runner.debugging.why import LIMIT, MAX_LIMIT, why_in
 from runner.service import computed, fragments
 from runner.service.api.replay import STEPS, Part, Start, Steps
-from runner.service.dependencies import RunComputationOf
+from runner.service.dependencies import ComputationOf, RecordedRun
 from runner.service.problems import error_docs
 
 router = APIRouter(
@@ -73,24 +73,32 @@ class WhatIf(BaseModel):
 
 @router.get("/what-if/{at}", response_model=WhatIf, summary="Where each joint action at a step leads.")
 async def what_if(
-    compute: RunComputationOf,
+    run: RecordedRun,
+    compute: ComputationOf,
     at: At,
     action: Annotated[
         list[str] | None, Query(max_length=MAX_ACTIONS, description="Numbers or names; default: all.")
     ] = None,
 ) -> Response:
     """Return what `dualtaxi branch --action all --json` prints; of a run that was trained here."""
-    return await compute.json(computed.answer, what_if_in, StepRef.parse(at), tuple(action or ()))
+    return await compute.json(
+        computed.answer, run.recording, what_if_in, StepRef.parse(at), tuple(action or ())
+    )
 
 
 @router.get(
     "/what-if/{at}/{action}", response_model=Part, summary="A part of the episode to which an action leads."
 )
 async def branch(
-    compute: RunComputationOf, at: At, action: ActionPath, start: Start = 0, steps: Steps = STEPS
+    run: RecordedRun,
+    compute: ComputationOf,
+    at: At,
+    action: ActionPath,
+    start: Start = 0,
+    steps: Steps = STEPS,
 ) -> Response:
     """Return steps in the form of a replay: those recorded up to the step, then those played."""
-    return await compute.json(fragments.branch_part, StepRef.parse(at), action, start, steps)
+    return await compute.json(fragments.branch_part, run.recording, StepRef.parse(at), action, start, steps)
 
 
 @router.get(
@@ -99,14 +107,15 @@ async def branch(
     summary="The training steps after which an expression holds.",
 )
 async def when(
-    compute: RunComputationOf,
+    run: RecordedRun,
+    compute: ComputationOf,
     expression: Expression,
     every: Annotated[bool, Query(alias="all", description="Find every interval.")] = False,
     first: Annotated[StepText, Query(alias="from")] = None,
     last: Annotated[StepText, Query(alias="to")] = None,
 ) -> Response:
     """Return what `dualtaxi when --json` prints; of a run that was trained here."""
-    return await compute.json(computed.answer, when_in, expression, every, first, last)
+    return await compute.json(computed.answer, run.recording, when_in, expression, every, first, last)
 
 
 @router.get(
@@ -115,7 +124,8 @@ async def when(
     summary="The rewards that a Q-value is the sum of.",
 )
 async def why(
-    compute: RunComputationOf,
+    run: RecordedRun,
+    compute: ComputationOf,
     state: StateName = None,
     action: ActionName = None,
     agent: AgentName = None,
@@ -123,4 +133,6 @@ async def why(
     limit: Annotated[int, Query(ge=0, le=MAX_LIMIT, description="Most steps, 0 for all.")] = LIMIT,
 ) -> Response:
     """Return where a Q-value comes from, as `dualtaxi why --json` prints it; of a run trained here."""
-    return await compute.json(computed.answer, why_in, state, action, agent, at, limit, alone=True)
+    return await compute.json(
+        computed.answer, run.recording, why_in, state, action, agent, at, limit, alone=True
+    )

@@ -15,10 +15,10 @@ from runner.recording.reader import Recording
 from runner.service import computed
 from runner.service.computed import too_many
 from runner.service.dependencies import (
+    ComputationOf,
     OpenRecording,
     ProcessesOf,
     RecordedRun,
-    RunComputationOf,
     SettingsOf,
     json_response,
 )
@@ -168,7 +168,8 @@ class Columns(BaseModel):
 
 @router.get("/metrics", response_model=Curves, responses=BUSY, summary="The curves of a run's metrics.")
 async def metrics(
-    compute: RunComputationOf,
+    run: RecordedRun,
+    compute: ComputationOf,
     metric: Metrics = None,
     axis: AxisName = EPISODES.name,
     start: FirstPosition = 0,
@@ -182,7 +183,7 @@ async def metrics(
     true; `start` and `stop` select a part at full resolution.
     """
     options = (axis, tuple(metric or ()), start, stop, points, False, smooth)
-    return await compute.json(computed.curves, *options)
+    return await compute.json(computed.curves, run.recording, *options)
 
 
 @router.get(
@@ -191,9 +192,9 @@ async def metrics(
     responses=BUSY,
     summary="Histograms over training, as heat maps.",
 )
-async def histograms(compute: RunComputationOf, axis: AxisName = EPISODES.name) -> Response:
+async def histograms(run: RecordedRun, compute: ComputationOf, axis: AxisName = EPISODES.name) -> Response:
     """Return the counts of returns, lengths, actions and rewards in stretches of training."""
-    return await compute.json(computed.run_histograms, axis)
+    return await compute.json(computed.run_histograms, run.recording, axis)
 
 
 def _add_records_route(kind: computed.RecordKind, summary: str, description: str) -> None:
@@ -206,10 +207,12 @@ def _add_records_route(kind: computed.RecordKind, summary: str, description: str
         description=description,
     )
     async def records(
-        compute: RunComputationOf, settings: SettingsOf, start: Start = 0, stop: Stop = None
+        run: RecordedRun, compute: ComputationOf, settings: SettingsOf, start: Start = 0, stop: Stop = None
     ) -> Response:
         stop = start + DEFAULT_RECORDS if stop is None else stop
-        return await compute.json(computed.records, kind, start, stop, settings.limits.page_records)
+        return await compute.json(
+            computed.records, run.recording, kind, start, stop, settings.limits.page_records
+        )
 
 
 _add_records_route(
@@ -290,7 +293,8 @@ def steps(
     summary="A summary of the Q-table at any step.",
 )
 async def q_table(
-    compute: RunComputationOf,
+    run: RecordedRun,
+    compute: ComputationOf,
     step: Step = None,
     episode: Episode = None,
     state: Annotated[
@@ -299,7 +303,7 @@ async def q_table(
 ) -> Response:
     """Return size, fill and range of each learner's exact table, as `dualtaxi qtable --json` prints it."""
     _refuse_both(step, episode)
-    return await compute.json(computed.q_table, step, episode, state, "json")
+    return await compute.json(computed.q_table, run.recording, step, episode, state, "json")
 
 
 @router.get(
@@ -308,10 +312,12 @@ async def q_table(
     responses=media_docs(OCTETS) | BUSY,
     summary="The whole Q-table at any step.",
 )
-async def whole_q_table(compute: RunComputationOf, step: Step = None, episode: Episode = None) -> Response:
+async def whole_q_table(
+    run: RecordedRun, compute: ComputationOf, step: Step = None, episode: Episode = None
+) -> Response:
     """Return the exact table as a NumPy file: float64 [states, actions], or [learners, states, actions]."""
     _refuse_both(step, episode)
-    body = await compute(computed.q_table, step, episode, None, "npy")
+    body = await compute(computed.q_table, run.recording, step, episode, None, "npy")
     return Response(body, media_type=OCTETS)
 
 
@@ -322,7 +328,8 @@ async def whole_q_table(compute: RunComputationOf, step: Step = None, episode: E
     summary="Every metric in one figure.",
 )
 async def plot(
-    compute: RunComputationOf,
+    run: RecordedRun,
+    compute: ComputationOf,
     form: Literal["svg", "png", "pdf"],
     axis: AxisName = EPISODES.name,
     smooth: Smooth = 0,
@@ -331,7 +338,7 @@ async def plot(
 ) -> Response:
     """Return the figure that `dualtaxi plot` draws."""
     style = CurveStyle(smooth=smooth, log_x=log_x, log_y=log_y)
-    return Response(await compute(computed.plot, form, axis, style), media_type=MEDIA[form])
+    return Response(await compute(computed.plot, run.recording, form, axis, style), media_type=MEDIA[form])
 
 
 def _refuse_both(step: int | None, episode: int | None) -> None:

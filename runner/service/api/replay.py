@@ -21,7 +21,7 @@ from runner.export.reports.player_data import Playback
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service import fragments
-from runner.service.dependencies import EPISODES, PicturesOf, RecordedRun, RunComputationOf, recording_state
+from runner.service.dependencies import EPISODES, ComputationOf, PicturesOf, RecordedRun, recording_state
 from runner.service.pictures import Make, PictureStreams
 from runner.service.problems import error_docs, media_docs
 
@@ -63,13 +63,14 @@ class Part(BaseModel):
 def _add_routes(path: str, episode: Callable[..., StepRef], kind: str) -> None:
     @router.get(path, name=kind, response_model=Part, summary=f"A part of a {kind}, to be replayed.")
     async def part(
-        compute: RunComputationOf,
+        run: RecordedRun,
+        compute: ComputationOf,
         at: StepRef = Depends(episode),  # noqa: B008 - as FastAPI reads it
         start: Start = 0,
         steps: Steps = STEPS,
     ) -> Response:
         """Return steps of an episode: actions, rewards, and states or observations at each frame."""
-        return await compute.json(fragments.episode_part, at, start, steps)
+        return await compute.json(fragments.episode_part, run.recording, at, start, steps)
 
     @router.get(
         f"{path}/pictures",

@@ -16,7 +16,7 @@ from runner.errors import RunnerError
 from runner.service import fragments
 from runner.service.api.debugging import At
 from runner.service.api.replay import STEPS
-from runner.service.dependencies import ComputationOf, OpenRecording, RecordedRun, RunComputationOf
+from runner.service.dependencies import ComputationOf, OpenRecording, RecordedRun
 from runner.service.fragments import ShownBranches, ShownWhen
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import message_of, page
@@ -48,7 +48,7 @@ class _WhenView(RunView):
 async def when(
     request: Request,
     run: RecordedRun,
-    compute: RunComputationOf,
+    compute: ComputationOf,
     expression: Annotated[str, Query(max_length=MAX_CHARACTERS)] = "",
     every: Annotated[bool, Query(alias="all")] = False,
     first: Annotated[StepField, Query(alias="from")] = "",
@@ -60,7 +60,7 @@ async def when(
         return page(request, _WhenView(*form))
     options = (expression, every, first or None, last or None, INTERVALS)
     try:
-        found = await compute.shown(ShownWhen, fragments.when, *options)
+        found = await compute.shown(ShownWhen, fragments.when, run.recording, *options)
     except RunnerError as error:
         return page(request, _WhenView(*form, None, message_of(error, request)), HTTPStatus.BAD_REQUEST)
     return page(request, _WhenView(*form, found))
@@ -83,7 +83,7 @@ async def why(
     request: Request,
     run: RecordedRun,
     recording: OpenRecording,
-    compute: RunComputationOf,
+    compute: ComputationOf,
     state: Name = "",
     action: Name = "",
     agent: Name = "",
@@ -94,7 +94,7 @@ async def why(
     if state or action or at:
         given = (text.strip() or None for text in (state, action, agent, at))
         try:
-            body = await compute(fragments.why, *given, WHY_STEPS, alone=True)
+            body = await compute(fragments.why, run.recording, *given, WHY_STEPS, alone=True)
         except RunnerError as error:
             problem = message_of(error, request)
     view = _WhyView(head_of(run), "why", recording.agents, state, action, agent, at, body.decode(), problem)

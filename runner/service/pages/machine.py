@@ -13,7 +13,7 @@ from runner.export.reports.rendering import View
 from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.addresses import link
-from runner.service.dependencies import RecordedRun, RunComputationOf
+from runner.service.dependencies import ComputationOf, RecordedRun
 from runner.service.fragments import Output
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import page
@@ -50,34 +50,34 @@ class _LinesView(View):
 
 
 @router.get("/system")
-async def system(request: Request, run: RecordedRun, compute: RunComputationOf) -> Response:
+async def system(request: Request, run: RecordedRun, compute: ComputationOf) -> Response:
     """Show steps a second, and the use of the machine, over time."""
-    body = (await compute(fragments.system)).decode()
+    body = (await compute(fragments.system, run.recording)).decode()
     live = _live(run, "system/part")
     return await run_in_threadpool(page, request, _SystemView(head_of(run), "system", body, live))
 
 
 @router.get("/system/part")
-async def system_part(run: RecordedRun, compute: RunComputationOf, status: Status = "running") -> Response:
+async def system_part(run: RecordedRun, compute: ComputationOf, status: Status = "running") -> Response:
     """Return what changes of the page; 204 if the run no longer has this status."""
     if run.status != status:
         return Response(status_code=HTTPStatus.NO_CONTENT)
-    return Response(await compute(fragments.system), media_type="text/html")
+    return Response(await compute(fragments.system, run.recording), media_type="text/html")
 
 
 @router.get("/pictures")
-async def pictures(request: Request, run: RecordedRun, compute: RunComputationOf) -> Response:
+async def pictures(request: Request, run: RecordedRun, compute: ComputationOf) -> Response:
     """Show the last pictures and films that were logged."""
-    body = (await compute(fragments.pictures)).decode()
+    body = (await compute(fragments.pictures, run.recording)).decode()
     return await run_in_threadpool(page, request, _SystemView(head_of(run), "pictures", body, ""))
 
 
 @router.get("/console")
 async def console(
-    request: Request, run: RecordedRun, compute: RunComputationOf, sought: Sought = "", stream: Stream = ""
+    request: Request, run: RecordedRun, compute: ComputationOf, sought: Sought = "", stream: Stream = ""
 ) -> Response:
     """Show the last lines of the output, or the last that have a text."""
-    output = await compute.shown(Output, fragments.console, sought, stream)
+    output = await compute.shown(Output, fragments.console, run.recording, sought, stream)
     live = _live(run, "console/part", q=sought, stream=stream)
     view = _ConsoleView(head_of(run), "console", output, sought, stream, live)
     return await run_in_threadpool(page, request, view)
@@ -87,7 +87,7 @@ async def console(
 async def console_part(
     request: Request,
     run: RecordedRun,
-    compute: RunComputationOf,
+    compute: ComputationOf,
     sought: Sought = "",
     stream: Stream = "",
     status: Status = "running",
@@ -95,7 +95,9 @@ async def console_part(
     """Return the lines alone; 204 if the run no longer has this status."""
     if run.status != status:
         return Response(status_code=HTTPStatus.NO_CONTENT)
-    return page(request, _LinesView(await compute.shown(Output, fragments.console, sought, stream)))
+    return page(
+        request, _LinesView(await compute.shown(Output, fragments.console, run.recording, sought, stream))
+    )
 
 
 def _live(run: Run, path: str, **query: str) -> str:

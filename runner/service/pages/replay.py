@@ -28,7 +28,7 @@ from runner.service import fragments
 from runner.service.addresses import link
 from runner.service.api.replay import STEPS, prepare_pictures
 from runner.service.catalogue import Catalogue
-from runner.service.dependencies import EPISODES, CatalogueOf, PicturesOf, RecordedRun, RunComputationOf
+from runner.service.dependencies import EPISODES, CatalogueOf, ComputationOf, PicturesOf, RecordedRun
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import message_of, page
 from runner.util.values import JsonView
@@ -133,7 +133,7 @@ class _LatestView(View):
 @router.get("")
 async def chosen_replay(
     run: RecordedRun,
-    compute: RunComputationOf,
+    compute: ComputationOf,
     phase: Literal["train", "eval"] | None = None,
     episode: str = "",
     after: str = "",
@@ -145,7 +145,7 @@ async def chosen_replay(
     elif phase == "eval" and after:
         place = f"eval/{_whole(after)}/{_whole(trial)}"
     else:
-        place = (await compute(fragments.typical_episode)).decode()
+        place = (await compute(fragments.typical_episode, run.recording)).decode()
     return RedirectResponse(f"/runs/{run.run_id}/replay/{place}", HTTPStatus.FOUND)
 
 
@@ -153,14 +153,14 @@ async def chosen_replay(
 async def latest(
     request: Request,
     run: RecordedRun,
-    compute: RunComputationOf,
+    compute: ComputationOf,
     shown: Annotated[str, Query(max_length=40)] = "",
 ) -> Response:
     """Return the replay of the latest whole training episode as a part of a page.
 
     204 if there is none after the one `shown`; with a header if there will be none, as the run is over.
     """
-    path = (await compute(fragments.latest_episode)).decode()
+    path = (await compute(fragments.latest_episode, run.recording)).decode()
     if path in ("", shown):
         over = {} if run.status == "running" else {"X-Run-Over": "true"}
         return Response(status_code=HTTPStatus.NO_CONTENT, headers=over)
@@ -182,7 +182,7 @@ def _add_route(path: str, episode: Callable[..., StepRef]) -> None:
     async def replay(
         request: Request,
         run: RecordedRun,
-        compute: RunComputationOf,
+        compute: ComputationOf,
         streams: PicturesOf,
         catalogue: CatalogueOf,
         at: StepRef = Depends(episode),  # noqa: B008 - as FastAPI reads it
@@ -192,7 +192,7 @@ def _add_route(path: str, episode: Callable[..., StepRef]) -> None:
         part: bytes | RunnerError
         preparing = asyncio.create_task(prepare_pictures(run, streams, replace(at, t=t)))
         try:
-            part = await compute(fragments.episode_part, at, max(0, t - BEFORE), STEPS)
+            part = await compute(fragments.episode_part, run.recording, at, max(0, t - BEFORE), STEPS)
         except RunnerError as error:
             part = error
         await preparing

@@ -39,7 +39,6 @@ from runner.service.dependencies import (
     JobsOf,
     OpenRecording,
     RecordedRun,
-    RunComputationOf,
     SettingsOf,
 )
 from runner.service.jobs.queue import JobQueue
@@ -177,9 +176,9 @@ def status(
 
 
 @router.get("/distributions")
-async def distributions(compute: RunComputationOf, axis: AxisName = EPISODES.name) -> Response:
+async def distributions(run: RecordedRun, compute: ComputationOf, axis: AxisName = EPISODES.name) -> Response:
     """Return the histograms of training, as a part of the run's page."""
-    return HTMLResponse(await compute(fragments.distributions, axis))
+    return HTMLResponse(await compute(fragments.distributions, run.recording, axis))
 
 
 @router.get("/evaluations")
@@ -199,9 +198,9 @@ def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) ->
 
 
 @router.get("/learned")
-async def learned(request: Request, run: RecordedRun, compute: RunComputationOf) -> Response:
+async def learned(request: Request, run: RecordedRun, compute: ComputationOf) -> Response:
     """Show policy and values at stages of learning."""
-    maps = (await compute(fragments.maps)).decode()
+    maps = (await compute(fragments.maps, run.recording)).decode()
     return await run_in_threadpool(page, request, _LearnedView(head_of(run), "learned", maps))
 
 
