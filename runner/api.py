@@ -171,10 +171,10 @@ def run_parallel(
     Training releases the interpreter's lock, and each run has its own tables and draws: it records what it
     would record alone. When `stop` returns True, current runs are closed and no others are started.
     """
-    is_left = threading.Event()
+    is_abandoned = threading.Event()
 
     def is_stopped() -> bool:
-        return is_left.is_set() or stop()
+        return is_abandoned.is_set() or stop()
 
     def do(job: Job) -> Run | None:
         return None if is_stopped() else _recorded(job, folder, name, report, is_stopped)
@@ -188,7 +188,7 @@ def run_parallel(
                     yield run
             yield from (run for each in pending if (run := each.result()))
         finally:
-            is_left.set()
+            is_abandoned.set()
 
 
 class Interrupt:

@@ -70,7 +70,7 @@ def count_line(what: str, total: int) -> Iterator[Callable[[int], None]]:
 
 @contextlib.contextmanager
 def total_line() -> Iterator[Callable[[int, int, str], None]]:
-    """Yield a function that is called with the number done, their total, which may change, and of what."""
+    """Yield a function that is called with the number done, the total so far, and what is counted."""
     columns = [_BAR, "{task.completed:,}/{task.total:,} {task.fields[what]}", "left"]
     with _line("", columns, total=0, what="") as update:
         yield lambda done, total, what: update(completed=done, total=total, what=what)

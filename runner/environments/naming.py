@@ -55,7 +55,7 @@ def action_names(mdp: Mdp) -> list[list[str]] | None:
     return [names for _ in mdp.agents]
 
 
-def deeds_in_words(mdp: Mdp) -> list[str]:
+def agent_actions_in_words(mdp: Mdp) -> list[str]:
     """Return every joint action as text, with its agents: `taxi 1 south, taxi 2 pickup`."""
     words = [str(word) for word in actions_in_words(mdp)]
     if len(mdp.agents) < 2 or action_names(mdp) is None:

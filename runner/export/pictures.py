@@ -23,7 +23,7 @@ import numpy as np
 from runner.drawing import svg
 from runner.drawing.raster import Pixels, require_packages
 from runner.environments.mdp import events_of
-from runner.environments.naming import deeds_in_words, events_in_words, exploration_in_words
+from runner.environments.naming import agent_actions_in_words, events_in_words, exploration_in_words
 from runner.errors import CannotRedo
 from runner.export.contents import ENDINGS, Step, ending_of, require_steps
 from runner.export.painting import (
@@ -228,14 +228,14 @@ def describer(recording: Recording, phase: str) -> Callable[[Step], tuple[str, s
     """Return how to put a step's action, and what happened in it, in words."""
     if recording.tabular:
         mdp, learners = recording.mdp, recording.agents
-        deeds = deeds_in_words(mdp)
+        named = agent_actions_in_words(mdp)
 
         def describe(row: Step) -> tuple[str, str]:
             step = np.asarray(row).reshape(1)
             check_steps(step, mdp, str(recording.path))
             events = events_in_words(mdp, int(events_of(mdp, step)[0]))
             explored = exploration_in_words(int(row["explored"]), learners)
-            return deeds[row["action"]], ", ".join(filter(None, [events, explored]))
+            return named[row["action"]], ", ".join(filter(None, [events, explored]))
 
         return describe
     in_words = action_in_words(recording, phase)

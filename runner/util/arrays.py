@@ -12,5 +12,5 @@ Array = NDArray[np.generic]
 Records = NDArray[np.void]
 """Structured records, such as messages of one topic."""
 MaskedArray = np.ma.MaskedArray[tuple[int, ...], np.dtype[np.generic]]
-"""The same with values missing."""
+"""An `Array` with missing values."""
 Ints = NDArray[np.int64]

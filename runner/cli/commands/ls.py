@@ -131,7 +131,7 @@ def ls_command(
         say(f"{problem[:1].upper()}{problem[1:]}")
     if len(problems) > MAX_PROBLEMS:
         say(f"{len(problems) - MAX_PROBLEMS:,} more runs are damaged: `dualtaxi ls status:damaged`.")
-    _say_what_is_missing(listed, total, offset, chosen, recordings)
+    _print_remainder(listed, total, offset, chosen, recordings)
 
 
 # --- reading ----------------------------------------------------------------------------------------------
@@ -277,7 +277,7 @@ def _cell(row: Row, column: str) -> str:
     return printable(as_text(row, column))
 
 
-def _say_what_is_missing(
+def _print_remainder(
     listed: int, total: int, offset: int, chosen: Filter, recordings: tuple[Path, ...]
 ) -> None:
     """Print how many matching runs are not listed, or why none is."""

@@ -122,7 +122,7 @@ def play_command(
 def _image_type(is_tabular: bool) -> Any:
     """Return what draws pictures in this terminal, a renderable of `textual_image`; None for nothing.
 
-    To find out, the terminal is asked once, and answers on stdin.
+    To find out, the terminal is queried once; its reply comes on stdin.
     """
     if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or not sys.stdin.isatty():
         return None

@@ -96,7 +96,7 @@ def run_command(
             say(f"Interrupted: {episodes} are kept in {run.recording}.")
             if run.status == "interrupted":
                 say(f"`{command_for(run, 'resume')}` continues from there.")
-            _say_left(experiment, number + 1)
+            _print_not_begun(experiment, number + 1)
             raise click.exceptions.Exit(ExitCode.INTERRUPTED)
 
 
@@ -149,7 +149,7 @@ def _run_parallel(
         for run in runs:
             if run.status == "interrupted":
                 say(f"Interrupted: {run.recording}; `{command_for(run, 'resume')}` continues from there.")
-        _say_left(config, len(runs))
+        _print_not_begun(config, len(runs))
         raise click.exceptions.Exit(ExitCode.INTERRUPTED)
 
 
@@ -194,7 +194,7 @@ def _is_interactive() -> bool:
     return sys.stdin.isatty() and sys.stderr.isatty()
 
 
-def _say_left(config: ExperimentConfig, begun: int) -> None:
+def _print_not_begun(config: ExperimentConfig, begun: int) -> None:
     """Print which seeds were not begun, if any."""
     if left := len(config.seeds) - begun:
         say(f"Not begun: {left} of {len(config.seeds)} seeds, from {config.seeds[begun]} on.")

@@ -29,7 +29,7 @@ from runner.analysis.series import read_series
 from runner.analysis.step_reference import StepRef
 from runner.drawing import svg, svg_maps
 from runner.environments.mdp import Mdp
-from runner.environments.naming import deeds_in_words, exploration_in_words, spoken, states_in_words
+from runner.environments.naming import agent_actions_in_words, exploration_in_words, spoken, states_in_words
 from runner.export.plots.comparisons import tables_svg
 from runner.export.plots.curves import Plot, plots_of
 from runner.export.reports.maps import situation, situation_in_words
@@ -175,7 +175,7 @@ def _picture(recording: Recording, step: np.void, title: str, after: bool) -> St
         explored = exploration_in_words(int(step["explored"]), recording.agents) or "greedy"
         rewards = " and ".join(f"{reward:g}" for reward in step["rewards"])
         end = "; the end" if step["terminated"] else "; the step limit" if step["truncated"] else ""
-        text = f"{deeds_in_words(mdp)[int(step['action'])]} ({explored}); reward {rewards}{end}"
+        text = f"{agent_actions_in_words(mdp)[int(step['action'])]} ({explored}); reward {rewards}{end}"
     if mdp.scene is None or mdp.scene_cells is None:
         return StepPicture(title, "", f"{text}. {state_text}" if after else text, False)
     drawing = svg.Drawing(mdp.scene)

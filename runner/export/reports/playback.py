@@ -18,7 +18,7 @@ from runner.environments.mdp import events_of
 from runner.environments.naming import (
     actions_in_words,
     agent_actions,
-    deeds_in_words,
+    agent_actions_in_words,
     event_in_words,
     numbered_actions,
     spoken,
@@ -111,7 +111,7 @@ def tabular_playback(
     if drawing is not None:
         grid = Grid(drawing.places(mdp, distinct).reshape(len(distinct), -1).tolist(), at.tolist())
     states = [str(word) for word in states_in_words(mdp)[distinct]]
-    deeds, actions = deeds_in_words(mdp), shown["action"].tolist()
+    named, actions = agent_actions_in_words(mdp), shown["action"].tolist()
     taken = [actions] * len(values)
     if len(values) > 1:  # each learner has a table of its own actions
         taken = [list(own) for own in zip(*(agent_actions(mdp, action) for action in actions), strict=True)]
@@ -126,7 +126,7 @@ def tabular_playback(
         agents=[spoken(agent) for agent in agents],
         before=[short(value) for value in before],
         reward=short_rows(shown["rewards"]),
-        actions=[words("", "action", [deeds[action] for action in actions])],
+        actions=[words("", "action", [named[action] for action in actions])],
         texts=[Words("", "state", states, at.tolist())],
         time=time,
         logged=logged_near(recording, place.phase, time),

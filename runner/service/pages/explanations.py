@@ -35,7 +35,7 @@ class _ExplanationView(View):
     lead: list[str]
     links: Sequence[Link]
     plots: Sequence[Plot]
-    parts_of_answer: Sequence[Section]
+    results: Sequence[Section]
 
 
 @dataclass(frozen=True)

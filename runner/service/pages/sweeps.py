@@ -108,7 +108,7 @@ async def sweep(
     state = await run_in_threadpool(_state_of, name, settings.recordings, catalogue)
     parts: dict[str, str | None] = {}
     for part in PARTS:
-        body = await _made(state, part, cache, processes) if whole else cache.get(_key(state, part))
+        body = await _part_html(state, part, cache, processes) if whole else cache.get(_key(state, part))
         parts[part] = None if body is None else body.decode()
 
     def show() -> Response:
@@ -139,7 +139,7 @@ async def sweep_part(
 ) -> Response:
     """Return a part of the page of a sweep: the ranking, the importance of parameters, or the pictures."""
     state = await run_in_threadpool(_state_of, name, settings.recordings, catalogue)
-    return HTMLResponse(await _made(state, part, cache, processes))
+    return HTMLResponse(await _part_html(state, part, cache, processes))
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class _SweepState:
     """The recordings folder."""
     runs: int
     digest: str
-    """Of the catalogue's rows of its runs, and of the files of the sweep itself."""
+    """A hash of the catalogue's rows of its runs, and of the sweep's own files."""
 
 
 def _state_of(name: str, folders: tuple[Path, ...], catalogue: Catalogue) -> _SweepState:
@@ -183,7 +183,7 @@ def _key(state: _SweepState, part: str) -> tuple[str, _SweepState]:
     return f"sweep {part}", state
 
 
-async def _made(state: _SweepState, part: str, cache: CacheOf, processes: SweepProcesses) -> bytes:
+async def _part_html(state: _SweepState, part: str, cache: CacheOf, processes: SweepProcesses) -> bytes:
     """Return the HTML of a part, cached or made by a child process."""
     make = PARTS[part]
     return await cache.get_or_await(

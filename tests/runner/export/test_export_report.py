@@ -15,7 +15,7 @@ from selenium.webdriver.support.select import Select
 
 from runner.cli import cli
 from runner.drawing.svg import Drawing, trail_points, transform
-from runner.environments.naming import deeds_in_words, states_in_words
+from runner.environments.naming import agent_actions_in_words, states_in_words
 from runner.export.episodes import ranked_trials
 from runner.export.reports.report import render_report
 from runner.recording.reader import open_recording
@@ -54,7 +54,7 @@ def test_replays_are_the_recorded_episodes_best_and_worst_among_them(recording, 
     (state,), (action,) = shown["texts"], shown["actions"]
     states = np.append(steps["state"], steps["next_state"][-1])
     assert [state["values"][i] for i in state["at"]] == words[states].tolist()
-    deeds = deeds_in_words(recording.mdp)
+    deeds = agent_actions_in_words(recording.mdp)
     assert [action["values"][i] for i in action["at"]] == [deeds[number] for number in steps["action"]]
     assert shown["explored"] == steps["explored"].tolist()
     assert np.allclose(shown["reward"], steps["rewards"])

@@ -14,7 +14,7 @@ import pytest
 from checked_pages import ACCEPT_HTML, page_of
 
 import runner
-from runner.environments.naming import deeds_in_words, states_in_words
+from runner.environments.naming import agent_actions_in_words, states_in_words
 from runner.execution.branching import branch_training
 from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import reader
@@ -171,7 +171,7 @@ def test_the_parts_of_an_episode_are_the_recorded_steps(client, recordings):
         mdp, words = recording.mdp, states_in_words(recording.mdp)
     whole = client.get("/api/v1/runs/first/replay/train/2?steps=2000").json()["episode"]
     assert whole["length"] == len(steps)
-    deeds = deeds_in_words(mdp)
+    deeds = agent_actions_in_words(mdp)
 
     def actions(part):
         (action,) = part["actions"]
