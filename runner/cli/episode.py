@@ -5,14 +5,14 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from runner.drawing.text import Drawing
 from runner.environments.mdp import events_of
 from runner.environments.naming import actions_in_words, states_in_words
-from runner.export.contents import ENDINGS, ending_of
+from runner.export.contents import ENDINGS, Step, ending_of
 from runner.export.pictures import describer
 from runner.export.values import action_in_words, plain_value, value_in_words
 from runner.replay.steps import check_steps, reset_of, transitions_of
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from runner.export.pictures import Pictures
     from runner.recording.reader import Recording
 
-Row = Any
-"""A recorded step, whose fields are found by name."""
 _MAX_NUMBERS: Final = 32
 """Larger arrays of an observation are not written out."""
 
@@ -115,7 +113,7 @@ def _state_drawer(recording: Recording, phase: str, episode: int) -> Callable[..
     if not recording.tabular:
         reset = reset_of(recording, phase, episode)
 
-        def words(row: Row, is_first: bool) -> Text:
+        def words(row: Step, is_first: bool) -> Text:
             if recording.kind == "step":
                 return Text(f"state {row['state' if is_first else 'next_state']}\n")
             if not is_first:
@@ -129,7 +127,7 @@ def _state_drawer(recording: Recording, phase: str, episode: int) -> Callable[..
     mdp = recording.mdp
     names, drawing = states_in_words(mdp), Drawing(mdp.scene) if mdp.scene is not None else None
 
-    def drawn(row: Row, is_first: bool) -> Text:
+    def drawn(row: Step, is_first: bool) -> Text:
         check_steps(np.asarray(row).reshape(1), mdp, str(recording.path), "recorded")
         state, text = int(row["state" if is_first else "next_state"]), Text()
         if drawing is not None and mdp.scene_cells is not None:
@@ -142,13 +140,13 @@ def _state_drawer(recording: Recording, phase: str, episode: int) -> Callable[..
     return drawn
 
 
-def _named(recording: Recording) -> Callable[[Row], dict[str, object]]:
+def _named(recording: Recording) -> Callable[[Step], dict[str, object]]:
     """Return a function that gives the states, action and events of a step with their names."""
     mdp, agents = recording.mdp, recording.agents
     states, actions = states_in_words(mdp), actions_in_words(mdp)
     words = {"state": states, "action": actions, "next_state": states}
 
-    def describe(row: Row) -> dict[str, object]:
+    def describe(row: Step) -> dict[str, object]:
         step = np.asarray(row).reshape(1)
         check_steps(step, mdp, str(recording.path), "recorded")
         events, explored = int(events_of(mdp, step)[0]), int(row["explored"])
@@ -163,7 +161,7 @@ def _named(recording: Recording) -> Callable[[Row], dict[str, object]]:
     return describe
 
 
-def _valued(recording: Recording, phase: str) -> Callable[[Row], dict[str, object]]:
+def _valued(recording: Recording, phase: str) -> Callable[[Step], dict[str, object]]:
     """Return a function that gives the action of a step, by name where it has one, and the observation."""
     agents = recording.agents if len(recording.agents) > 1 else ("",)
     words = {
@@ -172,7 +170,7 @@ def _valued(recording: Recording, phase: str) -> Callable[[Row], dict[str, objec
         if recording.action_names(phase, agent)
     }
 
-    def describe(row: Row) -> dict[str, object]:
+    def describe(row: Step) -> dict[str, object]:
         if recording.kind == "step":
             found: Json = {name: int(row[name]) for name in ("state", "action", "next_state")}
         else:

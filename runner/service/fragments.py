@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -121,13 +122,18 @@ def episode_part(path: Path, at: StepRef, start: int, steps: int) -> bytes:
         scene = recording.environment["scene"] if episode.grid else None
         has_pictures, note = picture_note(recording, "train" if at.after is None else "eval")
         data = {"episode": asdict(episode), "scene": scene}
-        return as_json(data | {"has_pictures": has_pictures, "picture_note": note})
+        return _compact(data | {"has_pictures": has_pictures, "picture_note": note})
 
 
 def branch_part(path: Path, at: StepRef, action: str, start: int, steps: int) -> bytes:
     """Return a part of the episode to which a joint action leads, as `episode_part` does."""
     with open_recording(path) as recording:
-        return as_json(_branch_part(recording, at, action, start, steps))
+        return _compact(_branch_part(recording, at, action, start, steps))
+
+
+def _compact(part: Json) -> bytes:
+    """Return a part of an episode, whose numbers are finite, as JSON without blanks."""
+    return json.dumps(part, separators=(",", ":"), ensure_ascii=False).encode(errors="replace")
 
 
 def what_if_page(run: Run, at: StepRef, action: str | None, start: int, steps: int) -> bytes:

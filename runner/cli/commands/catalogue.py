@@ -172,10 +172,7 @@ def index_command() -> None:
 
 
 @index_command.command("rebuild")
-def rebuild(
-    recordings: tuple[Path, ...] = folders_option,
-    as_json: bool = json_option,
-) -> None:
+def rebuild(recordings: tuple[Path, ...] = folders_option, as_json: bool = json_option) -> None:
     """Rebuild the index from the runs in the recordings folder.
 
     This is never required: commands notice changes by themselves, and the index holds nothing of its own.

@@ -37,9 +37,7 @@ _LEFT: Final = ("checkpoint", "phase", "format", "digest", "content")
 
 @click.command("checkpoints", cls=Command)
 def checkpoints_command(
-    run_name: str = run_argument,
-    recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
+    run_name: str = run_argument, recordings: Path | None = recordings_option, as_json: bool = json_option
 ) -> None:
     """List the checkpoints of RUN, which a loop recorded by `rec.checkpoint(name, ...)`.
 

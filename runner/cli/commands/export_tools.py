@@ -67,8 +67,7 @@ def minari(
 
 @click.command("tensorboard", cls=Command, short_help="An event file for TensorBoard.")
 def tensorboard(
-    run_name: str = run_argument,
-    to: Writing = writing_options("exports/tensorboard/NAME-RUN", "FOLDER"),
+    run_name: str = run_argument, to: Writing = writing_options("exports/tensorboard/NAME-RUN", "FOLDER")
 ) -> None:
     """Export RUN for TensorBoard: every metric, and length and return of each training episode.
 

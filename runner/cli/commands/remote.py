@@ -233,11 +233,7 @@ def submit(
 
 
 @remote_command.command("jobs")
-def jobs(
-    limit: int = limit_option(20),
-    server: Server = server_options,
-    as_json: bool = json_option,
-) -> None:
+def jobs(limit: int = limit_option(20), server: Server = server_options, as_json: bool = json_option) -> None:
     """List the jobs of a server, newest first.
 
     Example:
@@ -256,11 +252,7 @@ def jobs(
 
 
 @remote_command.command("watch")
-def watch(
-    number: int = _job_argument,
-    server: Server = server_options,
-    as_json: bool = json_option,
-) -> None:
+def watch(number: int = _job_argument, server: Server = server_options, as_json: bool = json_option) -> None:
     """Show the progress of JOB until it is over; Ctrl-C ends the watching, not the job.
 
     A broken connection is restored. Exit code 0 when the job finished, 1 when it failed or was cancelled.
@@ -276,11 +268,7 @@ def watch(
 
 
 @remote_command.command("cancel")
-def cancel(
-    number: int = _job_argument,
-    server: Server = server_options,
-    as_json: bool = json_option,
-) -> None:
+def cancel(number: int = _job_argument, server: Server = server_options, as_json: bool = json_option) -> None:
     """Cancel JOB, whether queued or running; what it has recorded is kept.
 
     Example:

@@ -15,8 +15,7 @@ from runner.cli.parameter_types import DIRECTORY, SHIPPED
 
 @click.command("init", cls=Command)
 def init_command(
-    folder: Path = argument(metavar="[FOLDER]", default=".", type=DIRECTORY),
-    as_json: bool = json_option,
+    folder: Path = argument(metavar="[FOLDER]", default=".", type=DIRECTORY), as_json: bool = json_option
 ) -> None:
     """Create a folder to start in, with configs/, recordings/ and a README of what to type.
 
@@ -56,9 +55,7 @@ def config_command() -> None:
 
 
 @config_command.command("ls")
-def ls(
-    as_json: bool = json_option,
-) -> None:
+def ls(as_json: bool = json_option) -> None:
     """List the shipped experiments, for `run`, and sweeps, for `sweep run`.
 
     Example:
@@ -102,9 +99,7 @@ def copy(
 
 @config_command.command("check")
 def check(
-    config: Path = config_argument,
-    overrides: tuple[str, ...] = set_option,
-    as_json: bool = json_option,
+    config: Path = config_argument, overrides: tuple[str, ...] = set_option, as_json: bool = json_option
 ) -> None:
     """Check CONFIG, a file or a shipped experiment, and print it with every value spelled out.
 
@@ -142,9 +137,7 @@ def schema(
 
 
 @click.command("completion", cls=Command)
-def completion_command(
-    shell: str = argument(type=click.Choice(["bash", "zsh", "fish"])),
-) -> None:
+def completion_command(shell: str = argument(type=click.Choice(["bash", "zsh", "fish"]))) -> None:
     """Print the script that makes SHELL complete commands, options, files and the names of runs.
 
     Examples:

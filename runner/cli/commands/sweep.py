@@ -190,10 +190,7 @@ def show(
 
 
 @sweep_command.command("ls")
-def ls(
-    recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
+def ls(recordings: Path | None = recordings_option, as_json: bool = json_option) -> None:
     """List the sweeps of a recordings folder.
 
     Example:

@@ -52,9 +52,7 @@ def create(
 
 
 @token_command.command("ls")
-def ls(
-    as_json: bool = json_option,
-) -> None:
+def ls(as_json: bool = json_option) -> None:
     """List the tokens; only their hashes are stored.
 
     Example:
@@ -72,10 +70,7 @@ def ls(
 
 
 @token_command.command("revoke")
-def revoke(
-    which: str = argument(metavar="TOKEN"),
-    as_json: bool = json_option,
-) -> None:
+def revoke(which: str = argument(metavar="TOKEN"), as_json: bool = json_option) -> None:
     """Revoke a token by its id or name; a running server refuses it from now on.
 
     Example:

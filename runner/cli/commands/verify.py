@@ -223,9 +223,7 @@ _MESSAGES: Final = {
 
 @click.command("repair", cls=Command)
 def repair_command(
-    run_name: str = run_argument,
-    recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
+    run_name: str = run_argument, recordings: Path | None = recordings_option, as_json: bool = json_option
 ) -> None:
     """Repair the recording of RUN, or one given by its path, so that every reader opens it.
 
