@@ -35,8 +35,8 @@ def export(
         others = [LoopExporter(stream, *one) for one in exported if not one[0].recording.has_tables]
         entities = {entity for run in with_tables for entity in run.send_metrics()}
         views = [runs_view([run.view for run in with_tables], entities)] if with_tables else []
-        if not others:  # a viewer shows the metrics while the steps come
-            stream.send_blueprint(arranged(views, "following"), make_active=False)
+        if not others:  # before the steps; active, as a viewer has arranged the metrics by itself
+            stream.send_blueprint(arranged(views, "paused"))
         for run in with_tables:
             run.send_steps()
         for loop in others:
