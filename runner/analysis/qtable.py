@@ -106,8 +106,8 @@ def _add_state(description: TablesDescription, recording: Recording, replay: Tab
     history = history_of(recording, state, replay.step)
     joint, own = actions_in_words(mdp), action_names(mdp)
     values: list[ActionValue] = []
-    for i, (agent, held) in enumerate(zip(replay.agents, replay.held, strict=True)):
-        q = held["q"]
+    for i, (agent, named) in enumerate(zip(replay.agents, replay.named_tables, strict=True)):
+        q = named["q"]
         names = joint if q.shape[1] == mdp.joint_actions else own[i] if own else range(q.shape[1])
         for action, name in enumerate(names):
             changed = int(history.changed_step[i, action])
@@ -121,8 +121,8 @@ def _add_state(description: TablesDescription, recording: Recording, replay: Tab
                 "changed_step": None if changed < 0 else changed,
                 "changed_episode": None if changed < 0 else int(history.changed_episode[i, action]),
             }
-            if "policy" in held:
-                value["policy"] = float(held["policy"][state, action])
+            if "policy" in named:
+                value["policy"] = float(named["policy"][state, action])
             values.append(value)
     description["state"] = state
     description["state_in_words"] = str(states_in_words(mdp)[state])

@@ -14,10 +14,10 @@ from runner.config.job import Job
 from runner.config.sections import RunTable
 from runner.environments.mdp import Mdp
 from runner.errors import RunnerError
-from runner.learning.learner import Held
+from runner.learning.learner import NamedTables
 from runner.recording.reader import Recording, open_recording
 from runner.replay.steps import last_step
-from runner.replay.tables import held_at, initially_held
+from runner.replay.tables import named_tables_at, tables_before_training
 from runner.runs.resolve import find_run
 from runner.runs.run import Run
 
@@ -54,13 +54,15 @@ def address(run: Run, recordings: Path) -> str:
     return run.run_id if inside and not run.stands_alone else str(run.recording.resolve())
 
 
-def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Held] | None:
-    """Return what the learners of the run in a job's `initial_q` held; see `tables_of`."""
+def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[NamedTables] | None:
+    """Return what the learners of the run in a job's `initial_q` have; see `tables_of`."""
     return tables_of(job.config, mdp, run.folder.parent, exclude=run.run_id)
 
 
-def tables_of(config: ExperimentConfig, mdp: Mdp, recordings: Path, exclude: str = "") -> list[Held] | None:
-    """Return what the learners of the run in `initial_q` held; None if the configuration has none.
+def tables_of(
+    config: ExperimentConfig, mdp: Mdp, recordings: Path, exclude: str = ""
+) -> list[NamedTables] | None:
+    """Return what the learners of the run in `initial_q` have; None if the configuration has none.
 
     Args:
         exclude: the id of a run that is never meant.
@@ -73,20 +75,20 @@ def tables_of(config: ExperimentConfig, mdp: Mdp, recordings: Path, exclude: str
         return None
     source = find_run(start.run, recordings, exclude=exclude)
     with open_recording(at_hand(source).recording) as recording:
-        held = held_at(recording, last_step(recording) if start.step is None else start.step)
+        tables = named_tables_at(recording, last_step(recording) if start.step is None else start.step)
     joint = config.tables == "joint"
     shapes = [(mdp.states, n) for n in ([mdp.joint_actions] if joint else mdp.action_counts)]
-    found = [one["q"].shape for one in held]
+    found = [one["q"].shape for one in tables]
     if found != shapes:
         raise RunnerError(f"initial_q: run {source.run_id} has tables of shape {found}, expected {shapes}.")
-    return held
+    return tables
 
 
-def recorded_tables(recording: Recording) -> list[Held] | None:
+def recorded_tables(recording: Recording) -> list[NamedTables] | None:
     """Return the tables that a run took from another run, from its own first snapshots.
 
     None if it took none, or was interrupted before them: then its configuration has their origin.
     """
     if not isinstance(from_mapping(recording.config).initial_q, RunTable):
         return None
-    return initially_held(recording)
+    return tables_before_training(recording)

@@ -26,7 +26,7 @@ from runner.errors import ConfigError, Diverged, RecordingError, RunnerError, tr
 from runner.execution.initial_tables import configured_tables, recorded_tables, resolve_job
 from runner.execution.session import Report, Session, Stop, describe, evaluation_brief, execute, recorder_for
 from runner.execution.verify import differing_environment
-from runner.learning.learner import Held, Learner
+from runner.learning.learner import Learner, NamedTables
 from runner.recording import schema
 from runner.recording.code import CODE_RECORD
 from runner.recording.integrity import may_be_cut, survey
@@ -176,7 +176,7 @@ def _job(run: Run) -> tuple[Job, bool]:
     raise Diverged("metadata run", "job", claimed, recorded.identity)
 
 
-def _first_tables(job: Job, run: Run, mdp: Mdp) -> list[Held] | None:
+def _first_tables(job: Job, run: Run, mdp: Mdp) -> list[NamedTables] | None:
     """Return the tables that the run took from another run; None if it took none."""
     if not isinstance(job.config.initial_q, RunTable):
         return None

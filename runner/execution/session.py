@@ -18,7 +18,7 @@ from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.errors import Diverged, RunnerError, StorageError, truncated_message
 from runner.execution.initial_tables import configured_tables, resolve_job
-from runner.learning.learner import Held, Learner
+from runner.learning.learner import Learner, NamedTables
 from runner.planning.optimality import ExactEvaluator
 from runner.recording import schema
 from runner.recording.blocks import topic_dtype
@@ -86,7 +86,7 @@ def run_job(
     observer: Observer | None = None,
     mdp: Mdp | None = None,
     threads: bool = True,
-    initial: Sequence[Held] | None = None,
+    initial: Sequence[NamedTables] | None = None,
     packed: PackedChunks | None = None,
 ) -> Run:
     """Train, evaluate and record a job; return its run, finished or interrupted.
@@ -234,7 +234,7 @@ class Session:
             self._show("train", records[:steps])
             recorder.commit("train", steps, episodes)
             if learner.step == next_log:
-                self._measure("train", schema.TRAIN_METRICS_TOPIC, learner.training_side())
+                self._measure("train", schema.TRAIN_METRICS_TOPIC, learner.training_metrics())
             self._report_progress()
         return True
 
@@ -324,7 +324,7 @@ def evaluation_metrics(learner: Learner, evaluation: int, trials: Records) -> Me
     """Return the metrics of an evaluation from its episode records, and of training at that moment."""
     known = bool(learner.mdp.success_events)
     successes = int(trials["success"].sum())
-    return learner.training_side() | {
+    return learner.training_metrics() | {
         "evaluation": evaluation,
         "trials": len(trials),
         "successes": successes if known else -1,

@@ -24,7 +24,7 @@ from runner.learning.schedules import compile_schedule, schedule_value
 NEVER: Final = 2**62
 """A step that no training reaches."""
 
-Held = Mapping[str, NDArray[np.float64]]
+NamedTables = Mapping[str, NDArray[np.float64]]
 """The tables of one learner: its Q-table as `q`, and its algorithm's `EXTRA_TABLES` by name."""
 
 
@@ -44,11 +44,11 @@ class Learner:
     """Tables, cursors and tallies of one job; `train` and `evaluate` fill blocks of records.
 
     Args:
-        initial: tables to start from instead of `config.initial_q`, as `held` returns them, for each learner.
+        initial: tables of each learner to start from instead of `config.initial_q`, as of `named_tables`.
     """
 
     def __init__(
-        self, config: ExperimentConfig, mdp: Mdp, seed: int, initial: Sequence[Held] | None = None
+        self, config: ExperimentConfig, mdp: Mdp, seed: int, initial: Sequence[NamedTables] | None = None
     ) -> None:
         self.config = config
         self.mdp = mdp
@@ -60,7 +60,7 @@ class Learner:
         _check_fit(config, mdp, self.model)
         self.kinds = kinds_of(config)
         self.tables = _tables(self.model, mdp.states, self.kinds)
-        self.set_held(initial)
+        self.set_tables(initial)
         log = config.log
         self._tally = _tally(self.model, log.window if log else 1, log.episodes if log else 50)
         self._eval_tally = _tally(self.model, 1, 1)
@@ -95,7 +95,7 @@ class Learner:
         """
         return self._of(i, self.tables.q)
 
-    def held(self, i: int) -> Held:
+    def named_tables(self, i: int) -> NamedTables:
         """Return all tables of learner i as they are now, [S, width] each and visits [S, 1]: views."""
         tables: dict[str, NDArray[np.float64]] = {"q": self.table(i)}
         for name, array in zip(self.kinds[1:], self.tables.extra, strict=False):
@@ -106,7 +106,7 @@ class Learner:
 
     def snapshot(self) -> list[NDArray[np.float64]]:
         """Return all tables as a snapshot numbers them, those of one kind together: views."""
-        return [self.held(i)[name] for name in self.kinds for i in range(len(self.agents))]
+        return [self.named_tables(i)[name] for name in self.kinds for i in range(len(self.agents))]
 
     def _of(self, i: int, array: NDArray[np.float64]) -> NDArray[np.float64]:
         start, width = int(self.tables.offset[i]), int(self.model.width[i])
@@ -164,7 +164,7 @@ class Learner:
         if not self.rules.learns:
             return [np.full((self.mdp.states, width), 1 / width) for width in self.model.width]
         if len(self.rules.algorithm) == algorithms.WOLF_PHC:
-            policies = [self.held(i)["policy"] for i in range(len(self.agents))]
+            policies = [self.named_tables(i)["policy"] for i in range(len(self.agents))]
             return [policy / policy.sum(axis=1, keepdims=True) for policy in policies]
         return self._policy
 
@@ -187,7 +187,7 @@ class Learner:
         self._mark_success(episodes[:ended])
         return filled, ended
 
-    def training_side(self) -> dict[str, object]:
+    def training_metrics(self) -> dict[str, object]:
         """Return the measures of training at this moment, named as in the recording's metrics."""
         rewards, counts = self._reward_distribution()
         lengths = self._tally.recent_lengths[: min(self.episode, len(self._tally.recent_lengths))]
@@ -231,7 +231,7 @@ class Learner:
         if self._success.any():
             episodes["success"] = episodes["events"][:, self._success].any(axis=1)
 
-    def set_held(self, initial: Sequence[Held] | None) -> None:
+    def set_tables(self, initial: Sequence[NamedTables] | None) -> None:
         """Set the tables of each learner; None for those that the configuration begins with.
 
         What `initial` leaves out follows from its `q`: both tables of Double Q-learning are equal to it, and
@@ -242,7 +242,7 @@ class Learner:
             self._fill(self.tables.extra.reshape(-1) if double else self.tables.q)
         for i in range(len(self.agents)):
             given = {} if initial is None else initial[i]
-            for name, array in self.held(i).items():
+            for name, array in self.named_tables(i).items():
                 if name in given:
                     array[:] = given[name]
                 elif name == "visits":
@@ -333,7 +333,7 @@ def kinds_of(config: ExperimentConfig) -> tuple[str, ...]:
     return ("q", *algorithms.EXTRA_TABLES.get(config.algorithm, ()))
 
 
-def held_of(tables: Sequence[NDArray[np.float64]], kinds: tuple[str, ...]) -> list[Held]:
+def name_tables(tables: Sequence[NDArray[np.float64]], kinds: tuple[str, ...]) -> list[NamedTables]:
     """Return the tables of a whole snapshot by learner and name."""
     learners = len(tables) // len(kinds)
     return [{name: tables[k * learners + i] for k, name in enumerate(kinds)} for i in range(learners)]

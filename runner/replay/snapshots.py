@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.learning.learner import held_of
+from runner.learning.learner import name_tables
 from runner.replay.step_replay import StepReplay
 
 S = TypeVar("S")
@@ -69,7 +69,7 @@ class DerivedTables(Generic[S]):
         self._given.add(table)
         self._known |= len(self._given) == len(tables)
         tables[table] = values
-        replay.rewind(step, held_of(tables, replay.kinds))
+        replay.rewind(step, name_tables(tables, replay.kinds))
 
     def _apply(self, steps: NDArray[np.void]) -> None:
         if not len(steps):

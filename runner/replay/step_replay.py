@@ -16,7 +16,7 @@ from runner.config import from_mapping
 from runner.environments.mdp import Mdp
 from runner.errors import RecordingError
 from runner.learning import kernel
-from runner.learning.learner import Held, Learner
+from runner.learning.learner import Learner, NamedTables
 from runner.learning.watching import Changes, Watch, begin, empty_changes, joined, replay_watched
 from runner.replay.steps import check_steps
 from runner.util.arrays import Array
@@ -85,9 +85,9 @@ class StepReplay:
         return [self._learner.table(i) for i in range(len(self.agents))]
 
     @property
-    def held(self) -> list[Held]:
+    def named_tables(self) -> list[NamedTables]:
         """All tables of each learner at `step`, by name: views that `apply` changes; `q` is its Q-table."""
-        return [self._learner.held(i) for i in range(len(self.agents))]
+        return [self._learner.named_tables(i) for i in range(len(self.agents))]
 
     @property
     def own_actions(self) -> NDArray[np.int32]:
@@ -103,9 +103,9 @@ class StepReplay:
         """Return all tables in the order of a snapshot, those of one kind together: views."""
         return self._learner.snapshot()
 
-    def rewind(self, step: int, held: list[Held]) -> None:
+    def rewind(self, step: int, tables: list[NamedTables]) -> None:
         """Set all tables to those of a step."""
-        self._learner.set_held(held)
+        self._learner.set_tables(tables)
         self.step = step
 
     def empty_rows(self, count: int) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from runner.config import from_mapping
 from runner.errors import NotInRecording, RecordingError
-from runner.learning.learner import Held, held_of, kinds_of
+from runner.learning.learner import NamedTables, kinds_of, name_tables
 from runner.learning.ledger import UNKNOWN_OUTCOME, UPDATE
 from runner.recording import schema
 from runner.recording.messages import QTable
@@ -75,34 +75,35 @@ class TableReplay(StepReplay):
         lost = self._recording.lost.get(schema.TRAIN_STEP.name, [])
         gap = any(start < step and stop > self.step for start, stop in lost)
         if gap or not self.step <= step <= self.step + NEAR_STEPS:
-            nearest, held = self._nearest(step)
+            nearest, tables = self._nearest(step)
             if not self.step <= step or nearest > self.step:
-                self._load(nearest, held)
+                self._load(nearest, tables)
         self.advance(step)
 
-    def rewind(self, step: int, held: list[Held]) -> None:
+    def rewind(self, step: int, tables: list[NamedTables]) -> None:
         """Set all tables to those of a step; from there on no checkpoints are saved."""
-        super().rewind(step, held)
+        super().rewind(step, tables)
         self._origin = None
 
-    def _load(self, step: int, held: list[Held]) -> None:
-        super().rewind(step, held)
+    def _load(self, step: int, tables: list[NamedTables]) -> None:
+        super().rewind(step, tables)
         self._origin = step
 
-    def _nearest(self, step: int) -> tuple[int, list[Held]]:
+    def _nearest(self, step: int) -> tuple[int, list[NamedTables]]:
         """Return the last snapshot at or before a step, or a checkpoint between them; and its step."""
         nearest = _snapshot_before(self._recording, step, self.kinds)
         if nearest is None:
             raise RecordingError(f"{self._recording.path}: has no Q-table at or before step {step}.")
         found, own = (
-            [table.shape for one in held for table in one.values()] for held in (nearest[1], self.held)
+            [table.shape for one in tables for table in one.values()]
+            for tables in (nearest[1], self.named_tables)
         )
         if found != own:
             raise RecordingError(f"{self._where}: found Q-tables of shape {found}, expected {own}.")
         if step - nearest[0] <= CHECKPOINT_STEPS:
             return nearest
         at, tables = self._checkpoints.nearest(step, [table.shape for table in self.snapshot()])
-        return (at, held_of(tables, self.kinds)) if at > nearest[0] else nearest
+        return (at, name_tables(tables, self.kinds)) if at > nearest[0] else nearest
 
     def advance(self, stop: int, rows: NDArray[np.float64] = NO_ROWS, trace: Trace | None = None) -> None:
         """Replay up to a later step; `rows` and `trace` are filled as `apply` fills them.
@@ -147,9 +148,9 @@ def tables_at(recording: Recording, step: int) -> list[NDArray[np.float64]]:
     return TableReplay(recording, step).tables
 
 
-def held_at(recording: Recording, step: int) -> list[Held]:
+def named_tables_at(recording: Recording, step: int) -> list[NamedTables]:
     """Return all tables of the learners after `step` training steps, by name; `q` are the Q-tables."""
-    return TableReplay(recording, step).held
+    return TableReplay(recording, step).named_tables
 
 
 def known_steps(recording: Recording) -> list[tuple[int, int]]:
@@ -172,7 +173,7 @@ def known_steps(recording: Recording) -> list[tuple[int, int]]:
     return found
 
 
-def initially_held(recording: Recording) -> list[Held] | None:
+def tables_before_training(recording: Recording) -> list[NamedTables] | None:
     """Return the learners' tables before training, from the first snapshot; None if that is missing."""
     nearest = _snapshot_before(recording, 0, kinds_of(from_mapping(recording.config)))
     return nearest and nearest[1]
@@ -180,7 +181,7 @@ def initially_held(recording: Recording) -> list[Held] | None:
 
 def _snapshot_before(
     recording: Recording, step: int, kinds: tuple[str, ...]
-) -> tuple[int, list[Held]] | None:
+) -> tuple[int, list[NamedTables]] | None:
     """Return the last complete snapshot at or before a step, and its step; None if there is none."""
     tables = len(recording.agents) * len(kinds)
     nearest: list[QTable] = []
@@ -193,4 +194,4 @@ def _snapshot_before(
             nearest = group
     if not nearest:
         return None
-    return nearest[0].step, held_of([table.values for table in nearest], kinds)
+    return nearest[0].step, name_tables([table.values for table in nearest], kinds)

@@ -11,7 +11,7 @@ import numpy as np
 from runner.analysis.diff.tables import own_actions_in_words
 from runner.config import from_mapping
 from runner.environments.naming import states_in_words
-from runner.learning.learner import Held
+from runner.learning.learner import NamedTables
 from runner.learning.schedules import compile_schedule, schedule_value
 from runner.recording import schema
 from runner.recording.reader import Recording
@@ -93,9 +93,9 @@ def _first_other_update(replays: Sequence[TableReplay], start: int, stop: int) -
     return start
 
 
-def _copy(replay: TableReplay) -> list[Held]:
+def _copy(replay: TableReplay) -> list[NamedTables]:
     """Return a copy of all that the learners hold now."""
-    return [{name: array.copy() for name, array in one.items()} for one in replay.held]
+    return [{name: array.copy() for name, array in one.items()} for one in replay.named_tables]
 
 
 def _are_equal(replays: Sequence[TableReplay]) -> bool:

@@ -16,7 +16,7 @@ from runner.cli import cli
 from runner.debugging.what_if import branched, what_if_in
 from runner.errors import ConfigError, RecordingError, RunnerError
 from runner.recording.reader import open_recording
-from runner.replay.tables import held_at
+from runner.replay.tables import named_tables_at
 from tests.runner.recording.making import LAKE, SAMPLED, TAXIS, make_run
 
 TEAM, TWO = {"mode": "cooperative"}, {"mode": "competitive"}
@@ -192,7 +192,7 @@ def check_values(run, at, epsilon):
     assert found.epsilon == pytest.approx(1.0 if run.facts["config"]["algorithm"] == "random" else epsilon)
     with open_recording(run.recording) as recording:
         mdp, config, discount = recording.mdp, recording.config, found.discount
-        held = held_at(recording, found.tables_step)
+        held = named_tables_at(recording, found.tables_step)
         policy = plain_policy(config, mdp, held, epsilon)
         learners = len(recording.agents)
 

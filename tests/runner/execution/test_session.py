@@ -87,12 +87,12 @@ def test_one_run_is_what_the_twin_does_from_beginning_to_end(tmp_path):
                 next_log = (len(twin.training.steps) // 500 + 1) * 500
                 twin.train(pause, next_log)
                 if len(twin.training.steps) == next_log:
-                    logged.append(twin.training_side())
+                    logged.append(twin.training_metrics())
             if pause % 30 == 0:
                 tables += [np.array(table).tobytes() for table in twin.tables]
             if pause % 20 == 0:
                 twin.evaluate(3)
-                evaluated.append(twin.training_side())
+                evaluated.append(twin.training_metrics())
         assert len(logged) == 5
         for found, expected in zip(recording.metrics("train"), logged, strict=True):
             assert {key: found[key] for key in expected} == expected

@@ -182,7 +182,7 @@ def assert_same_records(records: NDArray[np.void], expected: Sequence[NamedTuple
 def assert_same_tables(learner: Learner, twin: Twin) -> None:
     """Compare every cell of all that each learner holds, bit for bit."""
     for i in range(twin.learners):
-        held, expected = learner.held(i), twin.held(i)
+        held, expected = learner.named_tables(i), twin.named_tables(i)
         assert held.keys() == expected.keys()
         for name, table in expected.items():
             assert held[name].tobytes() == np.array(table).tobytes(), f"{name} of learner {i}"

@@ -18,7 +18,7 @@ from runner.learning.learner import Learner
 from runner.recording import schema
 from runner.recording.blocks import blank_records, topic_dtype
 from runner.recording.reader import open_recording
-from runner.replay.tables import TableReplay, held_at, tables_at
+from runner.replay.tables import TableReplay, named_tables_at, tables_at
 from runner.runs.listing import list_runs
 from tests.runner.killing import LONG, kill_when, posix, start
 from tests.runner.learning import harness
@@ -71,7 +71,7 @@ def same(found, learner):
     """Compare all that learners hold, bit for bit."""
     assert len(found) == len(learner.agents)
     for i, held in enumerate(found):
-        expected = learner.held(i)
+        expected = learner.named_tables(i)
         assert list(held) == list(expected)
         for name, array in held.items():
             assert array.tobytes() == expected[name].tobytes(), name
@@ -81,7 +81,7 @@ def test_what_is_held_at_any_step_is_what_the_learner_held(run):
     rng = np.random.default_rng(0)
     with open_recording(run.recording) as recording:
         for step in [0, 1, run.summary["train_steps"], *rng.integers(0, run.summary["train_steps"], 10)]:
-            same(held_at(recording, int(step)), live(run, int(step)))
+            same(named_tables_at(recording, int(step)), live(run, int(step)))
 
 
 def test_a_snapshot_holds_all_that_the_learner_held(algorithm, run):
@@ -94,7 +94,7 @@ def test_a_snapshot_holds_all_that_the_learner_held(algorithm, run):
             kind, i = divmod(table.table, learners)
             expected = live(run, table.step)
             assert table.agent == expected.agents[i]
-            assert table.values.tobytes() == expected.held(i)[kinds[kind]].tobytes()
+            assert table.values.tobytes() == expected.named_tables(i)[kinds[kind]].tobytes()
         shown = list(recording.snapshots())
         assert [table.table for table in shown] == [*range(learners)] * 3
 
@@ -132,11 +132,11 @@ def test_what_it_learned_is_played_again(algorithm, run, tmp_path):
     with open_recording(run.recording) as recording:
         learned = live(run, recording.count(schema.TRAIN_STEP))
     with open_recording(played.recording) as recording:
-        same(held_at(recording, 0), learned)
+        same(named_tables_at(recording, 0), learned)
         steps = np.concatenate(list(recording.blocks(schema.EVAL_STEP)))
         own = learned.model.own_action[steps["action"]]
     assert not steps["explored"].any()
-    for i, table in enumerate(learned.held(j) for j in range(len(learned.agents))):
+    for i, table in enumerate(learned.named_tables(j) for j in range(len(learned.agents))):
         if algorithm == "wolf_phc":
             assert (table["policy"][steps["state"], own[:, i]] > 0).all()
         else:
@@ -156,7 +156,7 @@ def test_another_algorithm_can_start_from_its_q_tables(run, tmp_path):
             initial_q={"run": str(run.recording)},
         )
         with open_recording(going_on.recording) as recording:
-            held = held_at(recording, 0)
+            held = named_tables_at(recording, 0)
         for table, one in zip(tables, held, strict=True):
             assert one["q"].tobytes() == table.tobytes()
         assert verify(going_on.recording).sound

@@ -38,7 +38,7 @@ def test_steps_after_any_moment_give_the_tables_from_what_was_held_then(rules):
     for stop in (7, 33, 34, 1777):  # also within an episode
         train(learner, 10**6, stop, block=1000)
         held = [
-            {name: array.copy() for name, array in learner.held(i).items()}
+            {name: array.copy() for name, array in learner.named_tables(i).items()}
             for i in range(len(learner.agents))
         ]
         other = Learner(config, mdp, 2)

@@ -112,7 +112,7 @@ class Twin:
     def _mean(self, i: int, state: int, action: int) -> float:
         return (self.doubles[0][i][state][action] + self.doubles[1][i][state][action]) / 2
 
-    def held(self, i: int) -> dict[str, list[list[float]]]:
+    def named_tables(self, i: int) -> dict[str, list[list[float]]]:
         """Return all that learner i holds, by name."""
         held = {"q": self.tables[i]}
         if self.config.algorithm == "double_q_learning":
@@ -360,7 +360,7 @@ class Twin:
         """Return a step's summed reward; one that all agents share counts once."""
         return step.rewards[0] if self.mdp.rewards.shape[-1] == 1 else sum(step.rewards)
 
-    def training_side(self) -> dict[str, Any]:
+    def training_metrics(self) -> dict[str, Any]:
         """Return the measures of training at this moment."""
         steps, episodes, log = self.training.steps, self.training.episodes, self.config.log
         recent = [self.team_reward(step) for step in steps[-log.window :]]

@@ -62,16 +62,16 @@ def test_the_second_replay_takes_few_steps_and_gives_the_same(tmp_path, applied,
     with open_recording(run.recording) as recording:
         last = recording.count(schema.TRAIN_STEP)
         steps = [last - 1, 299, 300, 301, 650, 900]
-        first = as_bytes(TableReplay(recording, last - 1).held)
+        first = as_bytes(TableReplay(recording, last - 1).named_tables)
         assert sum(applied) == last - 1
         for step in steps:
             del applied[:]
-            found = as_bytes(TableReplay(recording, step).held)
+            found = as_bytes(TableReplay(recording, step).named_tables)
             assert sum(applied) <= 300
             replay = TableReplay(recording)
             replay.advance(step)
-            assert found == as_bytes(replay.held)
-        assert as_bytes(TableReplay(recording, last - 1).held) == first
+            assert found == as_bytes(replay.named_tables)
+        assert as_bytes(TableReplay(recording, last - 1).named_tables) == first
     assert cached(TABLES)[run.run_id] == sum(file.stat().st_size for file in files()) > 0
 
 
