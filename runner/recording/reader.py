@@ -170,7 +170,7 @@ class Recording(TopicReader):
         elif times is None:
             yield from self.blocks(topic)
         else:
-            yield from self._chunks(topic).blocks_between(times)
+            yield from self.blocks_between(topic, times.start, times.stop)
 
     def row_dtype(self, name: str) -> np.dtype[np.void]:
         """Return the dtype of `rows`."""

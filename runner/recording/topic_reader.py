@@ -134,6 +134,10 @@ class TopicReader(RunDescription):
         """
         return self._chunks(topic).blocks(start, stop)
 
+    def blocks_between(self, topic: Topic, start_time: int, stop_time: int) -> Iterator[NDArray[np.void]]:
+        """Yield the messages of a fixed-width topic logged from `start_time` up to `stop_time`, in ns."""
+        return self._chunks(topic).blocks_between(range(start_time, stop_time))
+
     def first_from(self, topic: Topic, field: str, value: int) -> int:
         """Return the number of a fixed-width topic's first message of that value or more.
 
