@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from runner.environments.gym_types import Space
+if TYPE_CHECKING:
+    from runner.environments.gym_types import Space
 
 ByAgent = dict[Any, Any]
 """Values of a game by agent."""

@@ -8,7 +8,6 @@ from runner.cli.command import Group, argument, option
 from runner.cli.options import json_option
 from runner.cli.output import draw, print_json, say, table
 from runner.service.settings import tokens_file
-from runner.service.tokens import READ, WRITE, Tokens
 
 
 @click.group("token", cls=Group)
@@ -42,6 +41,8 @@ def create(
       dualtaxi token create laptop
       dualtaxi token create pusher --scope write
     """
+    from runner.service.tokens import READ, WRITE, Tokens
+
     scopes = (READ, WRITE) if scope == WRITE else (READ,)
     token, secret = Tokens(tokens_file()).create(name, scopes)
     if as_json:
@@ -58,6 +59,8 @@ def ls(as_json: bool = json_option) -> None:
     Example:
       dualtaxi token ls
     """
+    from runner.service.tokens import Tokens
+
     tokens = Tokens(tokens_file()).all()
     if as_json:
         print_json({"tokens": [token.as_json() for token in tokens]})
@@ -76,6 +79,8 @@ def revoke(which: str = argument(metavar="TOKEN"), as_json: bool = json_option) 
     Example:
       dualtaxi token revoke laptop
     """
+    from runner.service.tokens import Tokens
+
     token = Tokens(tokens_file()).revoke(which)
     if as_json:
         print_json(token.as_json())
