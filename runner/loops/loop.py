@@ -199,6 +199,8 @@ class Loop(Generic[R]):
                 raise ConfigError(f"at_step: found {steps!r}, expected a whole number from {before:,} up")
             self.position  # noqa: B018 - it raises an error if the loop is closed
             self._commit()
+            if self.active is not None:
+                self.active.open()  # else the next steps would replace those just committed
             self.extras.finish()
             if taken["train"]:
                 raise RunnerError(

@@ -11,6 +11,7 @@ from gymnasium.vector import AsyncVectorEnv
 
 import runner
 from runner.errors import ConfigError, RunnerError
+from runner.execution.redo import verify_by_redoing
 from runner.recording.reader import open_recording
 from runner.runs.listing import list_runs, run_at
 from runner.runs.shards import RUN_VARIABLE, shards_of
@@ -123,3 +124,14 @@ def test_the_owner_may_end_before_its_shards(tmp_path, monkeypatch):
     two.close()
     run = run_at(rec.run.folder)
     assert (run.status, run.summary.train_steps) == ("finished", 150)
+
+
+def test_evaluations_right_after_each_other_are_recorded_in_full(tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="quick") as rec:
+        evaluator = runner.record(gymnasium.make("CartPole-v1"), join=rec.run, phase="eval")
+        for evaluation in range(3):
+            evaluator.at_step(100 * evaluation)
+            play(evaluator, 20, seed=evaluation)
+        evaluator.close()
+    redone = verify_by_redoing(rec.run.recording)
+    assert (redone.verdict, redone.steps) == ("reproduced", 60)
