@@ -88,9 +88,11 @@ def deliver(run: Run, client: Client, report: Report = lambda *_: None) -> Uploa
 
 
 class Follower:
-    """Pushes a run while it is recorded, in a thread of its own; problems are reported at the end only.
+    """Pushes a run while it is recorded, in a thread of its own.
 
-    The client is closed at the end; `size` returns how many bytes of the recording are final.
+    A server that is unavailable is tried again; one that refuses the run is reported at once, since the loop
+    may go on for days, and at the end. The client is closed at the end; `size` returns how many bytes of the
+    recording are final.
     """
 
     def __init__(self, client: Client, run: Run, size: Callable[[], int]) -> None:
@@ -134,8 +136,13 @@ class Follower:
                 pause = FOLLOW_SECONDS
             except ServerUnavailable:
                 pause = min(2 * pause, MAX_PAUSE)
-            except RunnerError:
-                return  # reported when the rest is pushed
+            except RunnerError as error:
+                warnings.warn(
+                    f"run {run.run_id} is not pushed while it is recorded: {error} "
+                    f"It is kept in {run.folder}.",
+                    stacklevel=1,
+                )
+                return
 
 
 def forget_upload(run: Run) -> None:

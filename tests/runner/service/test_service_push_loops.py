@@ -134,6 +134,18 @@ def test_a_loop_waits_in_the_outbox_for_an_unavailable_server(own_server, outbox
     assert "empty" in dualtaxi("remote", "push", "--outbox").stderr
 
 
+def test_a_server_that_refuses_a_loop_is_reported_while_it_runs(server, outbox, monkeypatch):
+    monkeypatch.setattr("runner.client.outbox.FOLLOW_SECONDS", 0.05)
+    monkeypatch.setenv("DUALTAXI_TOKEN", "dualtaxi_" + "a" * 43)
+    rec = runner.record(gymnasium.make("FrozenLake-v1"), server.url, name="refused")
+    with pytest.warns(UserWarning, match="is not pushed while it is recorded: .*token") as caught:  # noqa: PT031
+        while not caught.list:
+            drive(rec, 10)
+    with pytest.warns(UserWarning, match="was not pushed: .*token"):
+        rec.close()
+    assert find_run(rec.run.run_id, outbox).status == "finished"
+
+
 def test_a_loop_that_is_killed_leaves_what_it_recorded(server, outbox):
     with loop(server.url, end="hang") as killed:
         assert killed.stdout is not None
