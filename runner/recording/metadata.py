@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from io import BytesIO
@@ -347,6 +348,13 @@ def _json_entry(value: Mapping[str, object]) -> dict[str, str]:
 
 _MAX_WINDOW: Final = 1 << 27
 """The most memory that zstd may take for its window."""
+_PREFIX: Final = b"\x93NUMPY\x01\x00"
+"""Magic and version, before the length of the header in two bytes."""
+_MAX_HEADER_BYTES: Final = 1024
+_HEADER: Final = re.compile(
+    rb"\{'descr': '([<|][biuf][1248])', 'fortran_order': (False|True), "
+    rb"'shape': \(((?:\d{1,10}, ?){0,7}(?:\d{1,10})?)\), \} *\n"
+)
 
 
 def pack_array(array: Array) -> bytes:
@@ -370,12 +378,15 @@ def unpack_array(data: bytes, max_bytes: int, where: str) -> Array:
 
 
 def _read_array(stream: zstandard.ZstdDecompressionReader, max_bytes: int, where: str) -> Array:
-    """Return the array in a `.npy` file of version 1.0."""
-    if np.lib.format.read_magic(stream) != (1, 0):
-        raise ValueError("found another version of .npy than 1.0")
-    shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-    if dtype.kind not in "biuf" or min(shape, default=0) < 0:
-        raise ValueError(f"found {dtype} of shape {shape}, expected numbers")
+    """Return the array in a `.npy` file of version 1.0, whose header is text in a fixed form.
+
+    NumPy's own reader parses the header as Python, which a hostile one makes fail in many ways.
+    """
+    prefix, length = stream.read(len(_PREFIX)), int.from_bytes(stream.read(2), "little")
+    header = _HEADER.fullmatch(stream.read(min(length, _MAX_HEADER_BYTES)))
+    if prefix != _PREFIX or header is None:
+        raise RecordingError(f"{where}: found no `.npy` file of numbers, version 1.0.")
+    dtype, shape = np.dtype(header[1].decode()), tuple(int(n) for n in header[3].split(b",") if n.strip())
     size = math.prod(shape) * dtype.itemsize
     if size > max_bytes:
         raise RecordingError(
@@ -388,4 +399,4 @@ def _read_array(stream: zstandard.ZstdDecompressionReader, max_bytes: int, where
         filled += more
     if filled != size or stream.read(1):
         raise RecordingError(f"{where}: found an array of another size than the {size} bytes it declares.")
-    return flat.reshape(shape, order="F" if is_fortran else "C")
+    return flat.reshape(shape, order="F" if header[2] == b"True" else "C")

@@ -183,6 +183,25 @@ def test_a_description_made_to_exhaust_memory_does_not(kind, recordings, path):
     assert _peak(path) < MOST_MEMORY
 
 
+HEADERS = {
+    "open brackets": b"(" * 5000,
+    "signs that nest": b"-" * 9000 + b"1",
+    "an empty type": b"{'descr': ('<f8',), 'fortran_order': False, 'shape': (0,), }",
+    "numbers of Python 2": b"{'descr': '<f8', 'fortran_order': False, 'shape': (0L,), }",
+    "objects": b"{'descr': '|O', 'fortran_order': False, 'shape': (0,), }",
+}
+
+
+@pytest.mark.parametrize("kind", HEADERS)
+def test_an_array_whose_header_is_no_description_of_numbers_is_refused(kind, recordings, path):
+    name, header = "environment/rewards.npy.zst", HEADERS[kind] + b"\n"
+    array = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
+    body = attachment_body(name, zstandard.compress(array))
+    path.write_bytes(replaced(recordings["tiny-0"], ATTACHMENT, name, body))
+    with open_recording(path) as recording, pytest.raises(RecordingError, match=r"found no .* of numbers"):
+        _ = recording.mdp
+
+
 def _peak(path) -> float:
     """Return the most memory that reading a file in every way takes at once, in MB."""
     command = [sys.executable, "-W", "error", "-m", "tests.reliability.peak", str(path)]
