@@ -259,15 +259,16 @@ def _held(found: Iterator[RedoneSteps], is_last: bool) -> Iterator[RedoneSteps]:
     """
     held: list[RedoneSteps] = []
     count = size = 0
-    begun = time.monotonic()
+    is_holding, begun = not is_last, time.monotonic()
     for steps in found:
         is_early = count < _HELD_STEPS and size < _HELD_BYTES
-        if not is_last and is_early and (not held or time.monotonic() < begun + _HELD_SECONDS):
+        if is_holding and is_early and (not held or time.monotonic() < begun + _HELD_SECONDS):
             if steps.difference is not None:
                 raise _Astray
             held.append(steps)
             count, size = count + len(steps), size + sum(frame.nbytes for frame in steps.frames)
             continue
+        is_holding = False  # what was yielded cannot be taken back
         while held:
             yield held.pop(0)
         yield steps

@@ -69,6 +69,15 @@ def test_another_limit_is_found_in_the_first_episode_that_reaches_it(tmp_path):
     assert (steps, difference.episode, difference.t, difference.field) == (150, 0, 149, "truncated")
 
 
+def test_steps_are_yielded_once_where_nothing_can_be_compared_in_advance(pole, monkeypatch):
+    monkeypatch.setattr("runner.replay.episodes._HELD_SECONDS", 0.0)  # as on a slow machine
+    limited = {"render_mode": "rgb_array", "max_episode_steps": 4}
+    steps, difference = redone(
+        pole, "train", [0], render=True, make=lambda: gymnasium.make("CartPole-v1", **limited)
+    )
+    assert (steps, difference.t, difference.field) == (4, 3, "truncated")
+
+
 def test_another_beginning_is_found_at_the_reset(pole):
     _, difference = redone(
         pole, make=lambda: gymnasium.wrappers.TransformObservation(cart_pole(), lambda o: o * 2, None)
