@@ -33,7 +33,7 @@ def load_sweep_libraries() -> None:
     def load() -> None:
         if sys.platform == "linux":  # elsewhere a priority is that of a whole process
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
-        for module in ("scipy.stats", "sklearn.tree", "optuna.samplers", "runner.sweep.results"):
+        for module in ("scipy.stats", "sklearn.ensemble", "optuna.samplers", "runner.sweep.results"):
             with contextlib.suppress(ImportError):  # the function that needs it explains how to install it
                 importlib.import_module(module)
 
