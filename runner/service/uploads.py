@@ -158,8 +158,7 @@ class Uploads:
             if upload is not None:
                 if upload.source.digest not in (None, source.digest):
                     raise UploadConflict("found another digest than the one announced; begin another upload.")
-                is_here = upload.state == "stored" and run_of_id(upload.run_id, self._recordings) is not None
-                if upload.state in ("verifying", "refused") or is_here:
+                if upload.state in ("verifying", "refused") or self._is_here(upload, source):
                     return upload
                 if upload.problem:
                     self._uploads[owner, upload_id] = replace(upload, problem="")  # it is verified next time
@@ -182,6 +181,14 @@ class Uploads:
                 upload = replace(upload, state="stored", offset=size, run_id=run.run_id, already=True)
             self._store(upload)
         return self._verify_if_whole(upload)
+
+    def _is_here(self, upload: Upload, source: UploadSource) -> bool:
+        """Return whether an upload was stored, and what it became was not removed since."""
+        if upload.state != "stored":
+            return False
+        if source.checkpoint_of:  # its run may have been removed with its contents, and be here again
+            return self._run_with(source) is not None
+        return run_of_id(upload.run_id, self._recordings) is not None
 
     def _run_with(self, source: UploadSource) -> Run | None:
         """Return the run that has all of these bytes already; None if there is none."""

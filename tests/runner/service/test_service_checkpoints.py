@@ -51,6 +51,19 @@ def test_a_pushed_run_has_its_checkpoints_and_so_has_a_pulled_one(server, tmp_pa
     assert list((tmp_path / "other").glob(".pulling/*")) == []
 
 
+def test_a_run_that_was_removed_is_pushed_again_with_its_checkpoints(server, tmp_path):
+    run = record_loop(tmp_path / "here", "removed")
+    with Client(server.url) as client:
+        for _ in range(2):
+            client.push(run)
+            there = runner.find_run(run.run_id, server.recordings)
+            assert all(each.is_here for each in there.checkpoints())
+            done = CliRunner().invoke(
+                cli, ["rm", run.run_id, "--yes", "--recordings", str(server.recordings)]
+            )
+            assert done.exit_code == 0, done.output
+
+
 def test_a_loop_recorded_for_a_server_leaves_no_content_in_the_outbox(server, outbox):
     run = record_loop(server.url, "sent")
     there = httpx2.get(f"{server.url}/api/v1/runs/{run.run_id}/checkpoints").json()["checkpoints"]
