@@ -20,7 +20,7 @@ from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run
 from runner.service.errors import UploadConflict, UploadTooLarge
-from runner.service.uploads import FOLDER
+from runner.service.uploads import FOLDER, UploadSource
 from tests.runner.recording.making import TAXIS, experiment, make_run, stopping_after, with_id
 
 
@@ -152,6 +152,22 @@ def test_another_run_of_the_same_id_is_not_replaced(uploads, lake, taxis, tmp_pa
     refused = send(uploads, lake.recording.read_bytes())
     assert "another run" in refused.problem
     assert find_run(lake.run_id, tmp_path / "runs").recording.read_bytes() == taxis.recording.read_bytes()
+
+
+def test_a_run_that_is_announced_otherwise_later_is_not_left_in_the_list(uploads, lake, tmp_path):
+    data = lake.recording.read_bytes()
+    upload = grow(uploads, ANNA, run_id=lake.run_id)
+    uploads.alive(uploads.append(ANNA, upload.id, 0, data))
+    assert visible(tmp_path / "runs") == [lake.run_id]
+    uploads.delete(BEN, grow_as(uploads, BEN, upload.id, run_id=lake.run_id).id)
+    assert visible(tmp_path / "runs") == [lake.run_id], "another's upload of the same id shows another run"
+    grow_as(uploads, ANNA, upload.id, run_id="another")
+    assert visible(tmp_path / "runs") == []
+
+
+def grow_as(uploads, owner, upload_id, **known):
+    """Begin or continue an upload of unknown bytes."""
+    return uploads.put(owner, upload_id, UploadSource(**known))
 
 
 def test_a_truncated_run_is_stored_as_interrupted(uploads, taxis, tmp_path):
