@@ -14,6 +14,7 @@ from runner.errors import RecordingError
 from runner.recording.actions import after_step
 from runner.recording.blocks import blank_records
 from runner.recording.reader import MAX_EPISODE_BYTES, Recording, open_recording
+from runner.recording.schema import PHASE_NAMES
 from runner.replay.redone import RedoneSteps
 
 
@@ -25,6 +26,7 @@ def whole_steps(recording: Recording, phase: str, episode: int) -> NDArray[np.vo
 
     Raises:
         CannotRedo: the environment cannot be made, or is another one.
+        RecordingError: actions of the episode were lost, or it is too long for an array.
     """
     span, topic = recording.episode_span(phase, episode), recording.topic(f"/{phase}/step")
     if len(span) * recording.dtypes[topic].itemsize > MAX_EPISODE_BYTES:
@@ -53,6 +55,8 @@ def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> NDArray[np
         for block in recording.actions(phase):
             inside = block[(block["step"] >= span.start) & (block["step"] < span.stop)]
             own.append(inside[(inside["step"] - span.start) % span.step == 0])
+        if not own or not np.array_equal(np.concatenate([part["step"] for part in own]), span):
+            raise RecordingError(f"{path}: steps of {PHASE_NAMES[phase]} episode {episode:,} were lost.")
         records = blank_steps(recording, phase, np.concatenate(own))
         is_state, start = recording.kind == "step", 0
         if is_state:

@@ -19,12 +19,14 @@ from starlette.testclient import TestClient
 
 import runner
 from runner.cli import cli
-from runner.errors import CannotRedo, ConfigError, Diverged, RunnerError
+from runner.errors import CannotRedo, ConfigError, Diverged, RecordingError, RunnerError
 from runner.execution.redo import verify_by_redoing
 from runner.execution.rerecord import rerecord
 from runner.execution.verify import verify
 from runner.export.reports.report import render_report
+from runner.recording.actions import packed
 from runner.recording.reader import open_recording
+from runner.replay.whole_steps import whole_steps
 from runner.service.app import create_app
 from runner.service.settings import Settings
 from tests.waiting import until
@@ -291,6 +293,19 @@ def test_a_changed_action_is_found(tmp_path, monkeypatch):
 
     with pytest.raises((CannotRedo, Diverged)):
         _rerecord_loop(run.recording, tmp_path / "fresh.mcap", trust=False)
+
+
+def test_an_episode_of_which_actions_were_lost_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("runner.recording.action_recorder.packed", lambda rows, n: packed(rows[5:], n))
+    env = gymnasium.make("FrozenLake-v1", is_slippery=False)
+    with runner.record(env, tmp_path, steps="actions") as rec:
+        rec.reset(seed=1)
+        for _ in range(100):  # at the edge, where nothing happens
+            rec.step(0)
+    with open_recording(rec.run.recording) as recording:
+        assert recording.episode_span("train", 0) == range(100)
+        with pytest.raises(RecordingError, match="steps of training episode 0 were lost"):
+            whole_steps(recording, "train", 0)
 
 
 def test_wide_actions_of_many_environments_stay_readable(tmp_path):
