@@ -338,9 +338,13 @@ class Uploads:
             LOG.exception("verification", extra={"upload": upload.id})
             problem = "something unexpected went wrong while it was verified; try again."
             upload = replace(upload, state="receiving", problem=problem)
-        self._on_verified(upload)
-        with contextlib.suppress(StorageError):  # after a restart it is verified again, with the same result
-            self._store(upload)
+        try:
+            self._on_verified(upload)
+        finally:
+            with contextlib.suppress(
+                StorageError
+            ):  # a restarted server verifies it again, to the same result
+                self._store(upload)
 
 
 def verify(source: UploadSource, body: Path, recordings: Path) -> tuple[str, bool]:

@@ -14,7 +14,8 @@ from uploading import ANNA, BEN, begin, grow, over, send, start, visible
 
 from runner.errors import StorageError
 from runner.service.errors import Busy, TooManyUploads, UploadTooLarge
-from runner.service.uploads import FOLDER
+from runner.service.settings import Limits
+from runner.service.uploads import FOLDER, Uploads
 from tests.waiting import until
 
 
@@ -125,6 +126,15 @@ def test_an_upload_whose_verification_fails_unexpectedly_can_be_completed_again(
     with pytest.raises(Busy, match="went wrong"):
         begin(uploads, ANNA, data)
     assert over(uploads, begin(uploads, ANNA, data)).state == "stored"
+
+
+def test_an_upload_is_stored_although_a_report_of_it_fails(lake, tmp_path):
+    def fail(upload):
+        raise RuntimeError(upload.id)
+
+    uploads = Uploads(tmp_path / "runs", Limits(spare_bytes=0), fail)
+    assert send(uploads, lake.recording.read_bytes()).state == "stored"
+    uploads.close()
 
 
 def test_one_client_cannot_hold_all_uploads(tmp_path):
