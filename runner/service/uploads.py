@@ -341,9 +341,7 @@ class Uploads:
         try:
             self._on_verified(upload)
         finally:
-            with contextlib.suppress(
-                StorageError
-            ):  # a restarted server verifies it again, to the same result
+            with contextlib.suppress(StorageError):  # verified again after a restart, with the same result
                 self._store(upload)
 
 
