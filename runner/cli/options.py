@@ -52,7 +52,6 @@ recordings_option: Final = option(
 
 
 def _folders(_ctx: click.Context, _param: click.Parameter, value: tuple[Path, ...]) -> tuple[Path, ...]:
-
     return value or (recordings_folder(),)
 
 

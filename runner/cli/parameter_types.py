@@ -74,7 +74,6 @@ class RunName(Completed):
 
 
 def _runs(ctx: click.Context, incomplete: str) -> Mapping[str, str]:
-
     try:
         return completions(incomplete, recordings_folder(ctx.params.get("recordings")))
     except RunnerError:
@@ -106,7 +105,6 @@ def _shipped(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
 
 
 def _filter_words(_ctx: click.Context, incomplete: str) -> Mapping[str, str]:
-
     if incomplete.startswith("status:"):
         return {f"status:{status}": "" for status in columns.STATUSES}
     words = {f"{name}:": field.meaning for name, field in columns.FIELDS.items()}

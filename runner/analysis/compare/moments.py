@@ -255,8 +255,6 @@ def _area(
     first, last = max(map(min, curves)), min(map(max, curves))
     if first >= last:
         return None, "it has no part of training in common with the other runs"
-    places, known = (
-        sorted({first, *(place for place in points if first <= place <= last), last}),
-        sorted(points),
-    )
+    places = sorted({first, *(place for place in points if first <= place <= last), last})
+    known = sorted(points)
     return mean_height(places, np.interp(places, known, [points[place] for place in known]).tolist()), ""
