@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -63,10 +64,11 @@ def compare_names(recording: Recording, learners: list[str] | None = None) -> No
     Raises:
         Diverged: two of them differ.
     """
-    described, config = recording.environment, recording.config.get("env", {})
+    described, config = recording.environment, recording.config.get("env")
     for key, name in (("env_id", "id"), ("kwargs", "kwargs")):
-        if described.get(key) != config.get(name):
-            raise Diverged("environment.json", key, described.get(key), config.get(name))
+        expected = config.get(name) if isinstance(config, Mapping) else None
+        if described.get(key) != expected:
+            raise Diverged("environment.json", key, described.get(key), expected)
     if learners is not None and list(recording.agents) != learners:
         raise Diverged("metadata run", "agents", list(recording.agents), learners)
 

@@ -13,9 +13,11 @@ from collections.abc import Mapping
 
 from blake3 import blake3
 
+from runner.errors import RecordingError, shortened
 from runner.recording.schema import Topic
 
 _PREFIX = b"dualtaxi content 0\n"
+_MAX_SHOWN = 80
 
 
 class ContentHash:
@@ -41,9 +43,20 @@ class ContentHash:
 
 
 def combined_digest(topics: Mapping[str, str]) -> str:
-    """Return the content digest for the hashes of the topics."""
+    """Return the content digest for the hashes of the topics.
+
+    Raises:
+        RecordingError: one of them is no hash.
+    """
     whole = blake3(_PREFIX)
     for name in sorted(topics):
         encoded = name.encode()
-        whole.update(struct.pack("<I", len(encoded)) + encoded + bytes.fromhex(topics[name]))
+        try:
+            own = bytes.fromhex(topics[name])
+        except ValueError:
+            found = shortened(topics[name], _MAX_SHOWN)
+            raise RecordingError(
+                f"the hash of {name}: found {found!r}, expected hexadecimal digits."
+            ) from None
+        whole.update(struct.pack("<I", len(encoded)) + encoded + own)
     return whole.hexdigest()

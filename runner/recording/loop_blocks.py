@@ -210,10 +210,12 @@ def records_of(
     """Yield the records of a topic in blocks, as `Recording.rows` does.
 
     Raises:
-        Inconsistent: messages are not numbered consecutively.
+        Inconsistent: messages are not numbered consecutively, or are of actions without their steps.
     """
     topic, first = recording.topic(name), 0
     number = schema.NUMBERED_BY[topic.message]
+    if topic.message in schema.STEP_MESSAGES and recording.has_actions_alone(topic.phase):
+        raise Inconsistent(f"{name}: found actions alone, expected whole steps as in the configuration")
     for block in recording.rows(name):
         if topic in recording.dtypes:
             on_block(topic, block)

@@ -239,3 +239,25 @@ def test_messages_of_varying_size_have_their_number_and_their_rewards(
         for _ in range(5):
             rec.step(rec.action_space.sample())
     assert finding in verify(rec.run.recording).finding
+
+
+def test_descriptions_of_a_loop_that_cannot_be_true_are_refused(tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path, steps="actions", index="message") as rec:
+        rec.reset(seed=1)
+        for _ in range(5):
+            rec.step(0)
+
+    def stating(name, **values):
+        def change(entries):
+            return {"json": json.dumps(json.loads(entries["json"]) | values)}
+
+        return altered(
+            rec.run.recording, tmp_path / f"{len(values)}-{name}.mcap", None, None, **{name: change}
+        )
+
+    assert "env_id" in verify(stating("config", env=5)).finding
+    found = verify(stating("result", topic_digests={"/train/step": "no"}, x=0))
+    assert "the hash of /train/step: found 'no', expected hexadecimal digits" in found.finding
+    claimed = {"compression": "zstd", "level": 1, "index": "message", "steps": "all"}
+    found = verify(stating("config", recording=claimed, y=0))
+    assert "/train/step: found actions alone, expected whole steps" in found.finding
