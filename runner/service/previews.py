@@ -1,6 +1,6 @@
 """Runs that are pushed while they are recorded: listed as running before their upload is complete.
 
-    recordings/k3v9m2xq/run.json          with the folder of the upload
+    recordings/k3v9m2xq/run.json          with the id of the upload
     recordings/k3v9m2xq/recording.mcap    a link to the bytes that have been received
     recordings/k3v9m2xq/stop              if the loop is requested to stop
 
@@ -35,15 +35,14 @@ class Previews:
     def __init__(self, recordings: Path) -> None:
         self._recordings = recordings
 
-    def update(self, upload: str, run_id: str, body: Path) -> Run | None:
+    def update(self, upload_id: str, run_id: str, body: Path) -> Run | None:
         """Note that the sender of an upload goes on; return the run that shows it, if its bytes describe it.
 
-        `upload` is the name of its folder, which only the server knows: clients choose ids. A run of another
-        upload, or one that is stored, stays as it is.
+        A run of another upload, or one that is stored, stays as it is.
         """
         if not re.fullmatch(NAME_PATTERN, run_id):
             return None
-        if (run := self._run(upload, run_id)) is not None:
+        if (run := self._run(upload_id, run_id)) is not None:
             run.beat()
             return run
         target = self._recordings / run_id
@@ -57,20 +56,20 @@ class Previews:
             if facts["run_id"] != run_id:
                 return None
             # The owner is no process of this machine, so the run counts as running by its heartbeat.
-            facts |= {"status": "running", "owner": {"host": "upload"}, PREVIEW: upload}
+            facts |= {"status": "running", "owner": {"host": "upload"}, PREVIEW: upload_id}
             hidden = body.with_name("preview")
             shutil.rmtree(hidden, ignore_errors=True)
             hidden.mkdir()
             os.link(body, hidden / RECORDING_FILE)
             write_object(hidden / RUN_FILE, facts)
             hidden.rename(target)
-        return self._run(upload, run_id)
+        return self._run(upload_id, run_id)
 
-    def remove(self, upload: str, run_id: str) -> None:
+    def remove(self, upload_id: str, run_id: str) -> None:
         """Remove the run that shows an upload, if there is one."""
-        if (run := self._run(upload, run_id)) is not None:
+        if (run := self._run(upload_id, run_id)) is not None:
             shutil.rmtree(run.folder, ignore_errors=True)
 
-    def _run(self, upload: str, run_id: str) -> Run | None:
+    def _run(self, upload_id: str, run_id: str) -> Run | None:
         run = run_in(self._recordings / run_id) if re.fullmatch(NAME_PATTERN, run_id) else None
-        return run if run is not None and run.facts.get(PREVIEW) == upload else None
+        return run if run is not None and run.facts.get(PREVIEW) == upload_id else None

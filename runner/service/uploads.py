@@ -173,7 +173,7 @@ class Uploads:
                 if run is None:
                     self._require_place(owner)
             if upload.run_id != source.run_id:
-                self._previews.remove(upload.folder, upload.run_id)
+                self._previews.remove(upload.id, upload.run_id)
             known = source.model_dump(include={"run_id", "name", "size"})
             upload = replace(upload, source=source, **known)
             if run is None:
@@ -236,7 +236,7 @@ class Uploads:
         """Show what has arrived of a run that is being recorded; return whether its loop is to stop, too."""
         if upload.state != "receiving" or upload.source.digest is not None:
             return upload
-        run = self._previews.update(upload.folder, upload.run_id, self._body(upload))
+        run = self._previews.update(upload.id, upload.run_id, self._body(upload))
         return replace(upload, stop_requested=run is not None and run.is_stop_requested)
 
     def delete(self, owner: str, upload_id: str) -> None:
@@ -251,7 +251,7 @@ class Uploads:
             if upload.state == "verifying":
                 raise UploadConflict("the upload is being verified; wait for its end.")
             del self._uploads[owner, upload_id]
-        self._previews.remove(upload.folder, upload.run_id)
+        self._previews.remove(upload.id, upload.run_id)
         shutil.rmtree(self._body(upload).parent, ignore_errors=True)
 
     def _body(self, upload: Upload) -> Path:
@@ -266,7 +266,7 @@ class Uploads:
                 body.touch()
                 write_object(body.with_name(STATE_FILE), _STORED.dump_python(upload, mode="json"))
                 if upload.is_over:
-                    self._previews.remove(upload.folder, upload.run_id)
+                    self._previews.remove(upload.id, upload.run_id)
                     body.unlink()
         finally:  # clients see it when it is on disk
             self._uploads[upload.owner, upload.id] = upload
