@@ -168,7 +168,7 @@ def test_what_cannot_be_evaluated_says_why(folder):
     for words in (["--episode", "0"], ["--checkpoint", "@0", "--policy", "a:b"]):
         assert dualtaxi(folder, "values", pole.run_id, *words).exit_code == 2
     words = ["--episode", "9999", "--checkpoint", "@0", "--policy", "agent_of_test:values"]
-    assert "no training episode 9999" in dualtaxi(folder, "values", pole.run_id, *words).output
+    assert "no training episode 9,999" in dualtaxi(folder, "values", pole.run_id, *words).output
 
 
 def test_a_vector_of_a_class_of_its_own_is_played_by_one_environment(tmp_path):

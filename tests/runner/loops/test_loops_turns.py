@@ -103,7 +103,7 @@ def test_pages_films_and_diffs_show_games_in_turns(tmp_path):
     with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
         shown = pictures(a, "train", 0)
         assert shown.source is Source.REDRAWN
-        assert [picture.action.partition(" ")[0] for picture in shown][1:3] == ["player_1", "player_2"]
+        assert [picture.action[:8] for picture in shown][1:3] == ["player 1", "player 2"]
         found = diff(a, b).divergence
         assert (found.episode, found.t, found.field) == (0, 0, "action.player_1")
     played = dualtaxi(tmp_path, "play", "game1", "--json").stdout.splitlines()

@@ -81,7 +81,7 @@ def test_the_steps_of_each_episode_are_its_own(phase, recording, whole):
 
 @pytest.mark.parametrize("number", [-1, 60, 61, 10**12])
 def test_an_episode_that_is_not_there_is_refused(number, recording):
-    with pytest.raises(RecordingError, match=rf"no training episode {number}; there are 60"):
+    with pytest.raises(RecordingError, match=rf"no training episode {number:,}; there are 60"):
         recording.episode_steps("train", number)
 
 

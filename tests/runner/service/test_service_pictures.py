@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import io
 import time
-from functools import partial
 
 import gymnasium
 import numpy as np
@@ -14,7 +13,6 @@ from loop_replays import pictures, serving, steps_of
 from PIL import Image
 
 from runner.recording.reader import open_recording
-from runner.replay.environment import redo_in_child
 from runner.runs.resolve import find_run
 from runner.service.errors import Busy
 from runner.service.pictures import MAX_STREAMS, PictureStreams
@@ -58,7 +56,7 @@ def test_pictures_after_the_end_are_none(loops_client):
 
 
 def test_an_environment_that_takes_too_long_is_given_up_with_a_reason(loops_client, monkeypatch):
-    monkeypatch.setattr("runner.replay.environment.redo_in_child", partial(redo_in_child, seconds=1e-3))
+    monkeypatch.setattr("runner.replay.environment.SECONDS", 1e-3)
     found, problem = pictures(loops_client, "pole/replay/train/2")
     assert found == []
     assert "took longer than 0.001 s" in problem
@@ -67,7 +65,7 @@ def test_an_environment_that_takes_too_long_is_given_up_with_a_reason(loops_clie
 def test_where_an_environment_cannot_draw_the_recorded_frames_are_shown_with_the_reason(
     loops_client, monkeypatch
 ):
-    monkeypatch.setattr("runner.replay.environment.redo_in_child", partial(redo_in_child, seconds=1e-3))
+    monkeypatch.setattr("runner.replay.environment.SECONDS", 1e-3)
     notes = []
     found, problem = pictures(loops_client, "framed/replay/train/2", notes, steps=1000)
     assert found[0].startswith(b"\x89PNG")

@@ -121,7 +121,7 @@ def test_without_a_picture_the_page_gives_the_reason_and_the_values(loops_client
         ("pole/replay/train/99", "no training episode 99"),
         ("pole/replay/eval/4/9", "no trial 9"),
         ("pole/replay/eval/3/0", "nearest after 4"),
-        ("poles/replay/train/9999", "no training episode 9999"),
+        ("poles/replay/train/9999", "no training episode 9,999"),
     ],
 )
 def test_an_episode_that_is_not_there_is_refused(loops_client, address, message):
