@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import os
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Final
@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 
 from runner.errors import NotInRecording, RecordingError
 from runner.recording import schema
-from runner.recording.actions import kept_dtype, unpacked
-from runner.recording.blocks import topic_dtype
 from runner.recording.extras import ExtraLayout, Extras, read_layouts
 from runner.recording.labels import read_labels
 from runner.recording.liveness import is_owned
@@ -31,29 +29,22 @@ from runner.recording.messages import (
     Message,
     QTable,
     Snapshot,
-    decode,
     decode_array,
     decode_q_table,
     unknown_measures,
 )
 from runner.recording.reset_states import ResetState, decode_reset_state
+from runner.recording.row_reader import RowReader
 from runner.recording.run_file import run_title
 from runner.recording.schema import Topic
 from runner.recording.spaces import decode as decode_value
 from runner.recording.topic_chunks import TopicChunks
-from runner.recording.topic_reader import TopicReader
 
 MAX_EPISODE_BYTES: Final = 128 << 20
 """The most that `episode_steps` returns as one array: some 1.5 million steps."""
 MAX_METRICS: Final = 1 << 17
 """The most that `metrics` returns as one list."""
 _METRICS_BYTES: Final = 1 << 20
-FOREVER: Final = 2**63 - 1
-"""A time in nanoseconds that no message has."""
-_OBJECT: Final = np.dtype(object)
-_ROWS: Final = 1024
-_ROWS_BYTES: Final = 16 << 20
-"""The most messages of varying size in a block of `rows`, and the bytes of values with which one ends."""
 
 
 def open_recording(path: str | os.PathLike[str]) -> Recording:
@@ -65,7 +56,7 @@ def open_recording(path: str | os.PathLike[str]) -> Recording:
     return Recording(Path(path))
 
 
-class Recording(TopicReader):
+class Recording(RowReader):
     """A recording, opened; a context manager."""
 
     @property
@@ -100,109 +91,6 @@ class Recording(TopicReader):
         recorded = {key: getattr(self.result, key) for key in counts}
         return {key: count() if recorded[key] is None else recorded[key] for key, count in counts.items()}
 
-    @property
-    def has_steps(self) -> bool:
-        """Whether any whole step was recorded."""
-        return any(self.has_messages(f"/{phase}/step") for phase in schema.PHASES)
-
-    @property
-    def has_actions(self) -> bool:
-        """Whether any action was recorded, with its step or alone."""
-        return any(self.has_actions_of(phase) for phase in schema.PHASES)
-
-    def has_actions_of(self, phase: str) -> bool:
-        """Return whether any action of a phase was recorded."""
-        return self.has_messages(f"/{phase}/step") or self.has_actions_alone(phase)
-
-    def has_actions_alone(self, phase: str) -> bool:
-        """Return whether actions of a phase were recorded without their steps."""
-        name = f"/{phase}/actions"
-        return name in self._topics_by_name and self.has_messages(name)
-
-    def step_count(self, phase: str) -> int:
-        """Return how many steps of a phase were recorded, whole or their actions alone."""
-        if not self.has_actions_alone(phase):
-            return self.count(self.topic(f"/{phase}/step"))
-        topic = self.topic(f"/{phase}/actions")
-        last = len(self._chunks(topic)) - 1
-        return max(
-            int(one["step"] + one["count"])
-            for _, one in self._parsed(topic, partial(decode, topic.message), last)
-        )
-
-    def actions(self, phase: str, times: range | None = None) -> Iterator[NDArray[np.void]]:
-        """Yield the steps of a loop's phase of which only the actions were recorded, in blocks.
-
-        Their fields are those of `kept_dtype`; `times` as for `rows`.
-
-        Raises:
-            RecordingError: they are damaged.
-        """
-        topic = self.topic(f"/{phase}/actions")
-        dtype, where = self.row_dtype(f"/{phase}/step"), f"{self.path}: {topic.name}"
-        # A message has the time of its last step.
-        for fields in self.decoded(topic, times=times and range(times.start, FOREVER)):
-            block = unpacked(fields, dtype, self.environments, where)
-            if times is not None:
-                if block["log_time"][0] >= times.stop:
-                    return
-                block = block[(block["log_time"] >= times.start) & (block["log_time"] < times.stop)]
-            yield block
-
-    def rows(self, name: str, times: range | None = None) -> Iterator[NDArray[np.void]]:
-        """Yield the steps, resets or episodes of a loop as records in blocks, however they are recorded.
-
-        Values of varying size are objects: the bytes that `spaces.decode` takes. Steps whose actions alone
-        were recorded have the fields of `kept_dtype`.
-
-        Args:
-            name: of the topic.
-            times: their `log_time` in ns, from the first to before the last; None for all.
-
-        Raises:
-            RecordingError: they are damaged.
-        """
-        topic = self.topic(name)
-        if topic.message in schema.STEP_MESSAGES and self.has_actions_alone(topic.phase):
-            yield from self.actions(topic.phase, times)
-        elif topic not in self.dtypes:
-            yield from self._decoded_rows(topic, times)
-        elif times is None:
-            yield from self.blocks(topic)
-        else:
-            yield from self.blocks_between(topic, times.start, times.stop)
-
-    def row_dtype(self, name: str) -> np.dtype[np.void]:
-        """Return the dtype of `rows`."""
-        topic = self.topic(name)
-        if topic not in self.dtypes:
-            return topic_dtype(topic, len(self.agents), 0, _OBJECT, _OBJECT)
-        is_alone = topic.message in schema.STEP_MESSAGES and self.has_actions_alone(topic.phase)
-        return kept_dtype(self.dtypes[topic]) if is_alone else self.dtypes[topic]
-
-    def _decoded_rows(self, topic: Topic, times: range | None) -> Iterator[NDArray[np.void]]:
-        """Yield messages of varying size as records, their values of spaces as bytes."""
-        learners, number = len(self.agents), schema.NUMBERED_BY[topic.message]
-        dtype, size = self.row_dtype(topic.name), 0
-        messages: list[Message] = []
-        for message in self.decoded(topic, times=times):
-            if len(rewards := message.get("rewards", [0.0] * learners)) != learners:
-                raise RecordingError(
-                    f"{self.path}: {topic.name}, {number} {message[number]}: found {len(rewards)} rewards, "
-                    f"expected {learners}."
-                )
-            messages.append(message)
-            size += sum(len(value) for value in message.values() if isinstance(value, bytes))
-            if len(messages) == _ROWS or size > _ROWS_BYTES:
-                yield _records_of(messages, dtype)
-                messages, size = [], 0
-        if messages:
-            yield _records_of(messages, dtype)
-
-    def has_messages(self, name: str) -> bool:
-        """Return whether the topic of that name has any message."""
-        return len(self._chunks(self.topic(name))) > 0
-
     def count(self, topic: Topic) -> int:
         """Return the number after that of a topic's last message: how many there are, if none was lost.
 
@@ -211,28 +99,6 @@ class Recording(TopicReader):
         if topic.message is schema.EXTRA:
             return self.extras(topic.phase).count
         return self._chunks(topic).count()
-
-    def whole_steps(self, phase: str) -> int:
-        """Return how many steps of a loop's phase are known to have their resets.
-
-        Of a recording that was cut off these are the steps up to the first end of an episode after its last
-        reset: what comes later may lack its reset, since topics are written one after the other.
-        """
-        n, total = self.environments, self.step_count(phase)
-        if "content_digest" in self.result:
-            return total
-        name = f"/{phase}/reset"
-        chunks, last = self._chunks(self.topic(name)), None
-        start = chunks.entry(len(chunks) - 1).start_time if len(chunks) else FOREVER
-        for resets in self.rows(name, range(start, FOREVER)):
-            last = resets[-1]
-        if last is None:
-            return 0
-        for block in self.rows(f"/{phase}/step", range(int(last["log_time"]), FOREVER)):
-            over = (block["terminated"] | block["truncated"]) & (block["step"] >= last["step"])
-            if over.any():
-                return min(int(block["step"][np.argmax(over)]) // n * n + n, total // n * n)
-        return total // n * n
 
     def blocks_of_episodes(self, phase: str, start: int, stop: int | None) -> Iterator[NDArray[np.void]]:
         """Yield the steps of the episodes number `start` up to `stop`; None for all that follow."""
@@ -444,10 +310,3 @@ class Recording(TopicReader):
 
     def _snapshots(self, first_chunk: int) -> Iterator[QTable]:
         return (table for _, table in self._parsed(schema.Q_TABLE_TOPIC, decode_q_table, first_chunk))
-
-
-def _records_of(messages: Sequence[Message], dtype: np.dtype[np.void]) -> NDArray[np.void]:
-    records = np.zeros(len(messages), dtype)
-    for name in messages[0]:
-        records[name] = [message[name] for message in messages]
-    return records

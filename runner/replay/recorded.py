@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.loop_blocks import aligned
-from runner.recording.reader import FOREVER, Recording
+from runner.recording.reader import Recording
 from runner.recording.reset_states import ResetState
+from runner.recording.row_reader import FOREVER
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.spaces import Value
 
