@@ -17,6 +17,7 @@ from runner.errors import RecordingError, RunnerError, RunNotFound
 from runner.runs.resolve import find_run, find_runs
 from runner.runs.run import RECORDING_FILE, RUN_FILE, SHARDS_FOLDER, Run, recordings_folder
 from runner.runs.shards import are_over, shards_in_words
+from runner.util.compilation import MESSAGE, announced
 from runner.util.humanize import UNKNOWN, duration, size
 from runner.util.values import Json, JsonView
 
@@ -151,9 +152,6 @@ def opened_run(
 @contextlib.contextmanager
 def compilation_notice() -> Iterator[None]:
     """Print a notice when a kernel is compiled, which takes seconds the first time."""
-    from runner.learning.numba_cache import MESSAGE, announced, load_without_scipy
-
-    load_without_scipy()
     with announced(lambda: say(MESSAGE)):
         yield
 

@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from numba.core import caching, event
 from numba.core.registry import cpu_target
 
+from runner.util.compilation import announce
+
 BLAS: Final = "scipy.linalg.cython_blas"
 """What Numba imports of SciPy."""
-MESSAGE: Final = "Compiling a kernel for this algorithm and number of agents: a few seconds, the first time."
 
 
 def watch(module: str) -> None:
@@ -68,22 +68,13 @@ def load_without_scipy() -> None:
         del sys.modules[BLAS]
 
 
-class _FirstStart(event.Listener):  # type: ignore[misc]  # Numba has no types
-    def __init__(self, notify: Callable[[], None]) -> None:
-        self._notify: Callable[[], None] | None = notify
-
+class _Announcement(event.Listener):  # type: ignore[misc]  # Numba has no types
     def on_start(self, _event: object) -> None:
-        if self._notify is not None:
-            notify, self._notify = self._notify, None
-            notify()
+        announce()
 
     def on_end(self, _event: object) -> None:
         pass
 
 
-def announced(notify: Callable[[], None]) -> Any:
-    """Return a context in which `notify` is called once, just before Numba begins to compile anything.
-
-    Numba sends the event after it has not found the signature in its cache, so a compilation does follow.
-    """
-    return event.install_listener("numba:compile", _FirstStart(notify))
+event.register("numba:compile", _Announcement())
+# Numba sends the event after it has not found the signature in its cache, so a compilation does follow.

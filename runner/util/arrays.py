@@ -1,6 +1,6 @@
 """Types of arrays that many modules handle."""
 
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,6 @@ Array = NDArray[np.generic]
 """An array whose element type is known only at run time, such as a column of a recording."""
 Records = NDArray[np.void]
 """Structured records, such as messages of one topic."""
-MaskedArray = np.ma.MaskedArray[tuple[int, ...], np.dtype[np.generic]]
-"""An `Array` with missing values."""
+MaskedArray: TypeAlias = "np.ma.MaskedArray[tuple[int, ...], np.dtype[np.generic]]"
+"""An `Array` with missing values; a string, as loading `numpy.ma` takes 20 ms."""
 Ints = NDArray[np.int64]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -225,8 +224,7 @@ def diff_command(
         require_page(html, force)
     left, right = find_recorded(a, recordings), find_recorded(b, recordings)
     with open_recording(left.recording) as recording_a, open_recording(right.recording) as recording_b:
-        notice = compilation_notice() if left.can_train_again else contextlib.nullcontext()
-        with notice, stage_line("comparing") as stage:
+        with compilation_notice(), stage_line("comparing") as stage:
             difference = differences.diff(recording_a, recording_b, dict(targets), first)
             difference = difference if first else differences.with_seconds(difference, left, right)
             difference = differences.without_ignored(difference, ignore, everything)

@@ -17,7 +17,6 @@ from runner.errors import RunnerError
 from runner.execution.branching import train_branch
 from runner.execution.resume import resume
 from runner.execution.session import Progress, evaluation_brief, run_job
-from runner.learning.numba_cache import MESSAGE, announced
 from runner.recording.reader import open_recording
 from runner.runs.listing import run_at
 from runner.runs.resolve import run_of_id
@@ -35,6 +34,7 @@ from runner.service.jobs.sweeps import run_sweep_job
 from runner.service.processes import lower_priority
 from runner.service.settings import without_folders
 from runner.sweep.cluster import RayActor, connect, start_actor
+from runner.util.compilation import MESSAGE, announced
 
 MAX_TEXT: Final = 4000
 """The length of a log line."""

@@ -10,8 +10,8 @@ import pytest
 
 from runner.environments.loading import load_mdp
 from runner.learning.model import build_model
-from runner.learning.numba_cache import announced
 from runner.recording.reader import open_recording
+from runner.util.compilation import announced
 
 pty = pytest.importorskip("pty", reason="a POSIX terminal", exc_type=ImportError)
 

@@ -27,8 +27,7 @@ def test_the_kernel_is_cached_by_it():
 def test_scipy_is_left_to_functions_that_need_it():
     program = (
         "import sys, numba, numpy as np\n"
-        "from runner.learning.numba_cache import load_without_scipy\n"
-        "load_without_scipy()\n"
+        "from runner.learning import kernel\n"
         "print('scipy.linalg' in sys.modules)\n"
         "print(numba.njit(lambda a: np.linalg.det(a @ a))(np.eye(2)))\n"
     )
