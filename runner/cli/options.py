@@ -30,7 +30,7 @@ from runner.runs.run import recordings_folder
 
 if TYPE_CHECKING:
     from runner.export.episodes import EpisodePlace
-    from runner.export.plots.metrics import CurveStyle
+    from runner.export.plots.style import CurveStyle
     from runner.export.rerun.selection import Request
     from runner.recording.reader import Recording
 
@@ -126,7 +126,7 @@ def curve_options(
     log_y: bool = option("--log-y", is_flag=True, help="Logarithmic vertical axes."),
 ) -> CurveStyle:
     """Return how curves are drawn."""
-    from runner.export.plots.metrics import CurveStyle
+    from runner.export.plots.style import CurveStyle
 
     return CurveStyle(lines, smooth, log_x, log_y)
 

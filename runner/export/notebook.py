@@ -101,7 +101,7 @@ def report(
     """
     from runner.analysis.axes import axis_of
     from runner.archive.places import at_hand
-    from runner.export.plots.metrics import CurveStyle
+    from runner.export.plots.style import CurveStyle
     from runner.export.reports.report import render_report
 
     paths, style = [at_hand(run).recording for run in runs], CurveStyle(lines, smooth, log_x, log_y)
@@ -139,11 +139,12 @@ def plot(
     """
     from runner.analysis.axes import axis_of
     from runner.analysis.groups import groups_of
+    from runner.analysis.panels import panels_of
     from runner.analysis.series import series_of
     from runner.archive.places import at_hand
     from runner.export.plots.curves import curves_sheet
     from runner.export.plots.image import write_image
-    from runner.export.plots.metrics import CurveStyle, panels_of
+    from runner.export.plots.style import CurveStyle
 
     style, over = CurveStyle(lines, smooth, log_x, log_y), axis_of(axis)
     series = series_of((at_hand(run).recording for run in runs), over)

@@ -28,11 +28,12 @@ from runner.analysis.evaluations import evaluation_records, training_records
 from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.analysis.groups import grouped, groups_of, metrics_of, require_two
 from runner.analysis.histograms import histograms
+from runner.analysis.panels import Curve, NoMetrics, Panel, panels_of, smoothed
 from runner.analysis.qtable import describe_tables, one_array, replay_at
 from runner.analysis.series import parse_target, read_series, series_of
 from runner.export.plots.curves import curves_sheet
 from runner.export.plots.image import check_suffix, save
-from runner.export.plots.metrics import Curve, CurveStyle, NoMetrics, Panel, panels_of, smoothed
+from runner.export.plots.style import CurveStyle
 from runner.export.rerun.cache import cached_export
 from runner.export.rerun.selection import Request
 from runner.export.rerun.viewer import require_rerun

@@ -29,7 +29,7 @@ from runner.util.humanize import counted, size
 if TYPE_CHECKING:
     from runner.analysis.axes import Axis
     from runner.analysis.series import RunSeries
-    from runner.export.plots.metrics import CurveStyle
+    from runner.export.plots.style import CurveStyle
 
 
 @click.command("plot", cls=Command)
@@ -60,11 +60,12 @@ def plot_command(
       dualtaxi plot hyperparameters -o hyperparameters.png
     """
     from runner.analysis.groups import duplicates, groups_of
+    from runner.analysis.panels import panels_of
     from runner.analysis.series import read_series, values_left_out
     from runner.export.contents import shortcomings
     from runner.export.plots.curves import curves_sheet
     from runner.export.plots.image import check_suffix, save
-    from runner.export.plots.metrics import CurveStyle, panels_of
+    from runner.export.plots.style import CurveStyle
     from runner.recording.reader import open_recording
 
     output, folder = to.path(), recordings_folder(to.recordings)

@@ -17,22 +17,12 @@ from numpy.typing import NDArray
 
 from runner.analysis.axes import EPISODES
 from runner.analysis.groups import Group
+from runner.analysis.panels import Curve, NoMetrics, Panel, panels_of, smoothed
 from runner.analysis.series import values_left_out
 from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.export.plots.chart import SMALL, Canvas, Chart, Scale, labelled, series_colour, series_marker
-from runner.export.plots.metrics import (
-    PLAIN,
-    Curve,
-    CurveStyle,
-    NoMetrics,
-    Panel,
-    not_drawn,
-    panels_of,
-    smoothed,
-    style_of,
-    visible,
-)
+from runner.export.plots.style import PLAIN, CurveStyle, not_drawn, style_of, visible
 from runner.recording.metrics import SHARES
 
 WIDTH: Final = 288.0

@@ -25,7 +25,7 @@ from runner.export.contents import flat_text, shortcomings, why_no_steps
 from runner.export.encoded import Thumbnails, picture_note, thumbnails
 from runner.export.episodes import first_state, last_whole_evaluation, place_of, ranked, ranked_trials
 from runner.export.plots.curves import Plot, plots_of
-from runner.export.plots.metrics import PLAIN, CurveStyle
+from runner.export.plots.style import PLAIN, CurveStyle
 from runner.export.reports.maps import MapRow, maps_of, stages_of
 from runner.export.reports.playback import MAX_VALUES, playback_of, titled
 from runner.export.reports.rendering import LegendEntry, View, embedded, render, templates

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from runner.analysis.axes import AXES, EPISODES
 from runner.analysis.frames import Phase, episode_columns, step_columns
-from runner.export.plots.metrics import CurveStyle
+from runner.export.plots.style import CurveStyle
 from runner.recording.reader import Recording
 from runner.service import computed
 from runner.service.computed import too_many

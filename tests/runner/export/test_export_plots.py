@@ -12,13 +12,13 @@ from click.testing import CliRunner
 
 from runner.analysis.evaluations import evaluation_records
 from runner.analysis.groups import groups_of
+from runner.analysis.panels import panels_of
 from runner.analysis.series import RunSeries, read_series
 from runner.cli import cli
 from runner.errors import RunnerError
 from runner.export.plots import image
 from runner.export.plots.chart import Text
 from runner.export.plots.curves import curves_sheet, panel_chart
-from runner.export.plots.metrics import panels_of
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 from tests.runner.recording.making import TAXIS, make_run, with_id

@@ -10,10 +10,11 @@ import pytest
 
 from runner.analysis.axes import EPISODES
 from runner.analysis.compare.statistics import Estimate
+from runner.analysis.panels import Curve, Panel, smoothed
 from runner.export.plots.chart import Scale
 from runner.export.plots.curves import panel_chart
-from runner.export.plots.metrics import Curve, CurveStyle, Panel, not_drawn, smoothed
 from runner.export.plots.mixtures import bars_chart
+from runner.export.plots.style import CurveStyle, not_drawn
 from runner.recording.metrics import SHARES
 
 

@@ -1,13 +1,12 @@
 """Every metric of runs over an axis: runs of one configuration together, as IQM and band.
 
-A `Panel` is a metric; it has a `Curve` for each group of runs (and agent), which `curves` draws.
+A `Panel` is a metric; it has a `Curve` for each group of runs (and agent).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,35 +17,10 @@ from runner.analysis.groups import Group
 from runner.analysis.series import LOGGED, points_of, title_of
 from runner.errors import RunnerError
 from runner.recording.metrics import METRIC_OF, SHARES
-from runner.util.humanize import listed
 
 
 class NoMetrics(RunnerError):
     """No run has any metric."""
-
-
-@dataclass(frozen=True)
-class CurveStyle:
-    """How curves are drawn."""
-
-    lines: bool = False
-    """Whether each run of a curve is drawn as a thin line too."""
-    smooth: float = 0.0
-    """Memory of the exponential mean that is drawn, in percent of the axis; 0 for the values themselves."""
-    log_x: bool = False
-    """Whether the horizontal axis is logarithmic; points at 0 are left out."""
-    log_y: bool = False
-    """Whether the vertical axes are logarithmic; points at 0 or below are left out."""
-
-    def __post_init__(self) -> None:
-        """Raise RunnerError if `smooth` is no percentage."""
-        if not 0 <= self.smooth <= 100:
-            raise RunnerError(
-                f"smooth: found {self.smooth}, expected a percentage of the axis from 0 to 100."
-            )
-
-
-PLAIN: Final = CurveStyle()
 
 
 @dataclass(frozen=True)
@@ -114,46 +88,6 @@ def smoothed(places: NDArray[np.float64], values: NDArray[np.float64], memory: f
     for weight, value in zip(weights.tolist(), values[1:].tolist(), strict=True):
         means.append(means[-1] + weight * (value - means[-1]))
     return np.array(means)
-
-
-def style_of(panel: Panel, style: CurveStyle) -> CurveStyle:
-    """Return the style in which a panel can be drawn.
-
-    An axis without positive values stays linear, and so do shares, which are drawn on top of each other.
-    """
-    log_x = style.log_x and panel.last > 0
-    positive = any(
-        ((curve.middle > 0) & (curve.places > 0 if log_x else True)).any() for curve in panel.curves
-    )
-    return replace(style, log_x=log_x, log_y=style.log_y and positive and panel.metric != SHARES)
-
-
-def visible(places: NDArray[np.float64], values: NDArray[np.float64], style: CurveStyle) -> NDArray[np.bool_]:
-    """Return which points have a place on the axes of a style, bool [n]."""
-    known = ~np.isnan(values)
-    if style.log_x:
-        known &= places > 0
-    if style.log_y:
-        known &= values > 0
-    return known
-
-
-def not_drawn(panels: Sequence[Panel], style: CurveStyle) -> str:
-    """Return a sentence on what logarithmic axes leave out, and which axes stay linear; empty if nothing."""
-    left_out, linear = [], []
-    for panel in panels:
-        own = style_of(panel, style)
-        count = sum(int((~visible(curve.places, curve.middle, own)).sum()) for curve in panel.curves)
-        if count:
-            left_out.append(f"“{panel.title}” ({count:,})")
-        if style.log_y and not own.log_y and panel.metric != SHARES:
-            linear.append(f"“{panel.title}”")
-    parts = []
-    if left_out:
-        parts.append(f"points at 0 or below are left out of {listed(left_out)}")
-    if linear:
-        parts.append(f"no value is positive in {listed(linear)}, so the axis is linear")
-    return f" On logarithmic axes {'; '.join(parts)}." if parts else ""
 
 
 def panels_of(groups: Sequence[Group]) -> list[Panel]:
