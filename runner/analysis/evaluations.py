@@ -210,10 +210,10 @@ def _loop_record(recording: Recording, evaluation: Evaluation, trials: NDArray[n
     defined = defined_metrics(bool(environment["success_events"]), environment["penalty_below"] is not None)
     own = {metric.name: metric.of_trials(trials) for metric in defined}
     unknown = np.empty(0)
-    means = {
-        metric.name: dict(zip(agents, map(finite_mean, own[metric.name].T), strict=True))
+    values = {
+        metric.name: dict(zip(agents, map(metric.of_usable, own[metric.name].T), strict=True))
         if metric.per_agent
-        else {"": finite_mean(own.get(metric.name, unknown))}
+        else {"": metric.of_usable(own.get(metric.name, unknown))}
         for metric in METRICS
     }
     counts = trials["events"].sum(axis=0, dtype=int).tolist()
@@ -223,7 +223,7 @@ def _loop_record(recording: Recording, evaluation: Evaluation, trials: NDArray[n
         step=evaluation.train_step,
         trials=len(trials),
         successes=int(trials["success"].sum()) if environment["success_events"] else None,
-        values=means,
+        values=values,
         terminations=int(trials["terminated"].sum()),
         events=dict(zip(recording.event_names, counts, strict=True)),
         not_finite=sum(int((~is_usable(each)).sum()) for each in own.values()),

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from runner.analysis.evaluations import RECENT_EPISODES
 from runner.environments.mdp import Mdp
 from runner.recording import schema
-from runner.recording.metrics import METRICS, defined_metrics, finite_mean, is_usable
+from runner.recording.metrics import METRICS, defined_metrics, finite_mean
 from runner.recording.schema import Topic
 
 MAX_NAMES: Final = 64
 """The most names whose last logged value is in a summary."""
+MAX_TRIALS: Final = 1 << 17
+"""Of an evaluation with more trials, the last of them are in a summary."""
 
 
 class Outcomes:
@@ -34,8 +36,8 @@ class Outcomes:
         self._evaluated_after = -1
         self._trials = 0
         """Number of trials of the last evaluation."""
-        self._sums: dict[str, tuple[float, int]] = {}
-        """Sum over those trials and number of usable values, by metric."""
+        self._values: dict[str, NDArray[np.float64]] = {}
+        """Values of those trials, summed over agents, by metric."""
         self._logged: dict[str, float | None] = {}
 
     def take_records(self, topic: Topic, records: NDArray[np.void]) -> None:
@@ -47,14 +49,13 @@ class Outcomes:
             self._recent = np.concatenate([self._recent, results])[-RECENT_EPISODES:]
         elif topic.name == schema.EVAL_EPISODE.name:
             if self._evaluated_after != self._trained:
-                self._evaluated_after, self._trials, self._sums = self._trained, 0, {}
+                self._evaluated_after, self._trials, self._values = self._trained, 0, {}
             self._trials += len(records)
             for metric in self._defined:
                 values = metric.of_trials(records).astype(np.float64)
                 values = values.sum(axis=1) if metric.per_agent else values
-                values = values[is_usable(values)]
-                total, count = self._sums.get(metric.name, (0.0, 0))
-                self._sums[metric.name] = total + float(values.sum()), count + len(values)
+                before = self._values.get(metric.name, np.empty(0))
+                self._values[metric.name] = np.concatenate([before, values])[-MAX_TRIALS:]
 
     def take_logged(self, name: str, value: float) -> None:
         """Add a logged value."""
@@ -77,6 +78,8 @@ class Outcomes:
     def _evaluation(self) -> dict[str, object] | None:
         if not self._trials:
             return None
-        means = {name: total / count for name, (total, count) in self._sums.items() if count}
-        values = {metric.name: means.get(metric.name) for metric in METRICS}
+        unknown = np.empty(0)
+        values = {
+            metric.name: metric.of_usable(self._values.get(metric.name, unknown)) for metric in METRICS
+        }
         return {"episode": self._evaluated_after, "trials": self._trials, **values}

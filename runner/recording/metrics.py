@@ -23,6 +23,10 @@ LARGEST: Final = 1e300
 """Values beyond it are left out of means: their sums, and the margins of an axis, would overflow."""
 
 
+def _mean(values: NDArray[Any]) -> Any:
+    return values.mean(axis=0)
+
+
 @dataclass(frozen=True)
 class Metric:
     """A value that is read at several moments of a run."""
@@ -40,7 +44,7 @@ class Metric:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationMetric(Metric):
-    """The mean of a value over the trials of an evaluation."""
+    """A value of the trials of an evaluation, combined to one: their mean unless it names another way."""
 
     number: int
     """Number of its field in `EvalMetrics`."""
@@ -54,11 +58,18 @@ class EvaluationMetric(Metric):
     highest: float = math.inf
     of_trials: Callable[[Records], NDArray[Any]]
     """Returns the value of each trial, [trials] or [trials, agents], from its `Episode` records."""
+    combine: Callable[[NDArray[Any]], Any] = _mean
+    """Returns one value for those of all trials: a number, or [agents]."""
 
     @property
     def key(self) -> str:
         """Its name in a record of an evaluation: `mean_returns` maps agents to their own values."""
         return f"{self.name}s" if self.per_agent else self.name
+
+    def of_usable(self, values: NDArray[Any]) -> float | None:
+        """Return the metric of the values of trials, [trials], that are usable; None without any."""
+        usable = values[is_usable(values)]
+        return float(self.combine(usable)) if usable.size else None
 
 
 METRICS: Final = (
