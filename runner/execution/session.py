@@ -330,8 +330,7 @@ def evaluation_metrics(learner: Learner, evaluation: int, trials: Records) -> Me
         "successes": successes if known else -1,
         **{each.field: math.nan for each in METRICS},
         **{
-            each.field: each.combine(each.of_trials(trials)).tolist()
-            for each in defined_metrics(known, True)
+            each.field: each.combine(each.of_trials(trials)).tolist() for each in defined_metrics(known, True)
         },
         "terminations": int(trials["terminated"].sum()),
         "events": trials["events"].sum(axis=0, dtype=np.int64).tolist(),

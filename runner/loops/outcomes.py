@@ -79,7 +79,5 @@ class Outcomes:
         if not self._trials:
             return None
         unknown = np.empty(0)
-        values = {
-            metric.name: metric.of_usable(self._values.get(metric.name, unknown)) for metric in METRICS
-        }
+        values = {metric.name: metric.of_usable(self._values.get(metric.name, unknown)) for metric in METRICS}
         return {"episode": self._evaluated_after, "trials": self._trials, **values}
