@@ -3,6 +3,7 @@
 120:5            step 5 of training episode 120; `120` is its first step
 eval:3000:17:5   step 5 of trial 17 of the evaluation after 3,000 training episodes;
 `eval:3000` is the first step of its first trial
+step:100000      a training step by its number, counted over the run; of runs that were trained here
 """
 
 from __future__ import annotations
@@ -20,9 +21,10 @@ if TYPE_CHECKING:
     from runner.recording.reader import Recording
 
 EXPECTED: Final = "EPISODE:T such as 120:5, or eval:N:TRIAL:T; a TRIAL or T that is left out is 0"
-EXPECTED_OF_TRAINING: Final = "EPISODE:T such as 120:5, or the number of a training step"
-_EXPECTED_ANY: Final = EXPECTED.replace(" or ", " the number of a training step, or ", 1)
+EXPECTED_OF_TRAINING: Final = "EPISODE:T such as 120:5, or step:N, a training step by its number"
+_EXPECTED_ANY: Final = EXPECTED.replace(" or ", " step:N, or ", 1)
 _NUMBER: Final = "([0-9]{1,15})"
+_BY_NUMBER: Final = re.compile(f"step:{_NUMBER}")
 _TRAINING: Final = re.compile(f"{_NUMBER}(?::{_NUMBER})?")
 _EVALUATION: Final = re.compile(f"eval:{_NUMBER}(?::{_NUMBER})?(?::{_NUMBER})?")
 
@@ -88,12 +90,12 @@ class StepRef:
 
 
 def parse_step(text: str, expected: str = _EXPECTED_ANY) -> int | StepRef:
-    """Return the step that a text refers to; a number alone is a training step, counted over the run.
+    """Return the step that a text refers to, or the number of the training step that `step:N` gives.
 
     `expected` is what the error says that was expected.
     """
-    is_number = text.isascii() and text.isdecimal() and len(text) < 16
-    return int(text) if is_number else StepRef.parse(text, expected)
+    match = _BY_NUMBER.fullmatch(text)
+    return int(match[1]) if match else StepRef.parse(text, expected)
 
 
 def training_steps(recording: Recording) -> int:
@@ -117,7 +119,7 @@ def training_step(recording: Recording, at: int | StepRef) -> int:
             )
         return at
     if at.after is not None:
-        raise RunnerError(f"found {at}, expected a step of training: EPISODE:T, or its number alone.")
+        raise RunnerError(f"found {at}, expected a step of training: {EXPECTED_OF_TRAINING}.")
     ended = recording.count(schema.TRAIN_EPISODE)
     start = step_of_episode(recording, min(at.episode, ended))
     stop = taken if at.episode >= ended else step_of_episode(recording, at.episode + 1)

@@ -38,7 +38,7 @@ def branch(
 
     Args:
         run: the parent.
-        at: the step: `EPISODE:T`; of a job also its number; of a loop also `eval:N:TRIAL:T`.
+        at: the step: `EPISODE:T`; of a job also its number or `step:N`; of a loop also `eval:N:TRIAL:T`.
         action: the action there; None for the recorded one.
         overrides: `KEY=VALUE` each: the settings from this step on.
         episodes: the training episodes in all; the parent's by default.
@@ -62,8 +62,8 @@ def branch(
         place = parse_step(at) if isinstance(at, str) else at
         if isinstance(place, int):
             raise ConfigError(
-                f"at: found the number {place}, expected EPISODE:T, such as {place}:0 for the first step of "
-                f"episode {place}: the steps of a loop are counted in its episodes."
+                f"at: found the number {place:,} of a step, expected EPISODE:T: the steps of a loop are "
+                "counted in its episodes."
             )
         if overrides or episodes is not None:
             raise ConfigError(

@@ -131,7 +131,8 @@ def when(
         run: a run that was trained here, with its steps.
         expression: such as `q[300, "north + east"] > 5 and visits[300] >= 100`.
         every: search all intervals.
-        first: the first training step to evaluate it after: its number, or EPISODE:T; by default step 0.
+        first: the first training step to evaluate it after: its number, `EPISODE:T` or `step:N`; 0 by
+            default.
         last: the last one; by default that of the run.
         report: called with the number of steps searched so far.
 

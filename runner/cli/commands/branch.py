@@ -35,7 +35,7 @@ def branch_command(
         "--at",
         type=PLACE,
         metavar="STEP",
-        help="The step: EPISODE:T, or a training step's number; eval:N:TRIAL:T of an evaluation.",
+        help="The step: EPISODE:T, or step:N by its number in training; eval:N:TRIAL:T of an evaluation.",
     ),
     actions: tuple[str, ...] = option(
         "--action",
@@ -89,7 +89,7 @@ def branch_command(
 
     Examples:
       dualtaxi branch cooperative --at 120:5 --action taxi_1=north
-      dualtaxi branch cooperative --at 400000 --set epsilon=0.3 --name curious
+      dualtaxi branch cooperative --at step:400000 --set epsilon=0.3 --name curious
       dualtaxi branch cooperative --at eval:3000:7:5 --action all
       dualtaxi branch cartpole --at 12:40 --action 1
       dualtaxi branch taxi --at eval:3000:7:5 --action north --policy random --seed 3

@@ -23,7 +23,7 @@ def when_command(
         help="Include everything, not only a selection: every interval in which it holds, with its end.",
     ),
     first: str | None = option(
-        "--from", metavar="STEP", help="The first training step: its number, or EPISODE:T."
+        "--from", metavar="STEP", help="The first training step: EPISODE:T, or step:N by its number."
     ),
     last: str | None = option("--to", metavar="STEP", help="The last training step, as for --from."),
     recordings: Path | None = recordings_option,
@@ -49,7 +49,7 @@ def when_command(
       dualtaxi when @latest 'greedy[300] == "pickup + east"'
       dualtaxi when k3v9m2xq 'q[300, "north + east"] > q[300, "west + east"]' --all
       dualtaxi when k3v9m2xq 'greedy_success[300] and visits[300] < 100' --from 2000:0
-      dualtaxi when rivals 'max(q.taxi_1[300]) > max(q.taxi_2[300]) > 0' --to 50000
+      dualtaxi when rivals 'max(q.taxi_1[300]) > max(q.taxi_2[300]) > 0' --to step:50000
     """
     from runner.debugging.when import section_of, when
 

@@ -31,9 +31,7 @@ At = Annotated[str, Path(max_length=60, description=EXPECTED, examples=["eval:30
 Expression = Annotated[
     str, Query(max_length=MAX_CHARACTERS, description="A condition.", examples=["max(q[300]) > 20"])
 ]
-StepText = Annotated[
-    str | None, Query(max_length=40, description="A training step: its number, or EPISODE:T.")
-]
+StepText = Annotated[str | None, Query(max_length=40, description="A training step: EPISODE:T, or step:N.")]
 StateName = Annotated[
     str | None, Query(max_length=1000, description="A state, by number or name; default: that of `at`.")
 ]

@@ -139,7 +139,7 @@ def is_path(name: str) -> bool:
 class BranchQuestion(BaseModel, extra="forbid", frozen=True):
     """A change of a training step; the fields are the arguments of `runner.branch`."""
 
-    at: str | int = Field(description="The first step that may differ: `EPISODE:T`, or its number.")
+    at: str | int = Field(description="The first step that may differ: `EPISODE:T`, `step:N` or its number.")
     action: str | int | dict[str, str | int] | None = Field(
         default=None, description="A joint action, or one by agent; names or numbers. Null: as recorded."
     )

@@ -23,11 +23,17 @@ def test_what_is_left_out_is_0(text, step):
     assert StepRef.parse(str(step)) == step
 
 
+def test_a_training_step_by_its_number_is_named_as_such():
+    assert parse_step("step:120") == 120
+    assert parse_step("120") == StepRef(120)
+
+
 @pytest.mark.parametrize(
-    "text", ["", "x", "1:", ":5", "1:2:3", "eval:", "eval:1:2:3:4", "-1", "1_0", "٣", " 1"]
+    "text",
+    ["", "x", "step:", "step:1:2", "1:", ":5", "1:2:3", "eval:", "eval:1:2:3:4", "-1", "1_0", "٣", " 1"],
 )
 def test_anything_else_is_refused_with_what_is_expected(text):
     with pytest.raises(RunnerError, match="expected EPISODE:T such as 120:5, or eval:N:TRIAL:T"):
         StepRef.parse(text)
-    with pytest.raises(RunnerError, match=r"EPISODE:T .*, the number of a training step, or eval:N:TRIAL:T"):
+    with pytest.raises(RunnerError, match=r"EPISODE:T .*, step:N, or eval:N:TRIAL:T"):
         parse_step(text)

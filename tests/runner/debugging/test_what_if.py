@@ -311,7 +311,9 @@ def test_an_action_of_one_agent_stands_for_the_joint_actions_that_have_it(taxis)
 
 def test_a_training_step_after_the_last_is_refused_by_its_number(taxis):
     steps = taxis.summary.train_steps
-    result = CliRunner().invoke(cli, ["branch", str(taxis.folder), "--at", str(steps), "--action", "all"])
+    result = CliRunner().invoke(
+        cli, ["branch", str(taxis.folder), "--at", f"step:{steps}", "--action", "all"]
+    )
     assert result.exit_code == 2
     assert f"found no training step {steps:,}; there are {steps:,}, from 0 to {steps - 1:,}" in result.output
 

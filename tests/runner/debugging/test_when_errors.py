@@ -182,13 +182,13 @@ def test_a_condition_counts_as_0_or_1_and_a_division_by_zero_is_no_error(coopera
     [
         (10**9, None, "found no training step 1,000,000,000; there are"),
         ("9" * 5000, None, "EPISODE:T"),
-        ("20000", None, "found no training step 20,000; there are"),
+        ("step:20000", None, "found no training step 20,000; there are"),
         ("500:0", None, "found no training episode 500"),
         ("0:5000", None, "found no step 5,000 of training episode 0"),
         ("eval:3000:1", None, "expected a step of training"),
         ("-1", None, "EPISODE:T"),
         ("1" * 5000, None, "EPISODE:T"),
-        ("3:x", None, "EPISODE:T such as 120:5, or the number of a training step."),
+        ("3:x", None, "EPISODE:T such as 120:5, or step:N, a training step by its number."),
         (20, 10, "expected them in order"),
     ],
 )
@@ -199,7 +199,7 @@ def test_a_step_that_is_none_is_refused(cooperative, first, last, message):
 
 
 def test_a_step_may_be_a_number_or_a_place_in_an_episode(cooperative):
-    found = runner.when(cooperative, "step >= 0", first="2:3", last="500")
+    found = runner.when(cooperative, "step >= 0", first="2:3", last="step:500")
     assert (found.first.episode, found.first.t) == (2, 3)
     assert found.held_before is True
     assert found.searched[1] == found.first.step  # without `every` it ends there

@@ -368,7 +368,7 @@ def test_what_cannot_be_branched_leaves_no_run(parent, tmp_path, error, message,
 
 
 def test_the_command_says_that_nothing_is_changed(parent, tmp_path):
-    words = ["branch", str(parent.folder), "--at", str(middle_of(parent)), "--recordings", str(tmp_path)]
+    words = ["branch", str(parent.folder), "--at", f"step:{middle_of(parent)}", "--recordings", str(tmp_path)]
     same, other = (CliRunner().invoke(cli, [*words, *more]) for more in ((), ("--set", "epsilon=0.9")))
     assert (same.exit_code, other.exit_code) == (0, 0), same.output + other.output
     assert f"nothing is changed, so the branch repeats run {parent.run_id}" in same.stderr

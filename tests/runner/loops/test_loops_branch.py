@@ -288,7 +288,7 @@ def test_what_cannot_be_branched_leaves_no_run(runs, tmp_path):
         runner.branch(job, at="0:1", policy="random", recordings=tmp_path)
     for message, options in (
         ("are for runs that were trained here", {"at": "0:1", "overrides": ["epsilon=0.1"]}),
-        ("expected EPISODE:T, such as 7:0", {"at": "7"}),
+        ("expected EPISODE:T: the steps of a loop", {"at": "step:7"}),
     ):
         with pytest.raises(ConfigError, match=message):
             runner.branch(run, recordings=tmp_path, **options)
