@@ -10,7 +10,7 @@ import contextlib
 import itertools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,12 +41,12 @@ _BATCH: Final = 4096
 class Histogram:
     """The counts of a quantity over an axis."""
 
-    quantity: str
-    """`return`, `length`, `action` or `reward`."""
+    quantity: Literal["return", "length", "action", "reward"]
     line: str
     """An agent, or a part of an action; empty if there is one."""
     unit: str
-    axis: Axis
+    axis: str
+    """The name of the axis."""
     edges: list[float]
     """Positions between the stretches, one more than there are of them."""
     values: list[float]
@@ -54,7 +54,7 @@ class Histogram:
     names: list[str]
     """The names of the distinct values; empty where there are ranges."""
     counts: list[list[int]]
-    """[stretches][values or ranges]."""
+    """[stretches][values or ranges]: a list for each stretch."""
     left_out: int
     """Number of values that are infinite, NaN or too large."""
 
@@ -63,7 +63,7 @@ class Histogram:
 class _Column:
     """A quantity whose values are being counted."""
 
-    quantity: str
+    quantity: Literal["return", "length", "action", "reward"]
     line: str
     unit: str
     name_of: Callable[[float], str]
@@ -112,7 +112,7 @@ class _Column:
             quantity=self.quantity,
             line=self.line,
             unit=self.unit,
-            axis=axis,
+            axis=axis.name,
             edges=edges.tolist(),
             values=self.levels.tolist(),
             names=[self.name_of(value) for value in self.levels.tolist()] if self.is_distinct else [],

@@ -10,6 +10,7 @@ import math
 import os
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
 from typing import Final, Literal, Protocol
@@ -56,6 +57,62 @@ class Answer(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class ShownCurve:
+    """A metric of a group of runs over an axis; what is not finite is null."""
+
+    metric: str
+    line: str
+    """An agent or a reward; empty if the metric has one line only."""
+    group: int
+    """Number of its group."""
+    title: str
+    unit: str
+    positions: list[float]
+    values: list[float | None]
+    """Of several runs, their interquartile mean; below four runs, their mean."""
+    smoothed: list[float | None] | None
+    """The exponential mean of the values, if it was requested."""
+    low: list[float | None] | None
+    """Of several runs, the lower end of the 95 % interval; below four runs, the lowest."""
+    high: list[float | None] | None
+    runs: list[list[float | None]]
+    """The values of each run of the group, if they were requested."""
+    of: int
+    """The number of points between `start` and `stop`."""
+    thinned: bool
+    """Whether only the lowest and the highest point of each section are included."""
+
+
+@dataclass(frozen=True)
+class AxisInfo:
+    """An axis that all of the runs have."""
+
+    name: str
+    title: str
+    label: str
+
+
+@dataclass(frozen=True)
+class CurveGroup:
+    """Runs that differ in nothing but the seed."""
+
+    label: str
+    runs: list[str]
+    left_out: Sequence[str]
+    """Runs that repeat one of these."""
+
+
+@dataclass(frozen=True)
+class Curves:
+    """The metrics of runs."""
+
+    axis: str
+    axes: list[AxisInfo]
+    groups: list[CurveGroup]
+    curves: list[ShownCurve]
+
+
 def curves(
     paths: Path | Sequence[Path],
     axis: str = EPISODES.name,
@@ -79,7 +136,7 @@ def curves(
             own = axes_of(recording)
             common = [each for each in common if each in own]
     groups = groups_of(series)
-    shown: list[Json] = []
+    shown: list[ShownCurve] = []
     with contextlib.suppress(NoMetrics):
         for panel in panels_of(groups):
             if not metrics or panel.metric in metrics:
@@ -88,52 +145,44 @@ def curves(
                 shown += [
                     _shown_curve(panel, curve, start, stop, points, lines, memory) for curve in panel.curves
                 ]
-    return as_json(
-        {
-            "axis": axis,
-            "axes": [{"name": each.name, "title": each.title, "label": each.label} for each in common],
-            "groups": [
-                {
-                    "label": group.label,
-                    "runs": [run.run_id for run in group.runs],
-                    "left_out": list(group.left_out),
-                }
-                for group in groups
-            ],
-            "curves": shown,
-        }
+    found = Curves(
+        axis,
+        [AxisInfo(each.name, each.title, each.label) for each in common],
+        [CurveGroup(group.label, [run.run_id for run in group.runs], group.left_out) for group in groups],
+        shown,
     )
+    return as_json(dataclasses.asdict(found))
 
 
 def run_histograms(path: Path, axis: str) -> bytes:
     """Return the histograms of a run's training over an axis, as JSON."""
     with open_recording(path) as recording:
         found, notes = histograms(recording, axis_of(axis))
-        shown = [dataclasses.asdict(each) | {"axis": each.axis.name} for each in found]
+        shown = list(map(dataclasses.asdict, found))
         return as_json({"run_id": recording.run_id, "histograms": shown, "notes": notes})
 
 
 def _shown_curve(
     panel: Panel, curve: Curve, start: float, stop: float | None, points: int, lines: bool, memory: float
-) -> dict[str, object]:
+) -> ShownCurve:
     inside = np.flatnonzero((curve.places >= start) & (curve.places < (math.inf if stop is None else stop)))
     chosen = inside[thinned(curve.middle[inside], points)]
     has_band = len(curve.runs) > 1
-    return {
-        "metric": panel.metric,
-        "line": curve.line,
-        "group": curve.group,
-        "title": panel.title,
-        "unit": panel.unit,
-        "positions": curve.places[chosen].tolist(),
-        "values": curve.middle[chosen].tolist(),
-        "smoothed": smoothed(curve.places, curve.middle, memory)[chosen].tolist() if memory else None,
-        "low": curve.low[chosen].tolist() if has_band else None,
-        "high": curve.high[chosen].tolist() if has_band else None,
-        "runs": curve.runs[:, chosen].tolist() if has_band and lines else [],
-        "of": len(inside),
-        "thinned": len(chosen) < len(inside),
-    }
+    return ShownCurve(
+        metric=panel.metric,
+        line=curve.line,
+        group=curve.group,
+        title=panel.title,
+        unit=panel.unit,
+        positions=curve.places[chosen].tolist(),
+        values=curve.middle[chosen].tolist(),
+        smoothed=smoothed(curve.places, curve.middle, memory)[chosen].tolist() if memory else None,
+        low=curve.low[chosen].tolist() if has_band else None,
+        high=curve.high[chosen].tolist() if has_band else None,
+        runs=curve.runs[:, chosen].tolist() if has_band and lines else [],
+        of=len(inside),
+        thinned=len(chosen) < len(inside),
+    )
 
 
 def records(path: Path, kind: RecordKind, start: int, stop: int, limit: int) -> bytes:

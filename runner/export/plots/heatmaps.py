@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 
+from runner.analysis.axes import AXES
 from runner.analysis.histograms import Histogram
 from runner.drawing import palette
 from runner.environments.naming import spoken
@@ -46,11 +47,11 @@ def heatmap_chart(histogram: Histogram) -> Chart:
     rows = counts.shape[1]
     names = [shortened(name, _MAX_LETTERS) for name in histogram.names]
     left = max(56.0, 16 + _LETTER * max(map(len, names), default=0))
-    x = Scale(0.0, histogram.edges[-1], left, WIDTH - 16)
+    axis, x = AXES[histogram.axis], Scale(0.0, histogram.edges[-1], left, WIDTH - 16)
     low, high = (0.0, float(rows)) if histogram.names else (histogram.values[0], histogram.values[-1])
     y = Scale(low, high, HEIGHT - 34, 34.0)
     title = title_of(histogram)
-    chart = Chart(x, y, WIDTH, HEIGHT, f"{title} over {histogram.axis.title}, {histogram.unit}")
+    chart = Chart(x, y, WIDTH, HEIGHT, f"{title} over {axis.title}, {histogram.unit}")
     edges = np.arange(rows + 1.0) if histogram.names else np.array(histogram.values)
     lines, columns = y(edges), x(np.array(histogram.edges))
     levels = np.ceil(shares / (shares.max() or 1.0) * (palette.LEVELS - 1)).astype(int)
@@ -61,7 +62,7 @@ def heatmap_chart(histogram: Histogram) -> Chart:
         )
         chart.cells(cells, palette.ramp_colour(level))
     chart.shape([(x.start, y.end), (x.start, y.start), (x.end, y.start)], stroke=palette.INK)
-    ticks = x.ticks if not histogram.axis.whole else [tick for tick in x.ticks if tick == int(tick)]
+    ticks = x.ticks if not axis.whole else [tick for tick in x.ticks if tick == int(tick)]
     for tick, text in labelled(ticks, short=histogram.edges[-1] >= 10_000):
         chart.shape([(x.at(tick), y.start), (x.at(tick), y.start + 3)], stroke=palette.INK)
         chart.text(x.at(tick), y.start + 11.5, text, "middle", size=8)
@@ -70,5 +71,5 @@ def heatmap_chart(histogram: Histogram) -> Chart:
         chart.text(x.start - 5, y.at(at) + 3, name, "end", size=8)
     chart.text(x.start, 14.0, title, size=9.5, bold=True)
     chart.text(x.start, 26.0, f"{histogram.unit}; lightest: {100 * shares.max():.0f} %", size=SMALL)
-    chart.text((x.start + x.end) / 2, HEIGHT - 5, histogram.axis.label, "middle")
+    chart.text((x.start + x.end) / 2, HEIGHT - 5, axis.label, "middle")
     return chart

@@ -15,8 +15,9 @@ from runner.debugging.explanation_files import explanations_in, read_explanation
 from runner.errors import RunNotFound
 from runner.runs.run import Run
 from runner.service import computed
-from runner.service.api.reading import AxisName, Curves, FirstPosition, LastPosition, Metrics, Points, Smooth
+from runner.service.api.reading import AxisName, FirstPosition, LastPosition, Metrics, Points, Smooth
 from runner.service.catalogue import Catalogue
+from runner.service.computed import Curves
 from runner.service.dependencies import CatalogueOf, ComputationOf, SettingsOf, recorded_run
 from runner.service.problems import error_docs
 from runner.service.settings import Settings

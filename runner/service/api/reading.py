@@ -10,10 +10,11 @@ from pydantic import BaseModel
 
 from runner.analysis.axes import AXES, EPISODES
 from runner.analysis.frames import Phase, episode_columns, step_columns
+from runner.analysis.histograms import Histogram
 from runner.export.plots.style import CurveStyle
 from runner.recording.reader import Recording
 from runner.service import computed
-from runner.service.computed import too_many
+from runner.service.computed import Curves, too_many
 from runner.service.dependencies import (
     ComputationOf,
     OpenRecording,
@@ -66,83 +67,11 @@ Smooth = Annotated[
 ]
 
 
-class Curve(BaseModel):
-    """A metric of a group of runs over an axis."""
-
-    metric: str
-    line: str
-    """An agent or a reward; empty if the metric has one line only."""
-    group: int
-    """Number of its group."""
-    title: str
-    unit: str
-    positions: list[float]
-    values: list[float | None]
-    """Of several runs, their interquartile mean; below four runs, their mean."""
-    smoothed: list[float] | None
-    """The exponential mean of the values, if it was requested."""
-    low: list[float | None] | None
-    """Of several runs, the lower end of the 95 % interval; below four runs, the lowest."""
-    high: list[float | None] | None
-    runs: list[list[float | None]]
-    """The values of each run of the group, if they were requested."""
-    of: int
-    """The number of points between `start` and `stop`."""
-    thinned: bool
-    """Whether only the lowest and the highest point of each section are included."""
-
-
-class AxisInfo(BaseModel):
-    """An axis that all of the runs have."""
-
-    name: str
-    title: str
-    label: str
-
-
-class CurveGroup(BaseModel):
-    """Runs that differ in nothing but the seed."""
-
-    label: str
-    runs: list[str]
-    left_out: list[str]
-    """Runs that repeat one of these."""
-
-
-class Curves(BaseModel):
-    """The metrics of runs."""
-
-    axis: str
-    axes: list[AxisInfo]
-    groups: list[CurveGroup]
-    curves: list[Curve]
-
-
-class HistogramModel(BaseModel):
-    """The counts of a quantity over an axis."""
-
-    quantity: Literal["return", "length", "action", "reward"]
-    line: str
-    """An agent, or a part of an action; empty if there is one."""
-    unit: str
-    axis: str
-    edges: list[float]
-    """Positions between the stretches, one more than there are of them."""
-    values: list[float]
-    """The distinct values, ascending, or else the edges of the ranges."""
-    names: list[str]
-    """The names of the distinct values; empty where there are ranges."""
-    counts: list[list[int]]
-    """A list for each stretch."""
-    left_out: int
-    """Number of values that are infinite, NaN or too large."""
-
-
 class Histograms(BaseModel):
     """The histograms of a run's training."""
 
     run_id: str
-    histograms: list[HistogramModel]
+    histograms: list[Histogram]
     notes: list[str]
     """What is left out, a sentence each."""
 
