@@ -303,7 +303,10 @@ def _game(env_runner: Any, env: object) -> MultiAgent:
     creator = kind
     if name is not None and _global_registry.contains(ENV_CREATOR, name):
         creator = _global_registry.get(ENV_CREATOR, name)
-    first = next(iter(inspect.signature(creator).parameters.values()), None) if callable(creator) else None
+    try:
+        first = next(iter(inspect.signature(creator).parameters.values()), None)
+    except (TypeError, ValueError):  # it is no function, or one without a signature, such as of compiled code
+        first = None
     if first is None or first.kind not in (first.POSITIONAL_OR_KEYWORD, first.KEYWORD_ONLY):
         return MultiAgent(env, name)
     return MultiAgent(env, name, creator, {first.name: dict(env_runner.config.env_config)})
