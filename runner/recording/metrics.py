@@ -52,6 +52,8 @@ class EvaluationMetric(Metric):
     """Name of its field in files and archives, if that is another one."""
     heading: str
     """Its short name, above a column."""
+    suffix: str = ""
+    """Its unit, after a number of it that stands alone."""
     requires: Literal["", "success_events", "penalty_below"] = ""
     """What the environment must define for the metric to be known."""
     lowest: float = -math.inf
@@ -82,6 +84,7 @@ METRICS: Final = (
         number=14,
         stored_as="finish_percent",
         heading="success %",
+        suffix=" %",
         requires="success_events",
         lowest=0,
         highest=100,
@@ -95,6 +98,7 @@ METRICS: Final = (
         field="eval_mean_length",
         number=15,
         heading="mean length",
+        suffix=" steps",
         lowest=0,
         of_trials=lambda trials: trials["length"],
     ),
@@ -106,6 +110,7 @@ METRICS: Final = (
         field="mean_penalties",
         number=16,
         heading="mean penalties",
+        suffix=" per trial",
         requires="penalty_below",
         lowest=0,
         of_trials=lambda trials: trials["penalties"],

@@ -124,7 +124,7 @@ def sentence(text: str) -> str:
     """Return a text with a capital at its start, unless that is a name, and a full stop at its end."""
     first, space, rest = text.partition(" ")
     start = first[:1].upper() + first[1:] if first.isalpha() else first
-    return f"{start}{space}{rest}{'' if text[-1:] in '.:' else '.'}"
+    return f"{start}{space}{rest}{'' if text[-1:] in '.:?' else '.'}"
 
 
 def embedded(data: object) -> str:

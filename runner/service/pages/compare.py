@@ -28,7 +28,7 @@ from runner.service.api.comparing import MAX_SCORES, found_runs
 from runner.service.api.reading import AxisName
 from runner.service.dependencies import CatalogueOf, ComputationOf
 from runner.service.fragments import ShownDifference
-from runner.service.pages.frame import RunHead, has_tables, head_of, last_evaluation
+from runner.service.pages.frame import RunHead, has_tables, head_of, last_evaluation, result_of
 from runner.service.pages.rendering import page
 from runner.service.pages.replay import Panel, panel_of
 from runner.util import humanize
@@ -323,10 +323,7 @@ def _results(runs: list[Run]) -> Rows:
     return [
         ("Status", [each.status for each in runs]),
         *(
-            (
-                f"{metric.heading.capitalize()} in the last evaluation",
-                [humanize.number(each.values.get(metric.name)) for each in last],
-            )
+            (result_of(metric, last[0])[0], [result_of(metric, each)[1] for each in last])
             for metric in metrics
         ),
         ("Training episodes", [humanize.number(each.summary.episodes, 0) for each in runs]),

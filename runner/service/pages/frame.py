@@ -9,9 +9,11 @@ from runner.analysis.evaluations import loop_summary
 from runner.errors import RecordingError
 from runner.export.reports.rendering import View
 from runner.recording import schema
+from runner.recording.metrics import EvaluationMetric
 from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics, Summary
 from runner.runs.run import Run
+from runner.util import humanize
 
 TABS: Final = (
     ("", "Overview"),
@@ -86,6 +88,13 @@ def loop_results(run: Run) -> Summary:
             return loop_summary(recording)
     except RecordingError:
         return Summary()
+
+
+def result_of(metric: EvaluationMetric, evaluation: EvaluationMetrics) -> tuple[str, str]:
+    """Return the name of a metric in the last evaluation, and its value with its unit."""
+    value = evaluation.values.get(metric.name)
+    heading = metric.heading.removesuffix(metric.suffix).capitalize()
+    return f"{heading} in the last evaluation", humanize.number(value) + metric.suffix * (value is not None)
 
 
 def last_evaluation(run: Run) -> EvaluationMetrics:

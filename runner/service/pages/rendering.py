@@ -18,7 +18,7 @@ from markupsafe import Markup
 
 from runner.errors import RunnerError
 from runner.export.reports.rendering import TEMPLATES as REPORT_TEMPLATES
-from runner.export.reports.rendering import View, code, environment_of, fill
+from runner.export.reports.rendering import View, code, environment_of, fill, sentence
 from runner.service import problems
 from runner.service.addresses import link
 from runner.service.pages import static
@@ -89,8 +89,8 @@ def _problem(message: str) -> Markup:
     """Return an error as HTML; lines with a caret have a fixed width, so that it points at its place."""
     text, _, marked = message.partition("\n")
     if not marked.rstrip().endswith("^"):
-        return Markup("<p>{}</p>").format(code(message))
-    return Markup("<p>{}</p><pre>{}</pre>").format(code(text), marked)
+        return Markup("<p>{}</p>").format(code(sentence(message)))
+    return Markup("<p>{}</p><pre>{}</pre>").format(code(sentence(text)), marked)
 
 
 def _age(moment: datetime | str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from http import HTTPStatus
@@ -42,7 +42,7 @@ from runner.service.dependencies import (
     SettingsOf,
 )
 from runner.service.jobs.queue import JobQueue
-from runner.service.pages.frame import RunView, has_tables, head_of, loop_results
+from runner.service.pages.frame import RunView, has_tables, head_of, loop_results, result_of
 from runner.service.pages.rendering import Form, message_of, page
 from runner.service.settings import Settings
 from runner.util import humanize
@@ -257,23 +257,16 @@ def _done_by(run: Run) -> Json:
 
 def _results(run: Run, last: EvaluationMetrics) -> dict[str, str]:
     """Return the last results of a run by name; of a loop, the known ones."""
-
-    def of_evaluation(metrics: EvaluationMetrics, names: Sequence[str]) -> dict[str, str]:
-        headings = {metric.name: metric.heading.capitalize() for metric in METRICS}
-        return {
-            f"{headings[name]} in the last evaluation": humanize.number(metrics.values.get(name))
-            for name in names
-        }
-
     if has_tables(run):
-        return of_evaluation(last, [metric.name for metric in METRICS if not metric.per_agent])
+        return dict(result_of(metric, last) for metric in METRICS if not metric.per_agent)
     results = loop_results(run)
     recent = results.recent_training or RecentTraining(episodes=0)
     episodes = f"the last {recent.episodes:,} training episodes"
+    evaluation = results.last_evaluation or EvaluationMetrics()
     measures = {
-        **of_evaluation(results.last_evaluation or EvaluationMetrics(), [metric.name for metric in METRICS]),
+        **dict(result_of(metric, evaluation) for metric in METRICS),
         f"Mean return of {episodes}": humanize.number(recent.mean_return),
-        f"Mean length of {episodes}": humanize.number(recent.mean_length),
+        f"Mean length of {episodes}": f"{humanize.number(recent.mean_length)} steps",
     }
     logged = {
         f"Logged last: {name}": humanize.measure(value)

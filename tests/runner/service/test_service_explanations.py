@@ -36,7 +36,7 @@ def test_an_explanation_is_listed_and_shown(client, recordings: Path):
 def test_a_missing_or_damaged_explanation_is_named(client, recordings: Path):
     page = {"accept": "text/html"}
     missing = client.get("/sweeps/explanations/none/success_percent", headers=page)
-    assert (missing.status_code, "no explanation" in missing.text) == (404, True)
+    assert (missing.status_code, "No explanation" in missing.text) == (404, True)
     folder = recordings / ".explain" / "pair"
     folder.mkdir(parents=True)
     (folder / "metric.json").write_text('{"name": "<script>"}')

@@ -73,7 +73,7 @@ def test_an_invalid_filter_is_explained(client, query):
 
 
 def test_missing_pages_are_pages(client):
-    assert "there is nothing at /nowhere" in page_of(client, "/nowhere", 404)
+    assert "There is nothing at /nowhere." in page_of(client, "/nowhere", 404)
     assert client.get("/nowhere").json()["error"]["message"]
 
 
@@ -142,14 +142,14 @@ def test_every_page_is_well_formed_and_has_nothing_inline(client):
 
 
 MISSING = [
-    ("/runs/nothing", 404, "no run"),
+    ("/runs/nothing", 404, "No run"),
     ("/runs/first/replay/train/60", 404, "there are 60, from 0"),
     ("/runs/first/replay/eval/7/0", 404, "the nearest after 10"),
     ("/runs/first/rerun?at=1:x", 400, "expected EPISODE:T"),
     ("/compare?run=first", 400, "expected 2 to 60"),
     ("/compare/replay?run=first&run=second&at=eval", 400, "expected EPISODE:T"),
-    ("/sweeps/nothing", 404, "no sweep"),
-    ("/queue/9", 404, "no job 9"),
+    ("/sweeps/nothing", 404, "No sweep"),
+    ("/queue/9", 404, "No job 9"),
 ]
 
 
