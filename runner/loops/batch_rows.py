@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.loops.description import Described
 from runner.loops.values import require_reset
-from runner.loops.vector_counts import Flags, ResetsBetween
-from runner.loops.vector_rows import VectorRows
+from runner.loops.vector_rows import ResetsBetween, VectorRows
+from runner.recording.episode_log import Flags
 from runner.recording.gym_values import fitted, put_fitted, put_unknown
 from runner.recording.recorder import Recorder
 

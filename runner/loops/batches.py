@@ -22,7 +22,7 @@ from runner.loops.options import Options, RunOptions, options_of
 from runner.loops.recorded import Recorded
 from runner.loops.values import as_array, check_phase
 from runner.loops.vector import autoreset_mode_of, described_vector, first_of, require_fixed
-from runner.loops.vector_counts import Flags
+from runner.recording.episode_log import Flags
 from runner.recording.gym_values import element_of
 from runner.util.arrays import Array
 

@@ -23,8 +23,8 @@ from runner.loops.makers import checked_make, vector_maker_of
 from runner.loops.options import RecordOptions, options_of
 from runner.loops.recorded import Recorded, require_pictures, without_none
 from runner.loops.values import check_phase, frozen_options
-from runner.loops.vector_counts import Flags
 from runner.loops.vector_rows import VectorRows
+from runner.recording.episode_log import Flags
 from runner.recording.spaces import Value
 from runner.replay.stepping_vector import final_observations, spaces_of_one
 

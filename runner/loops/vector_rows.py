@@ -8,7 +8,7 @@ episodes, the resets that environments do by themselves) is computed for a block
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,8 @@ from runner.loops.description import Described
 from runner.loops.generators import States
 from runner.loops.rows import MAX_SEED, Rows
 from runner.loops.values import require_reset, warn_user
-from runner.loops.vector_counts import EpisodeCounts, Flags, ResetsBetween, counts_of
 from runner.recording import schema
+from runner.recording.episode_log import Columns, EpisodeLog, Episodes, Flags, Steps
 from runner.recording.gym_values import filler, leaves_of, put_chosen
 from runner.recording.recorder import Recorder
 from runner.recording.reset_states import ResetState
@@ -28,6 +28,18 @@ from runner.util.arrays import Array, Ints
 _TRUE: Final = b"\1"
 _MAX_STEPS: Final = 2048
 """The most steps of the vector environment in a block; fewer if the recorder's blocks hold fewer records."""
+
+
+class ResetsBetween(NamedTuple):
+    """Resets of environments whose episodes had ended, by the user or within a step (`SAME_STEP`)."""
+
+    row: NDArray[np.intp]
+    """The row of the block that comes after each."""
+    which: NDArray[np.intp]
+    observation: Array
+    seeds: Sequence[int | None]
+    states: Sequence[ResetState | None]
+    """What each depended on, where that is to be recorded."""
 
 
 class VectorRows:
@@ -62,11 +74,8 @@ class VectorRows:
             for space in (described.observation, described.action)
         )
         self._n = n = described.environments
-        self._episode = np.zeros(n, np.int64)
-        """The number of the episode in progress, or of the next one, in each environment."""
-        self._length = np.zeros(n, np.int64)
-        self._return = np.zeros(n)
-        self._ended = self._reset_count = 0
+        self._log = EpisodeLog(n, 1, None)
+        self._reset_count = 0
         self._observation_dtype = recorder.dtype(self._resets)["observation"]
         self._current = np.zeros(n, self._observation_dtype)
         """The observations before the first row of the block."""
@@ -117,7 +126,7 @@ class VectorRows:
             new = slice(self._counted, self._filled)
             self._ended_here += int(np.count_nonzero(self._terminated[new] | self._truncated[new]))
             self._counted = self._filled
-        return self._recorder.steps[self._phase] + self.filled, self._ended + self._ended_here
+        return self._recorder.steps[self._phase] + self.filled, self._log.ended + self._ended_here
 
     @property
     def is_any_over(self) -> bool:
@@ -224,56 +233,40 @@ class VectorRows:
         if self._discrete:
             self._state[chosen] = now[chosen].astype(np.int64) - self._state_start
         steps = np.full(len(chosen), self._recorder.steps[self._phase])
-        self._put_resets(chosen, now[chosen], own_seeds, own_states, self._episode[chosen], steps)
+        self._put_resets(chosen, now[chosen], own_seeds, own_states, self._log.episode[chosen], steps)
 
     def _abandon(self, which: NDArray[np.intp]) -> None:
         """End the episodes in progress of these environments, neither terminated nor truncated."""
-        which = which[self._length[which] > 0]
-        if len(which):
-            last, never = self._recorder.steps[self._phase] - self._n + which, np.zeros(len(which), np.bool_)
-            self._put_ends(last, self._length[which], self._return[which], never, never)
-            self._episode[which] += 1
-            self._length[which] = 0
-            self._return[which] = 0.0
+        self._put_ends(self._log.interrupt(self._recorder.steps[self._phase], which))
 
     def commit(self) -> None:
         """Make the records of the block and hand them to the recorder."""
-        rows, n = self._filled, self._n
+        rows = self._filled
         if not rows:
             return
         first, over_after = self._recorder.steps[self._phase], self.over
-        self._current = self._now()
-        self._put_records(counts := self._count(), first)
-        self._recorder.steps[self._phase] += rows * n
-        row, which = np.nonzero(counts.over)
-        self._put_ends(
-            first + row * n + which,
-            counts.length[row, which],
-            counts.returns,
-            self._terminated[row, which],
-            self._truncated[row, which],
+        terminated, truncated = self._terminated[:rows], self._truncated[:rows]
+        was_reset, only_reset = np.zeros((2, rows, self._n), np.bool_)
+        for reset in self._block_resets:
+            inside = reset.row < rows
+            was_reset[reset.row[inside], reset.which[inside]] = True
+        if self._next_step:
+            only_reset[0], only_reset[1:] = self._over, (terminated | truncated)[:-1]
+            only_reset &= ~was_reset
+        rewards = self._rewards[:rows, :, np.newaxis]
+        episodes = self._log.take(
+            Steps(first, rewards, terminated, truncated, was_reset | only_reset, only_reset)
         )
-        self._put_block_resets(counts, first)
-        ended = counts.over[-1]
-        self._episode += counts.ended_before[-1]
-        self._length = np.where(ended, 0, counts.length[-1])
-        self._return = counts.carried
+        self._current = self._now()
+        self._put_records(episodes, first)
+        self._recorder.steps[self._phase] += rows * self._n
+        self._put_ends(episodes.ended)
+        self._put_block_resets(np.vstack([episodes.number, self._log.episode]), only_reset, first)
         self._over = over_after
         self._filled = self._counted = self._ended_here = 0
         self._block_resets, self._finals, self._autoreset_states = [], [], {}
 
-    def _count(self) -> EpisodeCounts:
-        rows = self._filled
-        over = self._terminated[:rows] | self._truncated[:rows]
-        only_reset = np.zeros_like(over)
-        if self._next_step:
-            only_reset[0], only_reset[1:] = self._over, over[:-1]
-            for reset in self._block_resets:
-                inside = reset.row < rows
-                only_reset[reset.row[inside], reset.which[inside]] = False
-        return counts_of(over, only_reset, self._rewards[:rows], self._length, self._return)
-
-    def _put_records(self, counts: EpisodeCounts, first: int) -> None:
+    def _put_records(self, episodes: Episodes, first: int) -> None:
         rows, n = self._filled, self._n
         terminated, truncated = self._terminated[:rows], self._truncated[:rows]
         last = self._observations[:rows]
@@ -281,11 +274,11 @@ class VectorRows:
             last = last.copy()
             for row, which, observation in self._finals:
                 last[row, which] = observation
-        columns: dict[str, Array] = {
+        columns: Columns = {
             "rewards": self._rewards[:rows, :, np.newaxis],
             "step": first + np.arange(rows * n).reshape(rows, n),
-            "episode": self._episode + counts.ended_before[:-1],
-            "t": counts.t,
+            "episode": episodes.number,
+            "t": episodes.t,
             "terminated": terminated,
             "truncated": truncated,
         }
@@ -305,10 +298,14 @@ class VectorRows:
         flat = {name: values.reshape(rows * n, *values.shape[2:]) for name, values in columns.items()}
         self._record(self._steps, flat, first + np.arange(1, rows * n + 1))
 
-    def _put_block_resets(self, counts: EpisodeCounts, first: int) -> None:
-        """Record the resets between and within the steps of the block, in their order."""
+    def _put_block_resets(self, episode: Ints, only_reset: Flags, first: int) -> None:
+        """Record the resets between and within the steps of the block, in their order.
+
+        Args:
+            episode: [rows + 1, N], the number of the episode that each belongs to, and of the next one.
+        """
         # NEXT_STEP: resets in place of a step come after those that the user called before it.
-        only_rows, only = np.nonzero(counts.only_reset)
+        only_rows, only = np.nonzero(only_reset)
         own = zip(only_rows.tolist(), only.tolist(), strict=True)
         own_states = [self._autoreset_states.get(row, {}).get(i) for row, i in own]
         observed = self._observations[only_rows, only]
@@ -324,23 +321,12 @@ class VectorRows:
         observation = np.concatenate([reset.observation for reset in resets])[order]
         known = [pair for reset in resets for pair in zip(reset.seeds, reset.states, strict=True)]
         seeds, states = zip(*(known[k] for k in order.tolist()), strict=True)
-        episode = self._episode[which] + counts.ended_before[rows[order], which]
-        self._put_resets(which, observation, seeds, states, episode, first + rows[order] * self._n)
+        at = rows[order]
+        self._put_resets(which, observation, seeds, states, episode[at, which], first + at * self._n)
 
-    def _put_ends(
-        self, last: Ints, length: Array, returns: Array, terminated: Flags, truncated: Flags
-    ) -> None:
-        """Record the ends of episodes, in the order in which they ended; `last` are their last steps."""
-        columns = {
-            "episode": self._ended + np.arange(len(last)),
-            "last_step": last,
-            "length": length,
-            "returns": returns[:, np.newaxis],
-            "terminated": terminated,
-            "truncated": truncated,
-        }
-        self._record(self._episodes, columns, last + 1)
-        self._ended += len(last)
+    def _put_ends(self, ended: Columns) -> None:
+        """Record the ends of episodes, in the order in which they ended."""
+        self._record(self._episodes, ended, ended["last_step"] + 1)
 
     def _put_resets(
         self,

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.recording import schema
+from runner.recording.episode_log import Flags
 from runner.recording.reader import Recording
-from runner.recording.schema import RESET_ONLY, Topic
+from runner.recording.schema import Topic
+from runner.util.arrays import Ints
 
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 OnBlock = Callable[[Topic, NDArray[np.void]], None]
 """Called with each block of a fixed-width topic when it is read."""
 
@@ -22,49 +22,25 @@ class Inconsistent(Exception):
     """Something that does not follow from the rest: the message says what, and where."""
 
 
-@dataclass
-class Block:
-    """Steps of all environments, ordered by environment, and by time within each; cut into segments.
-
-    A segment is what a block holds of an episode.
-    """
+class Block(NamedTuple):
+    """Steps of all environments, and the resets before them."""
 
     first: int
-    times: int
-    """Steps of each environment."""
+    """The number of the first step."""
     rows: NDArray[np.void]
-    number: Ints
-    """The number of each step."""
-    environment: Ints
-    opens: Bools
-    """Whether a step is the first of its environment in the block."""
+    """[steps of each environment, environments]."""
     resets: NDArray[np.void] | None
-    reset_rows: Ints
-    """The row that each reset comes before."""
-    over: Bools
-    """Whether a step terminated or truncated its episode."""
-    ends: Bools
-    """Whether an episode ended after a step."""
+    reset_at: tuple[Ints, Ints]
+    """The place in `rows` that each reset comes before."""
+    is_over: Flags
+    """[like `rows`]: whether a game of several agents ended with a step without the end of any of them."""
 
-    def __post_init__(self) -> None:
-        self.reset_only = self.rows["t"] == RESET_ONLY
-        """Whether a step is a reset alone."""
-        self.was_reset = np.zeros(len(self.rows), np.bool_)
-        """Whether a reset came before a step."""
-        self.was_reset[self.reset_rows] = True
-        self.starts = self.opens | np.where(self.opens, False, np.roll(self.ends, 1)) | self.was_reset
-        """Whether a step is the first of a segment."""
-        self.segment = np.cumsum(self.starts) - 1
-        """The segment of each step."""
-        self.heads = np.flatnonzero(self.starts)
-        """The first step of each segment; `tails` is the last."""
-        self.tails = np.append(self.heads[1:], len(self.rows)) - 1
-        self.owner = self.environment[self.heads]
-        """The environment of each segment."""
-        self.opening = self.opens[self.heads]
-        """Whether a segment is the first of its environment in the block."""
-        self.continues = self.opening & ~self.was_reset[self.heads]
-        """Whether a segment continues an episode of the block before."""
+    @property
+    def was_reset(self) -> Flags:
+        """[like `rows`]: whether a reset came before a step."""
+        was_reset = np.zeros(self.rows.shape, np.bool_)
+        was_reset[self.reset_at] = True
+        return was_reset
 
 
 def aligned(
@@ -117,26 +93,19 @@ class Blocks:
             )
 
     def _block(self, first: int, rows: NDArray[np.void]) -> Block:
-        n, count, times = self._n, len(rows), len(rows) // self._n
-        order = np.arange(count).reshape(times, n).T.ravel()
-        rows = rows[order] if n > 1 else rows
-        opens = np.zeros(count, np.bool_)
-        opens[::times] = True
-        over = rows["terminated"] | rows["truncated"]
-        ends = over.copy()
+        n, is_over = self._n, np.zeros(len(rows), np.bool_)
         # A game of several agents may end without the end of any of them: its episode record says so.
         if len(self._recording.agents) > 1 and n == 1:
-            for block in self.episodes.peek_while("last_step", first + count):
+            for block in self.episodes.peek_while("last_step", first + len(rows)):
                 silent = ~(block["terminated"] | block["truncated"]) & (block["last_step"] >= first)
-                ends[block["last_step"][silent] - first] = True
-        resets, at = self.resets.take_while("step", first + count), np.empty(0, np.int64)
+                is_over[block["last_step"][silent] - first] = True
+        resets, at = self.resets.take_while("step", first + len(rows)), (np.empty(0, np.int64),) * 2
         if resets is not None and len(resets):
             step, environment = resets["step"], resets["environment"].astype(np.int64)
             if ((environment >= self._recording.own_environments) | (step % n != 0) | (step < first)).any():
                 raise Inconsistent(f"/{self._phase}/reset: found resets out of order, or of no environment")
-            at = environment % n * times + (step - first) // n
-        owner = np.repeat(np.arange(n), times)
-        return Block(first, times, rows, first + order, owner, opens, resets, at, over, ends)
+            at = (step - first) // n, environment % n
+        return Block(first, rows.reshape(-1, n), resets, at, is_over.reshape(-1, n))
 
 
 def check_without_steps(recording: Recording, phase: str, on_block: OnBlock) -> int:

@@ -1,0 +1,153 @@
+"""The episodes of a phase of a loop, as they follow from what its environments did, block by block.
+
+A step counts for the episode in progress of its environment. An episode ends with a step that terminates or
+truncates it, or by a reset before the next one. Recording and verification number, measure and order episodes
+by these rules, which stand here alone.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.environments.mdp import Mdp
+from runner.recording.schema import RESET_ONLY
+from runner.util.arrays import Array, Ints
+
+Flags = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+Columns = dict[str, Array]
+"""Fields of records, by name."""
+
+
+class Steps(NamedTuple):
+    """Steps of N environments that take turns, [rows, N] each."""
+
+    first: int
+    """The number of the first step in its phase."""
+    rewards: Floats
+    """[rows, N, agents]."""
+    terminated: Flags
+    truncated: Flags
+    was_reset: Flags
+    """Whether the environment was reset before the step."""
+    only_reset: Flags | bool = False
+    """Where no step was taken: the environment ignored its action and was reset."""
+    is_over: Flags | bool = False
+    """Where a game is over though it is so for none of its agents."""
+    counts: Ints | None = None
+    """[rows, N, events + 1]: events and penalties, where the environment's arrays define them."""
+
+
+class Episodes(NamedTuple):
+    """What follows from a block of steps."""
+
+    t: Ints
+    """[rows, N]: the steps before each in its episode; `RESET_ONLY` where none was taken."""
+    number: Ints
+    """[rows, N]: the number of the step's episode, counted in its environment."""
+    ended: Columns
+    """The fields of the records of the episodes that ended, in their order."""
+
+
+class EpisodeLog:
+    """The episodes of N environments in a phase, and what is carried from block to block.
+
+    Args:
+        zero: what sums of rewards begin with: 0.0, or -0.0 where the sum of negative zeros is one.
+    """
+
+    def __init__(self, n: int, agents: int, mdp: Mdp | None, zero: float = 0.0) -> None:
+        self._n, self._agents, self._mdp, self._zero = n, agents, mdp, zero
+        self.episode = np.zeros(n, np.int64)
+        """The number of the episode in progress, or of the next one, in each environment."""
+        self.length = np.zeros(n, np.int64)
+        """Its steps so far."""
+        self._sums = np.full((n, agents + (1 + len(mdp.event_names) if mdp else 0)), zero)
+        """Its rewards by agent, and its events and penalties, so far."""
+        self.ended = 0
+        """Episodes of all environments that have ended."""
+
+    def take(self, steps: Steps) -> Episodes:
+        """Take the next steps of all environments."""
+        (rows, n), was_reset = steps.terminated.shape, steps.was_reset
+        ends = steps.terminated | steps.truncated | steps.is_over
+        taken = np.broadcast_to(np.logical_not(steps.only_reset), (rows, n))
+        count = np.cumsum(taken, axis=0, dtype=np.int64)
+        before = count - taken
+        after_end = np.vstack([np.zeros(n, np.bool_), ends[:-1]])
+        # What `before` was when the episode began; its steps before the block count as taken before it.
+        began = np.maximum.accumulate(np.where(after_end | was_reset, before, -self.length), axis=0)
+        length = count - began
+        left = np.where(after_end, 0, np.vstack([self.length, length[:-1]]))
+        cut = was_reset & (left > 0)  # the reset ends an episode in progress
+        number = np.cumsum(cut, axis=0) + np.cumsum(after_end, axis=0)
+        sums, place = self._summed(steps, taken, number, ends[-1])
+        episode, total = self.episode + number, number[-1] + ends[-1]
+
+        at, own = (np.concatenate(pair) for pair in zip(np.nonzero(ends), np.nonzero(cut), strict=True))
+        by_reset = np.arange(len(at)) >= np.count_nonzero(ends)
+        order = np.lexsort([own, by_reset, at - by_reset])
+        at, own, by_reset = at[order], own[order], by_reset[order]
+        ended = self._end(
+            steps.first + (at - by_reset) * n + own,
+            np.where(by_reset, left[at, own], length[at, own]),
+            sums[place[at, own] - by_reset],
+            steps.terminated[at, own] & ~by_reset,
+            steps.truncated[at, own] & ~by_reset,
+        )
+        self.episode = self.episode + total
+        self.length = np.where(ends[-1], 0, length[-1])
+        self._sums = sums[place[-1] + ends[-1]]
+        return Episodes(np.where(taken, before - began, RESET_ONLY), episode, ended)
+
+    def interrupt(self, steps: int, which: NDArray[np.integer]) -> Columns:
+        """End the episodes in progress of some environments by a reset after `steps` of the phase.
+
+        Returns the fields of their records.
+        """
+        which = which[self.length[which] > 0]
+        never = np.zeros(len(which), np.bool_)
+        last = np.asarray(steps - self._n + which, np.int64)
+        ended = self._end(last, self.length[which], self._sums[which], never, never)
+        self.episode[which] += 1
+        self.length[which], self._sums[which] = 0, self._zero
+        return ended
+
+    def _summed(self, steps: Steps, taken: Flags, number: Ints, ends: Flags) -> tuple[Floats, Ints]:
+        """Return the sums of each episode, and in which row of them that of each step is, [rows, N].
+
+        The episodes of an environment follow one another, and one is left to follow the last.
+        """
+        values = steps.rewards
+        if steps.counts is not None:
+            values = np.concatenate([values, steps.counts], axis=-1)
+        sizes = number[-1] + ends + 1
+        first = np.cumsum(sizes) - sizes
+        place = first + number
+        sums = np.full((values.shape[-1], int(sizes.sum())), self._zero)
+        at = np.concatenate([first, place[taken]])
+        with np.errstate(invalid="ignore", over="ignore"):
+            for k, own in enumerate(sums):  # added one after the other: other orders round otherwise
+                np.add.at(own, at, np.concatenate([self._sums[:, k], values[..., k][taken]]))
+        return sums.T, place
+
+    def _end(self, last: Ints, length: Ints, sums: Floats, terminated: Flags, truncated: Flags) -> Columns:
+        """Return the fields of the records of episodes that ended; `last` are their last steps."""
+        ended: Columns = {
+            "episode": self.ended + np.arange(len(last)),
+            "last_step": last,
+            "length": length,
+            "returns": sums[:, : self._agents],
+            "terminated": terminated,
+            "truncated": truncated,
+        }
+        if self._mdp is not None:
+            counts = sums[:, self._agents :].astype(np.int64)
+            success = [self._mdp.event_names.index(name) for name in self._mdp.success_events]
+            ended |= {"events": counts[:, :-1], "penalties": counts[:, -1]}
+            ended["success"] = np.asarray((counts[:, success] > 0).any(axis=1))
+        self.ended += len(last)
+        return ended
