@@ -32,7 +32,7 @@ def branch(
     """Change one step of a recorded run, and record what follows as a run of its own, with the same luck.
 
     The training of a job is changed at `at`, and goes on to its end: see
-    `runner.execution.branching.branch_training`, which takes `overrides` and `episodes`. Of a loop, one
+    `runner.execution.branching.branch_training`, which takes `overrides` and `episodes`. For a loop, one
     episode is played on: see `runner.loops.branch.branch_episode`, which takes `policy`, `seed`, `max_steps`
     and `trust`. Both take the other arguments; `runner.what_if` plays actions of a job on without training.
 

@@ -138,7 +138,7 @@ class ValuesAlong:
 def values_along(
     recording: Recording, phase: str, episode: int, checkpoint: Checkpoint, policy: str, trust: bool = False
 ) -> ValuesAlong:
-    """Return what a checkpoint's agent would have thought along an old episode.
+    """Return what a checkpoint's agent returns along a recorded episode.
 
     The policy is called with each recorded observation before a step. It may return a number, an array, or a
     mapping of names to these; without names, the name is `value`.

@@ -43,7 +43,7 @@ def archive_command(
 
     An archived run takes a tenth of the space. With --remove its recording is removed, but the run stays
     listed; commands that need the recording restore it into the cache, and `dualtaxi restore` brings it back.
-    With --json, one line for each run.
+    --json prints one line for each run.
 
     Examples:
       dualtaxi archive @latest

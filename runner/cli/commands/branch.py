@@ -53,10 +53,15 @@ def branch_command(
         default="recorded",
         show_default=True,
         metavar="recorded|random|constant|MODULE:FUNCTION",
-        help="Of a loop: what acts after the step.",
+        help="For a loop: what acts after the step.",
     ),
     seed: int = option(
-        "--seed", type=INDEX, default=0, show_default=True, help="Of a loop: seed of the random policy."
+        "--seed",
+        type=INDEX,
+        default=0,
+        show_default=True,
+        metavar="S",
+        help="For a loop: seed of the random policy.",
     ),
     name: str | None = option("--name", help="Name of the new run.  [default: RUN.branch]"),
     max_steps: int = option(
@@ -65,7 +70,7 @@ def branch_command(
         default=100_000,
         show_default=True,
         metavar="N",
-        help="Of a loop: stop after N steps.",
+        help="For a loop: stop after N steps.",
     ),
     trust: bool = trust_option,
     recordings: Path | None = recordings_option,
@@ -73,19 +78,19 @@ def branch_command(
 ) -> None:
     """Change one step of RUN, and record what follows as a run of its own, with the same luck.
 
-    A run that was trained here is trained again, the same up to the step: there agents take other actions, or
-    from there on settings are others (--set: step size, discount, epsilon, exploration, quirks and the
-    parameters of the algorithm), and every draw that this does not touch stays the same. The branch can be
-    verified, resumed, compared and branched as every run.
+    A run that was trained here is trained again, the same up to the step. There the agents take other
+    actions, or settings change (--set: step size, discount, epsilon, exploration, quirks and the parameters
+    of the algorithm); every random draw that this does not affect stays the same. The branch can be verified,
+    resumed, compared and branched like any run.
 
-    With --action all, and of a trial of an evaluation, nothing is trained: the episode is played on from the
-    step with each joint action, or those that are named, or have AGENT=VALUE, by the tables of that moment.
+    With --action all, and at a trial of an evaluation, nothing is trained: the episode is played on from the
+    step with each joint action, or with those that --action selects, by the tables of that moment.
 
-    Of a loop, an episode is played on from the step. Its environment is made again and brought there by the
-    recorded reset and actions, compared with the recording on the way. Then the recorded actions act, until
-    they run out; random ones; the same action again and again; or a function of yours, from an observation
-    to an action. An action is a number or a name, numbers separated by commas, or JSON where the space is a
-    Dict or Tuple.
+    For a loop, an episode is played on from the step. Its environment is made again and brought there by the
+    recorded reset and actions, compared with the recording on the way. What acts then is --policy: the
+    recorded actions, until they run out; random ones; the same action every time; or a function of yours,
+    from an observation to an action. An action is a number or a name, numbers separated by commas, or JSON
+    where the space is a Dict or Tuple.
 
     Examples:
       dualtaxi branch cooperative --at 120:5 --action taxi_1=north

@@ -208,7 +208,7 @@ def diff_command(
 ) -> None:
     """Show what differs between the runs A and B, down to the first step at which they diverge, and why.
 
-    With --all also what is equal. Exit code 0 if both have the same content, 1 if not.
+    --all also shows what is equal. Exit code 0 if both have the same content, 1 if not.
 
     Examples:
       dualtaxi diff k3v9m2xq p7 --ignore 'package.*'

@@ -53,7 +53,7 @@ def parquet(
 ) -> None:
     """Export RUN as Parquet: steps.parquet, episodes.parquet and metrics.parquet in a folder.
 
-    Columns are named as the recording's fields; each agent's action and reward has its own. Of a loop there
+    Columns are named as the recording's fields; each agent's action and reward has its own. For a loop there
     are resets.parquet and infos.parquet too, and each number of an observation or action has a column; an
     array of more than 64 is one column of bytes.
 

@@ -78,7 +78,7 @@ def play_command(
     your own loop the first trial of its last evaluation; of a run without evaluations the last training
     episode. --best and --worst choose among the trials of all evaluations, or else the training episodes. The
     space bar pauses, the arrow keys (or b and n) step back and forward, and q quits. Where stdout is no
-    terminal, the frames come one after another, without waiting. With --json, one line for each step.
+    terminal, the frames come one after another, without waiting. --json prints one line for each step.
 
     In a terminal it shows pictures, as `dualtaxi export film` does: by the terminal's graphics (kitty,
     sixel), else by coloured half blocks. Scenes are drawn in text where there are no graphics. NO_COLOR and

@@ -53,8 +53,8 @@ def rm_command(
 ) -> None:
     """Remove runs and their recordings, after confirmation.
 
-    If a run is running or tagged `keep`, or its folder holds files of other origin, nothing is removed. Links
-    are not followed. Archives stay.
+    If a run is running or tagged `keep`, or its folder holds files that no run writes, nothing is removed.
+    Links are not followed. Archives stay.
 
     Examples:
       dualtaxi rm k3v9m2xq p7
@@ -101,8 +101,8 @@ def prune_command(
     """Remove the runs that match FILTER (as in `dualtaxi ls`) and all options, after confirmation.
 
     At least one of them must be given. --keep-last keeps the newest runs of each configuration name, counted
-    over all runs. Runs that are running or tagged `keep` stay, and so do those whose folder holds files of
-    other origin.
+    over all runs. Runs that are running or tagged `keep` stay, and so do those whose folder holds files that
+    no run writes.
 
     Examples:
       dualtaxi prune --older-than 30d --keep-last 5 --status interrupted --dry-run

@@ -49,7 +49,7 @@ def plot_command(
     With --normalise the figure has normalised scores over environments instead, as in `dualtaxi compare`:
     aggregates, performance profiles and sample-efficiency curves of the returns.
 
-    Of a sweep, given by its name, the objective is drawn against each parameter and in parallel coordinates,
+    For a sweep, given by its name, the objective is drawn against each parameter and in parallel coordinates,
     and over episodes for the best and the median trial.
 
     Examples:

@@ -129,7 +129,7 @@ def evaluate_command(
         "--trials",
         type=COUNT,
         metavar="K",
-        help=f"Number of episodes.  [default: {TRIALS}, of a loop {LOOP_TRIALS}]",
+        help=f"Number of episodes.  [default: {TRIALS}, for a loop {LOOP_TRIALS}]",
     ),
     start: str = option(
         "--start",
@@ -157,8 +157,8 @@ def evaluate_command(
     The table at any step can be evaluated. The episodes are recorded as a separate run, whose configuration
     names the run and the step of the table.
 
-    Of a loop, a checkpoint is evaluated in its environment, which is made again. --policy names a function of
-    yours that takes the checkpoint's content (arrays by name, or bytes) and the spaces of observations and
+    For a loop, a checkpoint is evaluated in its environment, which is made again. --policy names a function
+    of yours that takes the checkpoint's content (arrays by name, or bytes) and the spaces of observations and
     actions, and returns a function from an observation to an action. Trial K resets with the seed S + K.
 
     Examples:

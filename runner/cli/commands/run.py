@@ -68,7 +68,7 @@ def run_command(
 
     With --live the Rerun viewer shows training as it happens: all metrics, and every Nth episode.
 
-    With --json, one line for each run.
+    --json prints one line for each run.
 
     Examples:
       dualtaxi run quick

@@ -45,17 +45,17 @@ def show_command(
 ) -> None:
     """Show a run: its evaluations, tables, configuration and provenance.
 
-    With --code the code that ran. `git checkout COMMIT && dualtaxi show RUN --code | git apply` restores it;
-    without a commit the patch has all files. With --json as well: under `files` the text of each recorded
+    --code prints the code that ran; `git checkout COMMIT && dualtaxi show RUN --code | git apply` restores
+    it; without a commit the patch has all files. With --json as well, `files` has the text of each recorded
     file, `new` those that the commit does not have, `patch` the changes since the commit.
 
-    With --json also the whole series: under `eval` an object for each evaluation, with the training episodes
-    before it, success_percent, mean_length, mean_penalties and the count of every event; under `optimality`
-    its exact measures, if the run takes them; under `train` one for each report of training; under `loop` the
-    last results of a loop: its last evaluation, the means of its last 100 training episodes and the last
-    values it logged; under `extras` the names of the values that it recorded with its steps; under
-    `checkpoints` what it kept of its agent; under `processes` those that recorded it together; under `origin`
-    what it was branched from, under `branches` its branches by run id.
+    --json also prints the whole series: `eval` has an object for each evaluation, with the training episodes
+    before it, success_percent, mean_length, mean_penalties and the count of every event; `optimality` its
+    exact measures, if the run takes them; `train` an object for each report of training; `loop` the last
+    results of a loop: its last evaluation, the means of its last 100 training episodes and the last values it
+    logged; `extras` the names of the values that it recorded with its steps; `checkpoints` those of its
+    agent; `processes` those that recorded it together; `origin` what it was branched from; and `branches` its
+    branches by run id.
 
     Examples:
       dualtaxi show @latest

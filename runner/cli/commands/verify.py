@@ -12,6 +12,7 @@ import click
 from runner.cli.command import Command, option
 from runner.cli.options import json_option, recordings_option, run_argument, trust_option
 from runner.cli.output import draw, facts, print_json
+from runner.cli.parameter_types import COUNT
 from runner.cli.progress import bytes_line, count_line
 from runner.cli.runs import command_for, find_recording, job_progress, require_over
 from runner.errors import Diverged, ExitCode
@@ -34,12 +35,13 @@ def verify_command(
         help="Run it again in the installed environment; by default loops only, where that is possible.",
     ),
     sample: int | None = option(
-        "--sample", type=click.IntRange(1), help="Do only N episodes of a loop again, evenly spread."
+        "--sample", type=COUNT, metavar="N", help="Do only N episodes of a loop again, evenly spread."
     ),
     tolerance: float = option(
         "--tolerance",
         type=click.FloatRange(0, 1),
         default=0.0,
+        metavar="X",
         help="Accept this absolute and relative difference of a loop's observations and rewards.",
     ),
     trust: bool = trust_option,

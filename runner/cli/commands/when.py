@@ -31,7 +31,7 @@ def when_command(
 ) -> None:
     """Find the first training step of RUN after which EXPRESSION holds, exactly: every step is replayed.
 
-    With --all, every interval in which it holds.
+    --all lists every interval in which it holds.
 
     In an expression:
       q[S, A], max(q[S])   a Q-value; the highest in a state, or the lowest: min(q[S])

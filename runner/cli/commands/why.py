@@ -28,7 +28,7 @@ def why_command(
         "--action", metavar="A", help="The action: a number or a name.  [default: that of --at]"
     ),
     agent: str | None = option(
-        "--agent", metavar="NAME", help="Whose Q-table, where each agent has its own."
+        "--agent", metavar="NAME", help="The agent whose Q-table it is in, where each has its own."
     ),
     at: StepRef | None = option(
         "--at",

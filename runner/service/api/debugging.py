@@ -39,7 +39,7 @@ ActionName = Annotated[
     str | None, Query(max_length=1000, description="An action, by number or name; default: that of `at`.")
 ]
 AgentName = Annotated[
-    str | None, Query(max_length=200, description="Whose Q-table, where each agent has its own.")
+    str | None, Query(max_length=200, description="The agent whose Q-table it is in, where each has its own.")
 ]
 StepName = Annotated[
     str | None, Query(max_length=60, description="The value before this step, EPISODE:T or eval:N:TRIAL:T.")
