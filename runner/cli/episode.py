@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -23,7 +22,6 @@ from runner.util.values import Json
 if TYPE_CHECKING:
     from rich.text import Text
 
-    from runner.drawing.raster import Pixels
     from runner.export.episodes import EpisodePlace
     from runner.export.pictures import Pictures
     from runner.recording.reader import Recording
@@ -83,11 +81,13 @@ class Episode:
 
     def illustrated(self, pictures: Pictures) -> Iterator[Frame]:
         """Yield a frame for each picture of the episode."""
+        from runner.drawing.raster import image_bytes
+
         for picture in pictures:
             below = _below(picture.action, picture.rewards, picture.returns, picture.events, picture.ended)
             if picture.note:
                 below.append(f"\n{picture.note}")
-            yield Frame(self._above(picture.t), below, _png(picture.pixels))
+            yield Frame(self._above(picture.t), below, image_bytes(picture.pixels, "png"))
 
     def _above(self, t: int) -> Text:
         from rich.text import Text
@@ -182,14 +182,6 @@ def _valued(recording: Recording, phase: str) -> Callable[[Step], dict[str, obje
         return found | ({"action_in_words": words[""](row["action"])} if words else {})
 
     return describe
-
-
-def _png(pixels: Pixels) -> bytes:
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, "PNG", compress_level=1)
-    return buffer.getvalue()
 
 
 def _joined(rewards: Sequence[float]) -> str:

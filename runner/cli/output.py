@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -44,6 +45,21 @@ def json_list(name: str, rows: Iterable[Mapping[str, object]]) -> Iterator[str]:
         yield separator + "\n  {\n   " + encode(finite(row))[1:-1] + "\n  }"
         separator = ","
     yield "\n ]\n}\n" if separator else "]\n}\n"
+
+
+class _Passed:
+    """A file for `csv.writer` whose `write` returns the line."""
+
+    @staticmethod
+    def write(line: str) -> str:
+        return line
+
+
+def csv_lines(columns: Iterable[str], rows: Iterable[Iterable[object]]) -> Iterator[str]:
+    """Yield the lines of a table as CSV, the headings first."""
+    write = csv.writer(_Passed(), lineterminator="\n").writerow
+    yield write(columns)
+    yield from map(write, rows)
 
 
 def print_written(text: str, as_json: bool, *paths: Path, **more: object) -> None:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import identity_of
 from runner.debugging.factors import Mixing
-from runner.environments.loading import load_mdp
+from runner.environments.loading import load_once
 from runner.environments.mdp import Mdp
 from runner.errors import RunnerError
 from runner.execution.initial_tables import tables_of
@@ -103,8 +103,7 @@ def measure(
     """
     plan = config.evaluation
     assert plan is not None
-    kwargs = json.dumps(config.to_mapping()["env"]["kwargs"], sort_keys=True)
-    mdp = _load_mdp(config.env.id, kwargs, config.rewards)
+    mdp = load_once(config.env.id, config.env.kwargs, config.rewards)
     learner = Learner(config, mdp, seed, tables_of(config, mdp, recordings))
     steps, episodes = (
         blank_records(topic, topic_dtype(topic, len(learner.agents), len(mdp.event_names)), _BLOCK_STEPS)
@@ -133,17 +132,11 @@ def measure(
     return read
 
 
-@lru_cache(maxsize=64)
-def _load_mdp(env_id: str, kwargs: str, rewards: str) -> Mdp:
-    """Return an environment, which a process loads once."""
-    return load_mdp(env_id, json.loads(kwargs), rewards)
-
-
-@lru_cache(maxsize=64)
-def _environment_digest(env_id: str, kwargs: str, rewards: str) -> str:
+@lru_cache(maxsize=16)
+def _environment_digest(mdp: Mdp) -> str:
     """Return the digest of an environment's arrays, which its code determines."""
     digest = blake3()
-    for name, array in sorted(_load_mdp(env_id, kwargs, rewards).arrays().items()):
+    for name, array in sorted(mdp.arrays().items()):
         digest.update(name.encode() + array.tobytes())
     return digest.hexdigest()[:16]
 
@@ -271,10 +264,8 @@ class Mixtures:
 
     def _identity(self, config: ExperimentConfig, seed: int) -> str:
         """Return what determines the readings of a run: its job, and the code of its environment."""
-        values = config.to_mapping()
-        kwargs = json.dumps(values["env"]["kwargs"], sort_keys=True)
-        environment = _environment_digest(config.env.id, kwargs, config.rewards)
-        return f"{identity_of(values, seed)}-{environment}-{__version__}"
+        environment = _environment_digest(load_once(config.env.id, config.env.kwargs, config.rewards))
+        return f"{identity_of(config.to_mapping(), seed)}-{environment}-{__version__}"
 
     def _failed(self, task: Measurement, reason: str) -> RunnerError:
         names = ", ".join(factor.name for factor in self.mixing.chosen(task.mixture)) or "none"

@@ -11,7 +11,7 @@ from runner.analysis.step_reference import StepRef
 from runner.drawing.svg_moves import Move
 from runner.environments.naming import spoken
 from runner.errors import MissingExtra
-from runner.export.reports.rendering import page_style, partials
+from runner.export.reports.rendering import framed, page_style, partials
 from runner.util.values import Json
 
 EXPLANATION: Final = (
@@ -221,7 +221,4 @@ def why_frame(found: Why) -> str:
         facts = "; ".join(f"{name} {text}" for name, text in facts_of(found).items())
         return f"<p>{escape(facts)}</p><p>{escape(str(error))}</p>"
     title = f"Why the value of action {found.action_in_words} in state {found.state} is {found.value:.4g}"
-    return (
-        f'<iframe title="{escape(title)}" srcdoc="{escape(page)}" width="100%" height="{HEIGHT}" '
-        'style="border: 1px solid #8888; border-radius: 6px" sandbox></iframe>'
-    )
+    return framed(title, page, HEIGHT)

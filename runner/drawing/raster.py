@@ -31,6 +31,7 @@ _SPRITE: Final = 130
 """Side of the square in which a thing is drawn, in hundredths of a cell."""
 _FINE: Final = 4
 """Trails are drawn at this multiple of the resolution, for smooth edges."""
+_JPEG_QUALITY: Final = 90
 _PURPOSE: Final = "a picture"
 
 
@@ -38,6 +39,16 @@ def require_packages() -> None:
     """Check that the packages that draw pictures are installed."""
     require("resvg_py", "PIL", extra="plots", purpose=_PURPOSE)
     _fonts()
+
+
+def image_bytes(pixels: Pixels, kind: str) -> bytes:
+    """Return a picture as the bytes of a `png` (exact) or `jpeg` (smaller, and not exact)."""
+    from PIL import Image
+
+    buffer = BytesIO()
+    options: dict[str, int] = {"compress_level": 1} if kind == "png" else {"quality": _JPEG_QUALITY}
+    Image.fromarray(pixels).save(buffer, kind, **options)
+    return buffer.getvalue()
 
 
 class SceneRaster:

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import functools
 import importlib
+import json
 import traceback
 from collections.abc import Mapping
 from pathlib import Path
@@ -51,6 +53,16 @@ def load_mdp(env_id: str, kwargs: Mapping[str, object], rewards: str = "team") -
     if rewards == "individual" and mdp.rewards.shape[-1] != len(mdp.agents):
         raise _one_reward_only(env_id)
     return mdp
+
+
+def load_once(env_id: str, kwargs: Mapping[str, object], rewards: str) -> Mdp:
+    """Return what `load_mdp` does; a process that needs the same environment again does not make it again."""
+    return _loaded(env_id, json.dumps(dict(kwargs), sort_keys=True, default=dict), rewards)
+
+
+@functools.lru_cache(maxsize=16)
+def _loaded(env_id: str, kwargs: str, rewards: str) -> Mdp:
+    return load_mdp(env_id, json.loads(kwargs), rewards)
 
 
 def mdp_of(env: Any, kwargs: Mapping[str, object]) -> Mdp:

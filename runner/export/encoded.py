@@ -21,6 +21,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.drawing.raster import image_bytes
 from runner.errors import CannotRedo, RunnerError
 from runner.export.painting import decoded
 from runner.export.pictures import Source, paint, source_of
@@ -31,7 +32,6 @@ from runner.util.extras import require
 
 _SMALL: Final = 256 * 256
 """Pictures of at most this number of pixels are encoded as PNG, which is exact; larger ones as JPEG."""
-_JPEG_QUALITY: Final = 88
 MAX_PICTURES: Final = 300
 """Pictures of an episode in a report."""
 _MAX_SIDE: Final = 320
@@ -80,13 +80,8 @@ def encoded_pictures(
 
 def encoded_picture(pixels: NDArray[np.uint8]) -> bytes:
     """Return a picture, [height, width, 3], as a file."""
-    image = require("PIL.Image", extra="plots", purpose="a picture").fromarray(pixels)
-    buffer = io.BytesIO()
-    if image.width * image.height <= _SMALL:
-        image.save(buffer, "PNG", compress_level=1)
-    else:
-        image.save(buffer, "JPEG", quality=_JPEG_QUALITY)
-    return buffer.getvalue()
+    require("PIL", extra="plots", purpose="a picture")
+    return image_bytes(pixels, "png" if pixels.shape[0] * pixels.shape[1] <= _SMALL else "jpeg")
 
 
 # --- thumbnails ---------------------------------------------------------------------------------------

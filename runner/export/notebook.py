@@ -102,16 +102,14 @@ def report(
     from runner.analysis.axes import axis_of
     from runner.archive.places import at_hand
     from runner.export.plots.style import CurveStyle
+    from runner.export.reports.rendering import framed
     from runner.export.reports.report import render_report
 
     paths, style = [at_hand(run).recording for run in runs], CurveStyle(lines, smooth, log_x, log_y)
     page, _ = render_report(paths, axis=axis_of(axis), style=style)
     page = page.replace("</head>", f"{_FRAME_STYLE}</head>", 1)
     title = ", ".join(f"{run.name}, run {run.run_id}" for run in runs)
-    return Html(
-        f'<iframe title="{escape(title)}" srcdoc="{escape(page)}" width="100%" height="{height}" '
-        'style="border: 1px solid #8888; border-radius: 6px" sandbox="allow-scripts"></iframe>'
-    )
+    return Html(framed(title, page, height, sandbox="allow-scripts"))
 
 
 def plot(

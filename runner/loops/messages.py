@@ -10,11 +10,12 @@ from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
+from runner.drawing.raster import image_bytes
 from runner.errors import ConfigError
 from runner.loops.checkpointing import content_of
 from runner.loops.options import ALL_INFO, Options, pillow
 from runner.loops.outcomes import Outcomes
-from runner.loops.pictures import Picture, image_bytes
+from runner.loops.pictures import Picture
 from runner.loops.rows import MAX_SEED
 from runner.loops.values import MAX_ARRAY_BYTES, arrays_of, check_log_name, logged_number
 from runner.loops.vector_rows import PhaseRows

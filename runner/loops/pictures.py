@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.drawing.raster import image_bytes
 from runner.errors import ConfigError
 from runner.loops.options import pillow
 
-_JPEG_QUALITY: Final = 90
 _MAX_PIXELS: Final = 1 << 28
 """The most pixels of a film, of all frames together."""
 
@@ -54,11 +54,3 @@ class Picture:
             buffer, "webp", save_all=True, append_images=images, duration=duration, loop=0, method=0
         )
         return buffer.getvalue()
-
-
-def image_bytes(pixels: NDArray[np.uint8], kind: str) -> bytes:
-    """Return a picture, [height, width, 3], as `png` (exact) or `jpeg` (smaller, and not exact)."""
-    buffer = io.BytesIO()
-    options: dict[str, int] = {"compress_level": 1} if kind == "png" else {"quality": _JPEG_QUALITY}
-    pillow().fromarray(pixels).save(buffer, kind, **options)
-    return buffer.getvalue()

@@ -6,7 +6,6 @@ of a run before a worker starts it, and whatever a worker leaves there is contin
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
@@ -18,7 +17,7 @@ from typing import Literal
 from runner.archive.places import at_hand
 from runner.config import from_mapping
 from runner.config.job import Job
-from runner.environments.loading import load_mdp
+from runner.environments.loading import load_once
 from runner.environments.mdp import Mdp
 from runner.errors import RecordingError, RunnerError
 from runner.execution.resume import resume
@@ -161,7 +160,7 @@ def _run(task: Task, stop: Callable[[], bool]) -> Run:
     if is_over(run):
         return run
     env = task.config["env"]
-    mdp = _load_mdp(env["id"], json.dumps(env["kwargs"], sort_keys=True), task.config["rewards"])
+    mdp = load_once(env["id"], env["kwargs"], task.config["rewards"])
     pruner = _Pruner(task, mdp, stop)
     if run.recording.exists():
         run = resume(run, task.accept_changes, pruner.report, pruner.stop)
@@ -178,12 +177,6 @@ def _run(task: Task, stop: Callable[[], bool]) -> Run:
 
 def _mark_pruned(folder: Path) -> None:
     change_labels(folder, lambda now: Labels(now.name, (*now.tags, PRUNED), now.note))
-
-
-@lru_cache(maxsize=4)
-def _load_mdp(env_id: str, kwargs: str, rewards: str) -> Mdp:
-    """Return an environment, which a worker loads once."""
-    return load_mdp(env_id, json.loads(kwargs), rewards)
 
 
 class _Pruner:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,7 +23,7 @@ from runner.cli.options import (
     trial_option,
     trust_option,
 )
-from runner.cli.output import draw, files_written, print_json, say, table
+from runner.cli.output import csv_lines, draw, files_written, print_json, say, table
 from runner.cli.progress import stage_line
 from runner.cli.runs import find_recorded
 from runner.export.places import write_new, write_text_new
@@ -118,7 +116,7 @@ def values_command(
     recordings: Path | None = recordings_option,
     as_json: bool = json_option,
 ) -> None:
-    """Compute what the agent of a checkpoint of RUN thinks along an old episode of it.
+    """Compute what the agent of a checkpoint of RUN returns at each step of a recorded episode.
 
     --policy names a function of yours that takes the checkpoint's content (arrays by name, or bytes) and the
     spaces of observations and actions, and returns a function. That is called with the recorded observation
@@ -150,7 +148,7 @@ def values_command(
         columns |= _columns(name, values)
     rows = list(zip(*columns.values(), strict=True))
     if output is not None:
-        write_text_new(output, force, _csv(columns, rows))
+        write_text_new(output, force, "".join(csv_lines(columns, rows)))
     if as_json:
         facts = {"phase": phase, "episode": number, "checkpoint": chosen.as_json(), "policy": policy}
         steps = [dict(zip(columns, row, strict=True)) for row in rows]
@@ -174,11 +172,3 @@ def _columns(name: str, values: Any) -> dict[str, list[object]]:
         return {name: values if isinstance(values, list) else values.tolist()}
     flat = values.reshape(len(values), -1)
     return {f"{name}[{i}]": flat[:, i].tolist() for i in range(flat.shape[1])}
-
-
-def _csv(columns: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
-    return text.getvalue()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import sys
 import tempfile
@@ -16,7 +14,7 @@ import click
 
 from runner.cli.command import Command, option
 from runner.cli.options import filter_argument, folders_option, json_option, limit_option
-from runner.cli.output import aligned, console, draw, json_list, printable, say, table
+from runner.cli.output import aligned, console, csv_lines, draw, json_list, printable, say, table
 from runner.cli.parameter_types import INDEX
 from runner.runs.catalogue.columns import (
     DEFAULT_JSON,
@@ -96,11 +94,11 @@ def ls_command(
       environment host git archive folder, and config.PATH for any value of the
       configuration
 
-    Shown are the training episodes done (and to do, if some are missing), the percentage of the last
-    evaluation's trials that finished, the size of the recording, how long ago the run began, and which run
-    recorded the same content before, and of which run it is a branch; of a loop also the mean return in its
-    last evaluation (in its last 100 training episodes, if it has none) and the last values it logged. Some
-    columns are left out where a terminal is narrow.
+    The table shows the training episodes done (and to do, if some are missing), the percentage of the last
+    evaluation's trials that succeeded, the size of the recording, how long ago the run began, which run
+    recorded the same content before, and which run it is a branch of. For a loop it also shows the mean
+    return in its last evaluation (in its last 100 training episodes, if it has none) and the last values that
+    it logged. A narrow terminal has fewer columns.
 
     Examples:
       dualtaxi ls
@@ -205,15 +203,7 @@ def _objects(rows: Iterable[Row], columns: Sequence[str]) -> Iterator[str]:
 
 
 def _csv_lines(rows: Iterable[Row], columns: Sequence[str]) -> Iterator[str]:
-    """Yield lines of CSV after a heading; tags are separated by blanks, logged values are a JSON object."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-
-    def line(cells: Iterable[object]) -> str:
-        text.seek(0)
-        text.truncate()
-        writer.writerow(cells)
-        return text.getvalue()
+    """Return lines of CSV after a heading; tags are separated by blanks, logged values are a JSON object."""
 
     def cell(value: object) -> object:
         return (
@@ -224,9 +214,7 @@ def _csv_lines(rows: Iterable[Row], columns: Sequence[str]) -> Iterator[str]:
             else value
         )
 
-    yield line(columns)
-    for row in rows:
-        yield line(map(cell, as_json(row, columns).values()))
+    return csv_lines(columns, (map(cell, as_json(row, columns).values()) for row in rows))
 
 
 def _informative(rows: Sequence[Row], folders: int) -> list[str]:

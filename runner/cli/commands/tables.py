@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +11,7 @@ import click
 
 from runner.cli.command import Command, option
 from runner.cli.options import force_option, json_option, recordings_option, run_argument, set_option
-from runner.cli.output import draw, facts, files_written, print_json, say, table, title
+from runner.cli.output import csv_lines, draw, facts, files_written, print_json, say, table, title
 from runner.cli.parameter_types import FILE, INDEX
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_recorded
@@ -51,7 +50,7 @@ def qtable_command(
 ) -> None:
     """Show the exact Q-table of RUN at any step: the nearest snapshot, with the recorded steps replayed.
 
-    With --state: its values, the policy if the algorithm learns one, the greedy action (ties go to the
+    --state shows its values, the policy if the algorithm learns one, the greedy action (ties go to the
     first), how often each action was taken there so far, and which step last changed each value. In Python:
     runner.replay.tables.tables_at().
 
@@ -146,7 +145,7 @@ def table_command(
     """Print an environment's transition table as CSV, with names.
 
     A row for each state, action and outcome that can happen: state, action, probability, next_state, reward,
-    is_over. With --set mode=competitive also the reward of each agent. With --json, one line for each row. In
+    is_over. --set mode=competitive adds the reward of each agent. --json prints one line for each row. In
     Python: runner.frames.transition_table().
 
     Examples:
@@ -170,6 +169,4 @@ def table_command(
         for row in rows():
             print_json(dict(zip(columns, row, strict=True)), indent=None)
     else:
-        writer = csv.writer(sys.stdout, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(rows())
+        sys.stdout.writelines(csv_lines(columns, rows()))

@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from html import escape
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
@@ -113,11 +114,20 @@ def page_style() -> str:
     return "\n".join([palette.css_variables(), layout, svg.STYLE, svg_maps.STYLE, dark])
 
 
+def framed(title: str, page: str, height: int, sandbox: str = "") -> str:
+    """Return a page in a frame of its own, as HTML for a notebook; `sandbox` is what the page may do."""
+    return (
+        f'<iframe title="{escape(title)}" srcdoc="{escape(page)}" width="100%" height="{height}" '
+        f'style="border: 1px solid #8888; border-radius: 6px" sandbox="{sandbox}"></iframe>'
+    )
+
+
 def code(text: str) -> Markup:
     """Return a text as HTML in which the parts between backticks are set as code."""
-    from markupsafe import Markup, escape
+    from markupsafe import Markup
+    from markupsafe import escape as marked
 
-    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(marked(text))))
 
 
 def sentence(text: str) -> str:
