@@ -53,19 +53,29 @@ def stamp(folder: Path) -> str:
     return hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest()
 
 
-def load_without_scipy() -> None:
-    """Load what Numba needs before its first function, except SciPy, whose import takes longer than the rest.
+def leave_out_scipy() -> None:
+    """Let Numba load what it needs before its first function without SciPy, whose import takes longer.
 
     Numba looks for the BLAS of an installed SciPy, which no kernel here uses. Afterwards SciPy can be
     imported, and Numba finds it for functions that need it, such as those of a user's environment.
     """
-    if BLAS in sys.modules:
+    context = cpu_target.target_context
+    if "refresh" in vars(context):
         return
-    sys.modules[BLAS] = None  # type: ignore[assignment]  # makes its import fail, as Python documents it
-    try:
-        cpu_target.target_context.refresh()
-    finally:
-        del sys.modules[BLAS]
+    refresh = context.refresh
+
+    def refresh_without_scipy() -> None:
+        del context.refresh
+        if BLAS in sys.modules:
+            refresh()
+            return
+        sys.modules[BLAS] = None  # type: ignore[assignment]  # makes its import fail, as Python documents it
+        try:
+            refresh()
+        finally:
+            del sys.modules[BLAS]
+
+    context.refresh = refresh_without_scipy
 
 
 class _Announcement(event.Listener):  # type: ignore[misc]  # Numba has no types

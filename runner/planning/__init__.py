@@ -5,6 +5,6 @@ outcome = evaluate_policy(mdp, policy, learners, 0.9)   a policy's results from 
 best_response(mdp, policy, learner, learners, 0.9)      one agent's highest value against the others' policies
 """
 
-from runner.learning.numba_cache import load_without_scipy
+from runner.learning.numba_cache import leave_out_scipy
 
-load_without_scipy()
+leave_out_scipy()

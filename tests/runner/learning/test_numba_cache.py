@@ -28,6 +28,7 @@ def test_scipy_is_left_to_functions_that_need_it():
     program = (
         "import sys, numba, numpy as np\n"
         "from runner.learning import kernel\n"
+        "kernel.fill_random(np.zeros(1), np.uint64(0), 0.0, 1.0)\n"
         "print('scipy.linalg' in sys.modules)\n"
         "print(numba.njit(lambda a: np.linalg.det(a @ a))(np.eye(2)))\n"
     )
