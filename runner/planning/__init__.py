@@ -4,7 +4,3 @@ optimum = optimal_values(mdp, discount)                 the highest value of all
 outcome = evaluate_policy(mdp, policy, learners, 0.9)   a policy's results from every start, without sampling
 best_response(mdp, policy, learner, learners, 0.9)      one agent's highest value against the others' policies
 """
-
-from runner.learning.numba_cache import leave_out_scipy
-
-leave_out_scipy()

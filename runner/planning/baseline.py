@@ -12,7 +12,6 @@ from typing import Final
 from blake3 import blake3
 
 from runner.environments.mdp import Mdp
-from runner.planning.evaluation import evaluate_stochastic_policy, random_policy
 from runner.util.files import cache_folder, read_object, write_object
 from runner.util.values import finite
 
@@ -79,6 +78,8 @@ def _cached(path: Path, mdp: Mdp) -> RandomBaseline:
         )
         if isinstance(length, float) and isinstance(returned, float) and isinstance(finish, float | None):
             return RandomBaseline(math.nan if finish is None else finish, length, returned, mdp.step_limit)
+    from runner.planning.evaluation import evaluate_stochastic_policy, random_policy  # loads Numba
+
     outcome = evaluate_stochastic_policy(mdp, random_policy(mdp), mdp.rewards.shape[-1], discount=1.0)
     baseline = RandomBaseline(
         float(outcome.success_percent),

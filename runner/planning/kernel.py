@@ -8,6 +8,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.learning.numba_cache import leave_out_scipy
+
+leave_out_scipy()
+
 
 class Chain(NamedTuple):
     """The steps of a deterministic policy in a deterministic environment, one for each state, [S] each."""

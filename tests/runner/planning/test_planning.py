@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
-from runner.planning import baseline
+from runner.planning import baseline, evaluation
 from runner.planning.baseline import random_baseline
 from runner.planning.evaluation import evaluate_policy, evaluate_stochastic_policy, random_policy
 from runner.planning.optimum import best_response, best_response_to_stochastic, greedy_policy, optimal_values
@@ -317,5 +317,5 @@ def test_the_random_baseline_is_computed_once_and_a_damaged_cache_is_not_believe
         baseline._remembered.clear()
         assert baseline.random_baseline(mdp) == computed
     baseline._remembered.clear()
-    monkeypatch.setattr(baseline, "evaluate_stochastic_policy", None)
+    monkeypatch.setattr(evaluation, "evaluate_stochastic_policy", None)
     assert baseline.random_baseline(mdp) == computed
