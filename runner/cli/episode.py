@@ -11,10 +11,10 @@ import numpy as np
 from runner.drawing.text import Drawing
 from runner.environments.mdp import events_of
 from runner.environments.naming import actions_in_words, states_in_words
-from runner.export.contents import ENDINGS, Step, ending_of
-from runner.export.pictures import describer
+from runner.export.contents import Step
+from runner.export.pictures import Moment, moments_of
 from runner.export.values import action_in_words, plain_value, value_in_words
-from runner.replay.steps import check_steps, reset_of, transitions_of
+from runner.replay.steps import check_steps, transitions_of
 from runner.util.humanize import number
 from runner.util.jsonable import as_json
 from runner.util.values import Json
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from runner.export.episodes import EpisodePlace
     from runner.export.pictures import Pictures
     from runner.recording.reader import Recording
+    from runner.recording.spaces import Value
 
 _MAX_NUMBERS: Final = 32
 """Larger arrays of an observation are not written out."""
@@ -63,28 +64,17 @@ class Episode:
 
     def frames(self) -> Iterator[Frame]:
         """Yield a frame of the first state, and one after each step, in text alone."""
-        from rich.text import Text
-
-        recording, phase, episode = self._recording, self._phase, self._number
-        show, describe = _state_drawer(recording, phase, episode), describer(recording, phase)
-        returns = np.zeros(len(recording.agents))
-        for t, row in enumerate(transitions_of(recording, phase, episode), 1):
-            if t == 1:
-                yield Frame(self._above(0) + show(row, is_first=True), Text("the start"))
-            action, events = describe(row)
-            rewards = np.asarray(row["rewards"], np.float64)
-            with np.errstate(over="ignore", invalid="ignore"):  # rewards may be infinite
-                returns += rewards
-            ended = ENDINGS[ending_of(recording, phase, episode)] if t == self._length else ""
-            below = _below(action, rewards.tolist(), returns.tolist(), events, ended)
-            yield Frame(self._above(t) + show(row, is_first=False), below)
+        draw = _state_drawer(self._recording)
+        for moment in moments_of(self._recording, self._phase, self._number):
+            yield Frame(self._above(moment.t) + draw(moment.observation), _below(moment))
 
     def illustrated(self, pictures: Pictures) -> Iterator[Frame]:
         """Yield a frame for each picture of the episode."""
         from runner.drawing.raster import image_bytes
 
         for picture in pictures:
-            below = _below(picture.action, picture.rewards, picture.returns, picture.events, picture.ended)
+            below = _below(picture)
+            below.append("" if picture.t else "\n\n")  # as high as those of steps
             if picture.note:
                 below.append(f"\n{picture.note}")
             yield Frame(self._above(picture.t), below, image_bytes(picture.pixels, "png"))
@@ -95,41 +85,31 @@ class Episode:
         return Text.assemble((self._title, "bold"), f"\nstep {t:,} of {self._length:,}\n\n")
 
 
-def _below(action: str, rewards: Sequence[float], returns: Sequence[float], events: str, ended: str) -> Text:
+def _below(moment: Moment) -> Text:
     from rich.text import Text
 
-    if not action:
-        return Text("the start\n\n")
+    if not moment.action:
+        return Text("the start")
     return Text(
-        f"{action}\nreward {_joined(rewards)}, so far {_joined(returns)}\n"
-        + ", ".join(filter(None, [events, ended]))
+        f"{moment.action}\nreward {_joined(moment.rewards)}, so far {_joined(moment.returns)}\n"
+        + ", ".join(filter(None, [moment.events, moment.ended]))
     )
 
 
-def _state_drawer(recording: Recording, phase: str, episode: int) -> Callable[..., Text]:
-    """Return a function that draws the state before or after a step, or puts it into words."""
+def _state_drawer(recording: Recording) -> Callable[[Value | None], Text]:
+    """Return a function that draws the state of an observation, or puts the observation into words."""
     from rich.text import Text
 
     if not recording.tabular:
-        reset = reset_of(recording, phase, episode)
-
-        def words(row: Step, is_first: bool) -> Text:
-            if recording.kind == "step":
-                return Text(f"state {row['state' if is_first else 'next_state']}\n")
-            if not is_first:
-                return Text(f"{value_in_words(row['next_observation'])}\n")
-            first = (
-                "the first observation was lost" if reset is None else value_in_words(reset["observation"])
-            )
-            return Text(f"{first}\n")
-
-        return words
-    mdp = recording.mdp
+        what = "state " if recording.has_states else ""
+        return lambda value: Text(
+            "the first observation was lost\n" if value is None else f"{what}{value_in_words(value)}\n"
+        )
+    mdp, first = recording.mdp, recording.spaces["observation"]["start"]
     names, drawing = states_in_words(mdp), Drawing(mdp.scene) if mdp.scene is not None else None
 
-    def drawn(row: Step, is_first: bool) -> Text:
-        check_steps(np.asarray(row).reshape(1), mdp, str(recording.path), "recorded")
-        state, text = int(row["state" if is_first else "next_state"]), Text()
+    def drawn(value: Value) -> Text:
+        state, text = int(value) - first, Text()
         if drawing is not None and mdp.scene_cells is not None:
             cells = mdp.scene_cells[state]
             carriers = np.full(len(cells), -1) if mdp.scene_carriers is None else mdp.scene_carriers[state]
@@ -171,7 +151,7 @@ def _valued(recording: Recording, phase: str) -> Callable[[Step], dict[str, obje
     }
 
     def describe(row: Step) -> dict[str, object]:
-        if recording.kind == "step":
+        if recording.has_states:
             found: Json = {name: int(row[name]) for name in ("state", "action", "next_state")}
         else:
             found = {name: as_json(plain_value(row[name])) for name in ("action", "next_observation")}

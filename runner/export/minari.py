@@ -165,10 +165,6 @@ def _description(recording: Recording, phase: str) -> dict[str, str]:
 
 
 def _spaces(recording: Recording) -> tuple[object, object]:
-    from gymnasium.spaces import Discrete
-
-    if not recording.has_spaces:
-        return Discrete(recording.mdp.states), Discrete(recording.mdp.joint_actions)
     try:
         return restore_space(recording.spaces["observation"]), restore_space(recording.spaces["action"])
     except (AssertionError, KeyError, TypeError, ValueError, OverflowError) as error:

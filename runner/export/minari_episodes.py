@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.export.contents import Ranges, Step, Steps
+from runner.export.values import observed
 from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.reader import Recording
@@ -52,9 +53,6 @@ def episodes_in(recording: Recording, phase: str, ranges: Ranges) -> Iterator[Ep
 
     An episode of a loop is left out if a repair lost steps of it or the observation of its reset.
     """
-    if not recording.has_spaces:
-        yield from _job_episodes(recording, phase, ranges)
-        return
     lengths: dict[int, int] = {}
     """The lengths of the episodes, by the number of their last step."""
     for start, stop in ranges:
@@ -67,33 +65,17 @@ def episodes_in(recording: Recording, phase: str, ranges: Ranges) -> Iterator[Ep
     for environment, steps in steps_of(recording, phase, lengths):
         seed, first = resets.before(environment, steps)
         resets.keep_last(environment, steps[-1])
-        if lengths.get(int(steps[-1]["step"])) == len(steps):
-            if isinstance(steps, np.ndarray) and recording.kind == "step":
-                yield _discrete_episode(recording, steps, seed)
-            elif first is not None:
-                yield _episode(recording, steps, first, seed)
-
-
-def _job_episodes(recording: Recording, phase: str, ranges: Ranges) -> Iterator[Episode]:
-    for start, stop in ranges:
-        rest = np.empty(0, recording.dtypes[schema.PHASES[phase][0]])
-        for block in recording.blocks_of_episodes(phase, start, stop):
-            steps = np.concatenate([rest, block])
-            ends = np.flatnonzero(steps["terminated"] | steps["truncated"]) + 1
-            *whole, rest = np.split(steps, ends)
-            for episode in whole:
-                states = np.append(episode["state"], episode["next_state"][-1:]).astype(np.int64)
-                actions = episode["action"].astype(np.int64)
-                yield Episode(states, actions, **_outcomes(episode))
+        if first is not None and lengths.get(int(steps[-1]["step"])) == len(steps):
+            yield _episode(recording, steps, first, seed)
 
 
 class _Resets:
     """The seed and the observation that each episode begins with."""
 
     def __init__(self, recording: Recording, phase: str) -> None:
-        self._has_observations = recording.kind != "step"
+        self._recording = recording
         self._environments = recording.environments
-        self._remaining = recording.resets(phase)
+        self._remaining = recording.resets(phase) if recording.has_spaces else iter(())
         self._next = next(self._remaining, None)
         self._read: dict[tuple[int, int], tuple[int | None, Value]] = {}
         """By environment and episode."""
@@ -108,12 +90,14 @@ class _Resets:
             self._read[key] = seed, _copy(reset["observation"])
             self._next = next(self._remaining, None)
         key = environment, int(steps[0]["episode"])
-        return self._read.pop(key, (None, self._last.get(environment)))
+        seed, first = self._read.pop(key, (None, self._last.get(environment)))
+        if self._recording.has_states:
+            first = steps[0]["state"].astype(np.int64) + self._recording.spaces["observation"]["start"]
+        return seed, first
 
     def keep_last(self, environment: int, step: Step) -> None:
         """Keep the last observation of an environment, since an episode may continue after its end."""
-        if self._has_observations:
-            self._last[environment] = _copy(step["next_observation"])
+        self._last[environment] = _copy(observed(self._recording, step))
 
 
 def _copy(value: Value) -> Value:
@@ -168,23 +152,17 @@ def _variable_steps(
             return
 
 
-def _discrete_episode(recording: Recording, steps: Records, seed: int | None) -> Episode:
-    """Return an episode whose observations and actions are numbered from 0 in the recording."""
-    observed, acted = recording.spaces["observation"], recording.spaces["action"]
-    states = np.append(steps["state"], steps["next_state"][-1:]).astype(np.int64)
-    actions = steps["action"].astype(np.int64)
-    return Episode(states + observed["start"], actions + acted["start"], seed=seed, **_outcomes(steps))
-
-
 def _episode(recording: Recording, steps: Steps, first: Value, seed: int | None) -> Episode:
     """Return an episode of its steps and the observation of its reset."""
-    after, actions = _column(steps, "next_observation"), _column(steps, "action")
-    observed, acted = (recording.spaces[name] for name in ("observation", "action"))
+    after, actions = observed(recording, steps), _column(steps, "action")
+    seen, acted = (recording.spaces[name] for name in ("observation", "action"))
+    if recording.has_states:
+        actions = actions.astype(np.int64) + acted["start"]
     if isinstance(after, list):
-        observations, taken = _collected(observed, [first, *after]), _collected(acted, actions)
+        observations, taken = _collected(seen, [first, *after]), _collected(acted, actions)
     else:
         records = np.concatenate([np.array([first], after.dtype), after])
-        observations, taken = _split(observed, records), _split(acted, actions)
+        observations, taken = _split(seen, records), _split(acted, actions)
     return Episode(observations, taken, seed=seed, **_outcomes(steps))
 
 

@@ -18,11 +18,10 @@ from runner.drawing import svg
 from runner.drawing.bars import BarRaster
 from runner.drawing.raster import Pixels, SceneRaster
 from runner.errors import CannotRedo, RecordingError
-from runner.export.values import Values
-from runner.recording import schema
+from runner.export.values import Values, observations_of
 from runner.recording.messages import Message
 from runner.recording.reader import Recording
-from runner.replay.steps import check_steps, recorded_frames, reset_of, transitions_of
+from runner.replay.steps import recorded_frames
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -42,11 +41,10 @@ def paint_scene(recording: Recording, phase: str, episode: int) -> Painted:
     assert drawing is not None
     raster = SceneRaster(drawing, SCENE_SIZE, SCENE_SIZE)
     places: deque[NDArray[np.int16]] = deque(maxlen=svg.TRAIL)
-    for t, row in enumerate(transitions_of(recording, phase, episode)):
-        check_steps(np.asarray(row).reshape(1), mdp, str(recording.path), schema.PHASE_NAMES[phase])
-        for state in (row["next_state"],) if t else (row["state"], row["next_state"]):
-            places.append(drawing.places(mdp, np.array([state]))[0])
-            yield raster.draw(np.stack(places))
+    first = recording.spaces["observation"]["start"]
+    for observation, _ in observations_of(recording, phase, episode):
+        places.append(drawing.places(mdp, np.array([observation]) - first)[0])
+        yield raster.draw(np.stack(places))
 
 
 def paint_recorded(recording: Recording, phase: str, episode: int) -> Painted:
@@ -139,41 +137,28 @@ def redrawn(
 
 
 def paint_observation(recording: Recording, phase: str, episode: int) -> Painted:
-    """Show the image in each observation."""
-    values = Values(recording.spaces["observation"], "observation")
-    reset = reset_of(recording, phase, episode)
-    for t, row in enumerate(transitions_of(recording, phase, episode)):
-        if t == 0:
-            yield values.pixels_in(row["next_observation"] if reset is None else reset["observation"])
-        yield values.pixels_in(row["next_observation"])
+    """Show the image in each observation; if the first was lost, the second in its place."""
+    values, lost = Values(recording.spaces["observation"], "observation"), 0
+    for observation, _ in observations_of(recording, phase, episode):
+        if observation is None:
+            lost = 1
+            continue
+        for _ in range(1 + lost):
+            yield values.pixels_in(observation)
+        lost = 0
 
 
 def paint_values(recording: Recording, phase: str, episode: int) -> Painted:
     """Draw the numbers of each observation and the rewards as bars, each on a scale of its own."""
     learners = recording.agents
-    names = [f"reward {agent}" for agent in learners] if len(learners) > 1 else ["reward"]
-    unpaid = np.full(len(names), np.nan)
-    if recording.kind in ("job", "step"):
-        names = ["state", *names]
+    values = Values(recording.spaces["observation"], "state" if recording.has_states else "observation")
+    names = [*values.names, *([f"reward {agent}" for agent in learners] if len(learners) > 1 else ["reward"])]
+    unknown, unpaid = np.full(len(values.names), np.nan), np.full(len(learners), np.nan)
 
-        def numbers() -> Iterator[NDArray[np.float64]]:
-            for t, row in enumerate(transitions_of(recording, phase, episode)):
-                if t == 0:
-                    yield np.append(row["state"], unpaid)
-                yield np.append(row["next_state"], row["rewards"])
-
-    else:
-        values = Values(recording.spaces["observation"], "observation")
-        reset = reset_of(recording, phase, episode)
-        unknown = np.full(len(values.names), np.nan)
-        names = [*values.names, *names]
-
-        def numbers() -> Iterator[NDArray[np.float64]]:
-            for t, row in enumerate(transitions_of(recording, phase, episode)):
-                if t == 0:
-                    first = unknown if reset is None else values.numbers_in(reset["observation"])
-                    yield np.append(first, unpaid)
-                yield np.append(values.numbers_in(row["next_observation"]), row["rewards"])
+    def numbers() -> Iterator[NDArray[np.float64]]:
+        for observation, step in observations_of(recording, phase, episode):
+            own = unknown if observation is None else values.numbers_in(observation)
+            yield np.append(own, unpaid if step is None else step["rewards"])
 
     low = high = np.zeros(len(names))
     for now in numbers():

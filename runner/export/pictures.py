@@ -34,15 +34,14 @@ from runner.export.painting import (
     paint_scene,
     paint_values,
 )
-from runner.export.values import Values, action_in_words
+from runner.export.values import Values, action_in_words, observations_of, observed
 from runner.recording.reader import Recording
+from runner.recording.spaces import Value
 from runner.replay.makers import why_not_redone
 from runner.replay.steps import (
-    check_steps,
     environment_of,
     environments_with_frames,
     frames_every,
-    transitions_of,
 )
 
 
@@ -61,13 +60,13 @@ class Source(StrEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """What an episode looked like after some of its steps."""
+class Moment:
+    """An episode after some of its steps."""
 
     t: int
     """Steps of the episode so far; 0 after the reset."""
-    pixels: Pixels
-    """uint8 [height, width, 3]; all pictures of an episode have one size."""
+    observation: Value | None
+    """What was observed, numbers where the space is `Discrete`; None if it was lost."""
     action: str
     """The action of the last of these steps, by name where it has one; empty at 0."""
     rewards: tuple[float, ...]
@@ -77,9 +76,35 @@ class Picture:
     events: str
     """What happened in that step: events of the environment, exploration, texts of the observation."""
     ended: str
-    """How the episode ended, as text, in its last picture; else empty."""
+    """How the episode ended, as text, after its last step; else empty."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture(Moment):
+    """What an episode looked like after some of its steps."""
+
+    pixels: Pixels
+    """uint8 [height, width, 3]; all pictures of an episode have one size."""
     note: str = ""
     """Why no picture follows although steps do; else empty."""
+
+
+def moments_of(recording: Recording, phase: str, episode: int) -> Iterator[Moment]:
+    """Yield T + 1 moments of an episode of T steps: after the reset, and after each step."""
+    describe, steps = describer(recording, phase), len(recording.episode_span(phase, episode))
+    returns = np.zeros(len(recording.agents))
+    unpaid = tuple(returns.tolist())
+    for t, (observation, step) in enumerate(observations_of(recording, phase, episode)):
+        if step is None:
+            yield Moment(t, observation, "", unpaid, unpaid, "", "")
+            continue
+        action, events = describe(step)
+        rewards = np.asarray(step["rewards"], np.float64)
+        with np.errstate(over="ignore", invalid="ignore"):  # rewards may be infinite
+            returns += rewards
+        ended = ENDINGS[ending_of(recording, phase, episode)] if t == steps else ""
+        paid, total = tuple(rewards.tolist()), tuple(returns.tolist())
+        yield Moment(t, observation, action, paid, total, events, ended)
 
 
 class Pictures:
@@ -113,25 +138,14 @@ class Pictures:
         self._painted.close()
 
     def _generate(self) -> Generator[Picture, None, None]:
-        recording, phase, episode = self._recording, self._phase, self._episode
-        describe, painted = describer(recording, phase), self._painted
-        returns = np.zeros(len(recording.agents))
-        none = tuple(returns.tolist())
-        pixels = next(painted)
-        yield Picture(0, pixels, "", none, none, "", "")
-        for t, row in enumerate(transitions_of(recording, phase, episode), 1):
+        pixels = next(self._painted)
+        for moment in moments_of(self._recording, self._phase, self._episode):
             note = ""
             try:
-                pixels = next(painted)
+                pixels = next(self._painted) if moment.t else pixels
             except CannotRedo as error:
                 note = str(error)
-            action, events = describe(row)
-            rewards = np.asarray(row["rewards"], np.float64)
-            with np.errstate(over="ignore", invalid="ignore"):  # rewards may be infinite
-                returns += rewards
-            ended = ENDINGS[ending_of(recording, phase, episode)] if t == self.steps else ""
-            paid, total = tuple(rewards.tolist()), tuple(returns.tolist())
-            yield Picture(t, pixels, action, paid, total, events, ended, note)
+            yield Picture(**vars(moment), pixels=pixels, note=note)
             if note:
                 return
 
@@ -177,10 +191,8 @@ def source_of_recorded(recording: Recording, phase: str, episode: int | None) ->
     framed = environments_with_frames(recording, phase)
     if framed and (episode is None or environment_of(recording, phase, episode) in framed):
         return Source.RECORDED
-    if recording.kind in ("transition", "variable"):
-        with_image = Values(recording.spaces["observation"], "observation").image is not None
-        return Source.OBSERVATION if with_image else Source.VALUES
-    return Source.VALUES
+    has_image = Values(recording.spaces["observation"], "observation").image is not None
+    return Source.OBSERVATION if has_image else Source.VALUES
 
 
 _PAINTERS: Final = {
@@ -231,9 +243,7 @@ def describer(recording: Recording, phase: str) -> Callable[[Step], tuple[str, s
         named = agent_actions_in_words(mdp)
 
         def describe(row: Step) -> tuple[str, str]:
-            step = np.asarray(row).reshape(1)
-            check_steps(step, mdp, str(recording.path))
-            events = events_in_words(mdp, int(events_of(mdp, step)[0]))
+            events = events_in_words(mdp, int(events_of(mdp, np.asarray(row).reshape(1))[0]))
             explored = exploration_in_words(int(row["explored"]), learners)
             return named[row["action"]], ", ".join(filter(None, [events, explored]))
 
@@ -247,6 +257,6 @@ def describer(recording: Recording, phase: str) -> Callable[[Step], tuple[str, s
             action = {agent: action[agent] for i, agent in enumerate(agents) if int(row["acted"]) >> i & 1}
         words = in_words(action)
         words = f"action {words}" if words.removeprefix("-").isdecimal() else words
-        return words, "" if recording.kind == "step" else texts.texts_in(row["next_observation"])
+        return words, texts.texts_in(observed(recording, row))
 
     return describe_values

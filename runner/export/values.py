@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.drawing.raster import Pixels
 from runner.environments.naming import spoken
+from runner.export.contents import Step
+from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import Leaf, Value, leaves_of
+from runner.replay.steps import check_steps, reset_of, transitions_of
 
 MAX_NUMBERS: Final = 64
 """Leaves of more numbers are not shown number by number."""
@@ -59,6 +62,37 @@ class Values:
         return np.ascontiguousarray(np.stack([pixels] * 3, axis=-1) if pixels.ndim == 2 else pixels)
 
 
+def observed(recording: Recording, steps: Any) -> Value:
+    """Return the observation after a step, or those after steps; numbers where the space is `Discrete`."""
+    if recording.has_states:
+        return steps["next_state"].astype(np.int64) + recording.spaces["observation"]["start"]
+    return (
+        [each["next_observation"] for each in steps] if isinstance(steps, list) else steps["next_observation"]
+    )
+
+
+def observations_of(
+    recording: Recording, phase: str, episode: int
+) -> Iterator[tuple[Value | None, Step | None]]:
+    """Yield the observation before an episode, without a step, then each step's with the step.
+
+    The first one is None if it was lost.
+
+    Raises:
+        RecordingError: there is no such episode, or a step has a state that the environment does not have.
+    """
+    for t, step in enumerate(transitions_of(recording, phase, episode)):
+        if recording.tabular:
+            where, name = str(recording.path), schema.PHASE_NAMES[phase]
+            check_steps(np.asarray(step).reshape(1), recording.mdp, where, name)
+        if t == 0 and recording.has_states:
+            yield step["state"].astype(np.int64) + recording.spaces["observation"]["start"], None
+        elif t == 0:
+            reset = reset_of(recording, phase, episode)
+            yield None if reset is None else reset["observation"], None
+        yield observed(recording, step), step
+
+
 def value_in_words(value: object, limit: int = FEW) -> str:
     """Return a value of any space as text on one line: `3`, `[0.12 -0.5]`, `go 3, push [0.5]`.
 
@@ -92,11 +126,11 @@ def action_in_words(recording: Recording, phase: str, agent: str = "") -> Callab
     space = recording.spaces["action"]
     start = (space["spaces"][agent] if agent else space).get("start")
     least = start if isinstance(start, int) else 0
-    recorded_from = 0 if recording.kind == "step" else least
+    recorded_from = 0 if recording.has_states else least
     names = [spoken(name) for name in recording.action_names(phase, agent)]
 
     def in_words(action: Value) -> str:
-        if not names and recording.kind != "step":
+        if not names and not recording.has_states:
             return value_in_words(action)
         index = int(action) - recorded_from
         return names[index] if 0 <= index < len(names) else str(index + least)

@@ -287,17 +287,26 @@ class RunDescription(ABC):
     @property
     def tabular(self) -> bool:
         """Whether the environment's arrays are there, so that it has an `mdp`."""
-        return self.kind in ("job", "step") and bool(self.environment["arrays"])
+        return self.has_states and bool(self.environment["arrays"])
 
     @cached_property
     def mdp(self) -> Mdp:
         """The environment: arrays, agents, events, scene."""
         return environment_of(self.environment, self.attachment, str(self.path))
 
+    @property
+    def has_states(self) -> bool:
+        """Whether its steps have states and actions by number, from 0; else values of the spaces."""
+        return self.kind in ("job", "step")
+
     @cached_property
     def spaces(self) -> Json:
-        """The descriptions of the `observation` and the `action` space of a loop's recording."""
-        return spaces_of(self.run, str(self.path))
+        """The descriptions of the `observation` and the `action` space; of a job those of its tables."""
+        if self.has_spaces:
+            return spaces_of(self.run, str(self.path))
+        number = {"type": "Discrete", "start": 0, "dtype": "<i8", "shape": []}
+        sizes = {"observation": self.mdp.states, "action": self.mdp.joint_actions}
+        return {name: number | {"n": n} for name, n in sizes.items()}
 
     @property
     def environments(self) -> int:

@@ -29,7 +29,7 @@ from runner.export.reports.player_data import (
     short_rows,
     words,
 )
-from runner.export.values import action_in_words, is_image, names_in, number_names
+from runner.export.values import action_in_words, is_image, names_in, number_names, observed
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, leaves_of
@@ -80,12 +80,12 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
     if not 0 <= first < len(span):
         raise no_step(recording, place.title, len(span), first)
     part = span[first : first + limit]
-    observed, notes = _shown_parts(recording)
+    parts, notes = _shown_parts(recording)
     in_words = _actions_in_words(recording, place.phase)
     before = np.zeros(len(recording.agents))
     rewards, log_times = [np.empty((0, len(before)))], [np.empty(0, np.int64)]
     actions: dict[str, list[str]] = {agent: [] for agent in in_words}
-    observations = [_observations_before(recording, place, span, first, observed)]
+    observations = [_observations_before(recording, place, span, first, parts)]
     for steps in _steps(recording, place, range(span.start, part[-1] + 1, span.step)):
         paid = np.array([step["rewards"] for step in steps], np.float64)
         earlier = int(np.searchsorted([step["step"] for step in steps], part.start))
@@ -96,7 +96,7 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
             log_times.append(np.array([step["log_time"] for step in shown], np.int64))
             for agent, text_of in in_words.items():
                 actions[agent] += [shortened(text_of(step), _MAX_LETTERS) for step in shown]
-            observations.append(_observations(recording, shown, observed))
+            observations.append(_observations(recording, shown, parts))
     reward, time = np.concatenate(rewards), np.concatenate(log_times)
     if len(reward) != len(part):
         raise RecordingError(f"{recording.path}: steps of this part of the episode were lost.")
@@ -107,7 +107,7 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
         total = float(recording.episodes(place.phase, place.number, place.number + 1)["returns"].sum())
     elif first + limit >= len(span):
         total = float(before.sum() + reward.sum())
-    texts, series = _frames(observed, observations)
+    texts, series = _frames(parts, observations)
     title = place.title[0].upper() + place.title[1:]
     return Playback(
         title=title if span.step == 1 else f"{title}, in environment {span.start % span.step}",
@@ -159,30 +159,24 @@ def _actions_in_words(recording: Recording, phase: str) -> dict[str, Callable[[S
 
 
 def _observations_before(
-    recording: Recording, place: EpisodePlace, span: range, first: int, observed: Sequence[_ShownPart]
+    recording: Recording, place: EpisodePlace, span: range, first: int, parts: Sequence[_ShownPart]
 ) -> list[Column]:
     """Return the observation before a step of an episode, as columns of one value; empty if unknown."""
     if first:
         number = span[first - 1]
         steps = next(_steps(recording, place, range(number, number + 1, span.step)), [])
-        return _observations(recording, steps, observed) if len(steps) else []
+        return _observations(recording, steps, parts) if len(steps) else []
     reset = reset_of(recording, place.phase, place.number)
     if reset is None:
         return []
     value = reset["observation"]
-    return [part.column([value] if recording.kind == "variable" else np.array([value])) for part in observed]
+    return [part.column([value] if recording.kind == "variable" else np.array([value])) for part in parts]
 
 
-def _observations(recording: Recording, steps: Steps, observed: Sequence[_ShownPart]) -> list[Column]:
+def _observations(recording: Recording, steps: Steps, parts: Sequence[_ShownPart]) -> list[Column]:
     """Return what is shown of the observations after steps, as columns."""
-    after: Values
-    if isinstance(steps, list):
-        after = [step["next_observation"] for step in steps]
-    elif recording.kind == "step":
-        after = steps["next_state"].astype(np.int64) + recording.spaces["observation"]["start"]
-    else:
-        after = steps["next_observation"]
-    return [part.column(after) for part in observed]
+    after = observed(recording, steps)
+    return [part.column(after) for part in parts]
 
 
 def _extras(recording: Recording, phase: str, part: range, notes: list[str]) -> list[Series]:
