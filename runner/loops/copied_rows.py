@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -16,9 +15,9 @@ from runner.loops.extras import TOPICS, begin_layout
 from runner.loops.rows import Rows
 from runner.loops.shard_sources import PHASES, Source
 from runner.loops.single_rows import VariableRows
-from runner.recording import schema
+from runner.recording.episode_log import Flags
 from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAME_LENGTH, MAX_NAMES, ExtraLayout
-from runner.recording.messages import Message, encode
+from runner.recording.messages import Message
 from runner.recording.recorder import Recorder
 from runner.util.arrays import Ints
 
@@ -49,7 +48,7 @@ class _Copies(Rows):
     @property
     def begun(self) -> int:
         """The number of the episode that began last; -1 before any."""
-        return self._episode + len(self._begins)
+        return self._begun - 1
 
 
 class CopiedRows(_Copies):
@@ -62,34 +61,15 @@ class CopiedRows(_Copies):
 
     def put(self, rows: NDArray[np.void]) -> None:
         """Copy consecutive steps of the environment that was reset last."""
-        edges = [0, *np.flatnonzero(rows["t"] == 0).tolist(), len(rows)]
-        for begin, end in pairwise(edges):
-            done = begin
-            while done < end:
-                part = rows[done : min(end, done + self._room - self.filled)]
-                self._put_part(part)
-                done += len(part)
-                if self.filled == self._room or len(self._ends) >= self._episode_room:
-                    self.commit()
-                    self.open()
-
-    def _put_part(self, part: NDArray[np.void]) -> None:
-        """Copy steps of one episode, for which there is room."""
-        at = self.filled
-        rewards, is_first = np.asarray(part["rewards"]), part["t"][0] == 0
-        if is_first:
-            if not self._fresh:  # a game that ended without the end of any agent
-                self._end(at - 1, False, False)
-            self._begins.append(at)
-            self._fresh = False
-        else:
-            rewards = np.concatenate([np.reshape(self._return, (1, -1)), rewards])
-        self._return = np.add.accumulate(rewards, axis=0)[-1]
-        self.filled = at + len(part)
-        for name in self._fields:
-            self._block[name][at : self.filled] = part[name]
-        if part["terminated"][-1] or part["truncated"][-1]:
-            self._end(self.filled - 1, bool(part["terminated"][-1]), bool(part["truncated"][-1]))
+        while len(rows):
+            part, rows = np.split(rows, [self._room - self.filled])
+            at, self.filled = self.filled, self.filled + len(part)
+            for name in self._fields:
+                self._block[name][at : self.filled] = part[name]
+            self._begun += int(np.count_nonzero(part["t"] == 0))
+            if self.filled == self._room:
+                self.commit()
+                self.open()
 
     def _open_steps(self) -> tuple[int, int]:
         self._block = self._recorder.block(self._steps)
@@ -99,8 +79,12 @@ class CopiedRows(_Copies):
     def _put_reset(self, observation: object, seed: int | None) -> None:  # noqa: ARG002
         self._reset_block["observation"][len(self._reset_rows)] = observation
 
-    def _rewards(self, n: int) -> NDArray[np.float64]:
-        return np.asarray(self._block["rewards"][:n, 0])
+    def _outcomes(self, n: int) -> tuple[NDArray[np.void], Flags | bool]:
+        return self._block[:n], False
+
+    def _begins(self, n: int) -> Flags:
+        """Return where an episode begins, also after a game that ended without the end of any agent."""
+        return np.asarray(self._block["t"][:n] == 0)
 
     def _transitions(self, n: int) -> tuple[Ints, Ints, Ints]:
         if "state" not in self._fields:
@@ -120,26 +104,17 @@ class CopiedMessages(_Copies, VariableRows):
 
     def put_reset(self, reset: Message, environment: int) -> None:
         """Copy a reset."""
-        fields = {"reset": self.resets, "episode": self.begun + 1, "step": self.place[0]}
-        fields |= {"environment": environment}
-        position = sum(self._recorder.steps.values()) + self.filled
-        seed = int(reset["seed"]) if reset["seeded"] else None
-        self._recorder.append(self._resets, encode(schema.RESET, _payload(reset) | fields), position)
-        self.reset(None, seed)
+        self._fresh = True
+        self._put_reset_message(_payload(reset) | {"environment": environment})
+        self.reset(None, int(reset["seed"]) if reset["seeded"] else None)
 
     def put(self, rows: Sequence[Message]) -> None:
         """Copy consecutive steps of the environment that was reset last."""
         for row in rows:
-            is_first = row["t"] == 0
-            episode = self.begun + is_first
-            position = sum(self._recorder.steps.values()) + self.filled + 1
-            fields = {"step": self.place[0], "episode": episode}
-            self._recorder.append(self._steps, encode(schema.TRANSITION, _payload(row) | fields), position)
-            self._paid[self.filled] = row["rewards"][0]
-            self._count(row["rewards"][0], row["terminated"], row["truncated"])
+            self._put_message(_payload(row))
 
-    def _put_reset(self, observation: object, seed: int | None) -> None:  # noqa: ARG002
-        self._reset_count += 1
+    def _put_reset(self, observation: object, seed: int | None) -> None:
+        """Do nothing: the message is recorded."""
 
 
 def _payload(message: Mapping[str, object]) -> dict[str, object]:

@@ -14,16 +14,17 @@ from runner.loops.description import Described
 from runner.loops.rows import Rows
 from runner.loops.values import lone_number, require_reset, warn_user, whole_number
 from runner.recording import schema
+from runner.recording.episode_log import Flags
 from runner.recording.gym_values import filler, filler_by_agent, leaves_by_agent, value_bytes
 from runner.recording.messages import encode
 from runner.util.arrays import Ints
 
 _DISCRETE: Final = struct.Struct("<qqd??")
 _DISCRETE_DTYPE: Final = np.dtype(
-    [("action", "<i8"), ("next_state", "<i8"), ("reward", "<f8"), ("terminated", "?"), ("truncated", "?")]
+    [("action", "<i8"), ("next_state", "<i8"), ("rewards", "<f8"), ("terminated", "?"), ("truncated", "?")]
 )
 _ENDING: Final = struct.Struct("<d??")
-_ENDING_DTYPE: Final = np.dtype([("reward", "<f8"), ("terminated", "?"), ("truncated", "?")])
+_ENDING_DTYPE: Final = np.dtype([("rewards", "<f8"), ("terminated", "?"), ("truncated", "?")])
 _VARIABLE_ROWS: Final = 4096
 _MAX_STATE: Final = 2**32 - 1
 
@@ -44,12 +45,9 @@ class BlockRows(Rows):
             self._bytes = self._scratch.view(np.uint8).data
         return room, len(self._reset_block)
 
-    def _rewards(self, n: int) -> NDArray[np.float64]:
-        return self._scratch["reward"][:n]
-
     def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
         block, rows = self._block[:n], self._scratch[:n]
-        block["rewards"] = rows["reward"].reshape(n, -1)
+        block["rewards"] = rows["rewards"].reshape(n, -1)
         block["terminated"], block["truncated"] = rows["terminated"], rows["truncated"]
         block["step"] = self._recorder.steps[self._phase] + np.arange(n)
         block["episode"] = episode
@@ -94,7 +92,7 @@ class DiscreteRows(BlockRows):
         except (struct.error, TypeError):
             action, observation = whole_number(action, "action"), whole_number(observation, "observation")
             _DISCRETE.pack_into(self._bytes, at, action, observation, reward, terminated, truncated)
-        self._count(reward, terminated, truncated)
+        self._count(terminated or truncated)
 
     def _put_reset(self, observation: object, seed: int | None) -> None:  # noqa: ARG002
         self._reset_column[len(self._reset_rows)] = whole_number(observation, "observation")
@@ -166,7 +164,7 @@ class ArrayRows(BlockRows):
         self._action(row, action)
         self._next(row, observation)
         _ENDING.pack_into(self._bytes, row * 10, reward, terminated, truncated)
-        self._count(reward, terminated, truncated)
+        self._count(terminated or truncated)
 
     def _put_reset(self, observation: object, seed: int | None) -> None:  # noqa: ARG002
         self._first(len(self._reset_rows), observation)
@@ -186,12 +184,15 @@ class AgentRows(BlockRows):
     @property
     def place(self) -> tuple[int, int]:
         """The steps of the phase so far, and the number of episodes that have ended."""
-        return super().place[0], self._ended + len(self._ends)
+        return super().place[0], self._begun - (not self._fresh)
 
     def _set_leaves(self, described: Described) -> None:
         self._agents = described.agents
         self._scratch_dtype = np.dtype(
-            [("reward", "<f8", (len(self._agents),)), ("terminated", "?"), ("truncated", "?")]
+            [
+                ("rewards", "<f8", (len(self._agents),)),
+                *((name, "?") for name in ("terminated", "truncated", "over")),
+            ]
         )
         self._own_observations = leaves_by_agent(described.observation, "observation", warn_user)
         self._own_actions = leaves_by_agent(described.recorded_action, "action", warn_user)
@@ -225,10 +226,11 @@ class AgentRows(BlockRows):
         self._block["agents_truncated"][row] = self._mask(truncated)
         paid = np.array([float(rewards.get(agent, 0.0)) for agent in self._agents])
         endings = [over and any(flags.values()) for flags in (terminated, truncated)]
-        self._scratch[row] = (paid, *endings)
-        self._count(paid, *endings)
-        if over and not self._fresh:  # no agent is left, and none was terminated or truncated
-            self._end(self.filled - 1, False, False)
+        self._scratch[row] = (paid, *endings, over)
+        self._count(over)
+
+    def _outcomes(self, n: int) -> tuple[NDArray[np.void], Flags | bool]:
+        return self._scratch[:n], self._scratch["over"][:n, np.newaxis]
 
     def _put_reset(self, observation: Any, seed: int | None) -> None:  # noqa: ARG002
         self._first(len(self._reset_rows), observation)
@@ -241,19 +243,17 @@ class VariableRows(Rows):
     """Rows of `dualtaxi.Transition` where a space has texts: each message is made when it comes."""
 
     _is_settled = False
+    _t = 0
+    """Steps of the episode in progress before its last one."""
 
     def _open_steps(self) -> tuple[int, int]:
-        self._paid = np.zeros(_VARIABLE_ROWS)
+        self._scratch = np.zeros(_VARIABLE_ROWS, _ENDING_DTYPE)
         return _VARIABLE_ROWS, _VARIABLE_ROWS
 
     @property
-    def resets(self) -> int:
-        """The number of resets so far."""
-        return self._reset_count
-
-    @property
-    def _coming_episode(self) -> int:
-        return self._episode + len(self._begins) + self._fresh
+    def _episode(self) -> int:
+        """The number of the episode of the next step."""
+        return self._begun - (not self._fresh)
 
     def take(
         self,
@@ -264,50 +264,47 @@ class VariableRows(Rows):
         truncated: object,
     ) -> None:
         """Put down a step."""
-        row, reward = self.filled, lone_number(reward, "reward")
+        reward = lone_number(reward, "reward")
         require_reset(self.resets, self._phase)
         if not self._is_settled:
             self._is_settled = True
             self._first_action(action)
-        began = row if self._fresh else self._begins[-1] if self._begins else -self._t
         fields = {
             "action": value_bytes(self._action_leaves, action),
             "next_observation": value_bytes(self._observation_leaves, observation),
             "rewards": [reward],
-            "step": self.place[0],
-            "episode": self._coming_episode,
-            "t": row - began,
+            "t": 0 if self._fresh else self._t + 1,
             "terminated": bool(terminated),
             "truncated": bool(truncated),
             "acted": 1,
             "agents_terminated": int(bool(terminated)),
             "agents_truncated": int(bool(truncated)),
         }
-        position = sum(self._recorder.steps.values()) + row + 1
+        self._put_message(fields)
+
+    def _put_message(self, fields: dict[str, Any]) -> None:
+        """Record a step, given by its fields but its number and that of its episode."""
+        fields |= {"step": self.place[0], "episode": self._episode}
+        position = sum(self._recorder.steps.values()) + self.filled + 1
         self._recorder.append(self._steps, encode(schema.TRANSITION, fields), position)
-        self._paid[row] = reward
-        self._count(reward, terminated, truncated)
+        self._t, ends = fields["t"], (fields["terminated"], fields["truncated"])
+        self._scratch[self.filled] = (fields["rewards"][0], *ends)
+        self._count(any(ends))
 
     def _put_reset(self, observation: object, seed: int | None) -> None:
-        fields = {
-            "observation": value_bytes(self._observation_leaves, observation),
-            "reset": self._reset_count,
-            "episode": self._coming_episode,
-            "step": self.place[0],
-            "seed": seed or 0,
-            "seeded": seed is not None,
-        }
+        fields = {"seed": seed or 0, "seeded": seed is not None}
+        self._put_reset_message(fields | {"observation": value_bytes(self._observation_leaves, observation)})
+
+    def _put_reset_message(self, fields: dict[str, Any]) -> None:
+        """Record a reset, given by its fields but the numbers of reset, episode and step."""
+        fields |= {"reset": self.resets, "episode": self._episode, "step": self.place[0]}
         position = sum(self._recorder.steps.values()) + self.filled
         self._recorder.append(self._resets, encode(schema.RESET, fields), position)
-        self._reset_count += 1
-
-    def _rewards(self, n: int) -> NDArray[np.float64]:
-        return self._paid[:n]
 
     def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
         """Do nothing: the messages are complete."""
 
-    def _finish_resets(self, begins: Ints, before: int) -> None:
+    def _finish_resets(self, episode: Ints, step: Ints, other: int) -> None:
         """Do nothing: the messages are complete."""
 
 

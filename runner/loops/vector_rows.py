@@ -7,7 +7,7 @@ episodes, the resets that environments do by themselves) is computed for a block
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -356,12 +356,10 @@ class VectorRows:
                 self._recorder.append(self._reset_states, payload, other + int(steps[k]))
         self._reset_count += len(which)
 
-    def _record(self, topic: Topic, columns: Mapping[str, Array], steps: Array) -> None:
+    def _record(self, topic: Topic, columns: Columns, steps: Array) -> None:
         """Hand records, given by field, to the recorder; `steps` are the steps of the phase at each."""
         other = sum(self._recorder.steps.values()) - self._recorder.steps[self._phase]
-        for block, part in self._recorder.fill(topic, (steps + other).astype(np.uint64)):
-            for name, values in columns.items():
-                block[name] = values[part]
+        self._recorder.put(topic, columns, steps + other)
 
 
 PhaseRows = Rows | VectorRows

@@ -27,7 +27,7 @@ from runner.recording.reuse import PackedChunks
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.topic_chunks import ChunkSpan
 from runner.recording.writer import RecordingFile
-from runner.util.arrays import Records
+from runner.util.arrays import Array, Records
 from runner.util.packing import Packing
 
 FLUSH_SECONDS: Final = 0.5
@@ -191,6 +191,12 @@ class Recorder:
             yield block, part
             self.take(topic, positions[part])
             done = part.stop
+
+    def put(self, topic: Topic, columns: Mapping[str, Array], positions: Array) -> None:
+        """Record messages of a fixed-width topic, given by field; `positions` are as for `take`."""
+        for block, part in self.fill(topic, positions.astype(np.uint64)):
+            for name, values in columns.items():
+                block[name] = values[part]
 
     def capacity(self, topic: Topic) -> int:
         """Return how many records a whole block of a fixed-width topic has."""
