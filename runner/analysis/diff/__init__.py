@@ -175,7 +175,7 @@ def _diff_loops(difference: RunDiff, a: Recording, b: Recording) -> RunDiff:
     if not have_same_spaces(a, b):
         notes.append("the environments have other spaces: no steps are compared")
     elif not difference.same_content:
-        notes += _left_out(a, b)
+        notes += [_left_out(name, one) for name, one in (("A", a), ("B", b)) if one.leaves_out_steps]
         train, evaluation = (loop_divergence(a, b, phase) for phase in ("train", "eval"))
         digests = [recording.result.topic_digests for recording in (a, b)]
         if train is evaluation is None and all(digests):
@@ -193,20 +193,14 @@ def _diff_loops(difference: RunDiff, a: Recording, b: Recording) -> RunDiff:
     return replace(difference, divergence=train, evaluation_divergence=evaluation, notes=notes)
 
 
-def _left_out(a: Recording, b: Recording) -> list[str]:
-    """Return what recordings of loops left out of their steps, and what is compared instead."""
-    notes = []
-    for name, one in (("A", a), ("B", b)):
-        if not one.leaves_out_steps:
-            continue
-        again = f"`dualtaxi rerecord {one.run_id}` records them"
-        if one.has_actions:
-            notes.append(f"{name} holds the actions of its steps alone, which are compared; {again} whole")
-        elif one.can_train_again:
-            notes.append(f"{name} holds no steps, so none are compared; {again}")
-        else:
-            notes.append(f"{name} holds neither steps nor actions, so none are compared")
-    return notes
+def _left_out(name: str, recording: Recording) -> str:
+    """Return what a recording left out of its steps, and what is compared instead."""
+    again = f"`dualtaxi rerecord {recording.run_id}` records them"
+    if recording.has_actions:
+        return f"{name} holds the actions of its steps alone, which are compared; {again} whole"
+    if recording.can_train_again:
+        return f"{name} holds no steps, so none are compared; {again}"
+    return f"{name} holds neither steps nor actions, so none are compared"
 
 
 def with_seconds(difference: RunDiff, a: Run, b: Run) -> RunDiff:
@@ -314,8 +308,7 @@ def _notes(a: Recording, b: Recording) -> list[str]:
         if recording.status != "finished":
             notes.append(f"{name} is not finished: compared as far as it got")
         if recording.leaves_out_steps:
-            again = f"`dualtaxi rerecord {recording.run_id}` records them"
-            notes.append(f"{name} holds no steps, so no trajectory is compared; {again}")
+            notes.append(_left_out(name, recording))
         elif not recording.count(schema.TRAIN_STEP):
             notes.append(f"{name} has no training steps, so no trajectory of training is compared")
         whole = unbroken(recording)[0]

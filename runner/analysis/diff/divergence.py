@@ -18,11 +18,9 @@ from numpy.typing import NDArray
 from runner.analysis.evaluations import evaluations_of
 from runner.analysis.step_reference import StepRef
 from runner.recording import schema
-from runner.recording.actions import kept_dtype
 from runner.recording.blocks import HEADER_BYTES
-from runner.recording.messages import decode
 from runner.recording.reader import Recording
-from runner.recording.spaces import Value
+from runner.recording.spaces import Value, decode
 from runner.replay.steps import episode_blocks
 from runner.runs.branches import BranchOrigin
 from runner.util.arrays import Array
@@ -109,7 +107,7 @@ def first_difference(
 
 def differing_rows(a: Block, b: Block, fields: tuple[str, ...] = FIELDS) -> NDArray[np.bool_]:
     """Return which of two equally long blocks of records differ in any of the fields."""
-    if a.dtype == b.dtype and "digest" not in (a.dtype.names or ()):
+    if a.dtype == b.dtype and not a.dtype.hasobject and "digest" not in (a.dtype.names or ()):
         left, right = (
             np.ascontiguousarray(block).view(np.uint8).reshape(-1, block.itemsize) for block in (a, b)
         )
@@ -214,6 +212,8 @@ def _divergence(
 
 def _differing_part(name: str, a: Value, b: Value) -> tuple[str, Value, Value]:
     """Return the first part of a value that differs: of a Dict its entry, of many numbers one of them."""
+    if isinstance(a, bytes):
+        return name, a, b
     for entry in a.dtype.names or ():
         if a[entry].tobytes() != b[entry].tobytes():
             return _differing_part(f"{name}.{entry}", a[entry], b[entry])
@@ -258,29 +258,29 @@ def loop_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None
 
 def _first_in_phase(a: Recording, b: Recording, phase: str) -> Divergence | None:
     """Return the same; the number of a trial is that among all evaluations."""
-    topics = [recording.topic(f"/{phase}/step") for recording in (a, b)]
-    if topics[0] not in a.dtypes:
-        return _message_divergence(a, b, phase)
-    alone = [recording.has_actions_alone(phase) for recording in (a, b)]
-    is_tabular = a.kind in ("job", "step")
-    fields = FIELDS if is_tabular else _TRANSITION_FIELDS
-    if any(alone):
-        dtypes = [recording.dtypes[topic] for recording, topic in zip((a, b), topics, strict=True)]
-        names = set.intersection(*(set(kept_dtype(dtype).names or ()) for dtype in dtypes))
-        digest = ("digest",) if all(alone) else ()
-        fields = (*(name for name in _TRANSITION_FIELDS if name in names), *digest)
-    streams = [
-        recording.actions(phase) if is_alone else recording.blocks(topic)
-        for recording, topic, is_alone in zip((a, b), topics, alone, strict=True)
-    ]
-    found = _divergence(phase, first_difference(streams[0], streams[1], fields), fields)
+    name, is_tabular = f"/{phase}/step", a.has_states
+    alone = [one.has_actions_alone(phase) for one in (a, b)]
+    known = set.intersection(*(set(one.row_dtype(name).names or ()) for one in (a, b)))
+    digest = ("digest",) if all(alone) else ()
+    fields = (*(each for each in (FIELDS if is_tabular else _TRANSITION_FIELDS) if each in known), *digest)
+    found = _divergence(phase, first_difference(a.rows(name), b.rows(name), fields), fields)
     if not is_tabular:  # else a step has the state before it
         found = _reset_divergence(a, b, phase, math.inf if found is None else found.step) or found
-    if found is None or not any(alone):
-        return found
-    if found.field == "digest":
-        found = replace(found, a=found.a.hex(), b=found.b.hex())
-    return replace(found, a_step=None, b_step=None, actions_alone=True)
+    if found is None:
+        return None
+    if isinstance(found.a, bytes):
+        found = replace(found, a=_legible(a, found.field, found.a), b=_legible(b, found.field, found.b))
+    if any(alone) or a.kind == "variable":
+        found = replace(found, a_step=None, b_step=None, actions_alone=any(alone))
+    return found
+
+
+def _legible(recording: Recording, field: str, value: bytes) -> str:
+    """Return a digest, or a value of varying size, as text."""
+    if field == "digest":
+        return value.hex()
+    space = "action" if field == "action" else "observation"
+    return str(decode(recording.spaces[space], value, str(recording.path)))
 
 
 def branch_divergence(a: Recording, b: Recording, origin: BranchOrigin) -> Divergence | None:
@@ -302,7 +302,7 @@ def branch_divergence(a: Recording, b: Recording, origin: BranchOrigin) -> Diver
 def _reset_divergence(a: Recording, b: Recording, phase: str, last: float) -> Divergence | None:
     """Return where what a reset observed differs, if that is before the end of the step `last`."""
     streams = [
-        itertools.takewhile(lambda block: block["step"][0] <= last, one.blocks(one.topic(f"/{phase}/reset")))
+        itertools.takewhile(lambda block: block["step"][0] <= last, one.rows(f"/{phase}/reset"))
         for one in (a, b)
     ]
     _, left, right = first_difference(streams[0], streams[1], ("observation",)) or (0, None, None)
@@ -310,18 +310,3 @@ def _reset_divergence(a: Recording, b: Recording, phase: str, last: float) -> Di
         return None
     part = _differing_part("reset.observation", left["observation"][0], right["observation"][0])
     return Divergence(phase, int(left["step"][0]), int(left["episode"][0]), 0, *part)
-
-
-def _message_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None:
-    """Return where loops diverge whose steps vary in size."""
-    streams = [recording.messages(recording.topic(f"/{phase}/step")) for recording in (a, b)]
-    for position, pair in enumerate(itertools.zip_longest(*streams)):
-        if None not in pair and pair[0][1] == pair[1][1]:
-            continue
-        steps = [{} if one is None else decode(schema.TRANSITION, one[1]) for one in pair]
-        some = steps[0] or steps[1]
-        names = [name for name in some if steps[0].get(name) != steps[1].get(name)]
-        name = names[0] if all(steps) and names else "step"
-        x, y = (str(step.get(name, "none")) for step in steps)
-        return Divergence(phase, position, some["episode"], some["t"], name, x, y)
-    return None

@@ -163,11 +163,10 @@ def _environment(difference: RunDiff) -> Section:
 def _training(difference: RunDiff) -> Section:
     overlap, divergence, cause = difference.overlap, difference.divergence, difference.cause
     sentences, grids = [], []
-    if divergence is not None and cause is not None:
-        sentences += [f"They diverge {where_in_words(divergence)}: {cause.text}.", *updates_in_words(cause)]
+    if divergence is not None:
+        sentences.append(divergence_in_words(divergence, cause))
+        sentences += updates_in_words(cause)
         grids += _q_rows(cause)
-    elif divergence is not None:
-        sentences.append(": ".join(loop_divergence_in_words(divergence)) + ".")
     elif overlap is not None:
         sentences.append("Training is the same, step by step.")
     if divergence is not None:
@@ -207,58 +206,58 @@ def _evaluation(difference: RunDiff) -> Section:
     divergence, cause = difference.evaluation_divergence, difference.evaluation_cause
     if divergence is None:
         return Section("Evaluation")
-    if cause is None:
-        return Section("Evaluation", [": ".join(loop_divergence_in_words(divergence)) + "."])
-    where = f"They diverge {where_in_words(divergence)}: {cause.text}."
+    where = divergence_in_words(divergence, cause)
     return Section("Evaluation", [where, *evaluation_updates(difference, cause)], _q_rows(cause))
 
 
-def loop_divergence_in_words(divergence: Divergence) -> tuple[str, str]:
-    """Return where two loops diverge, and the values that differ there: sentences without full stops."""
-    phase = "training" if divergence.phase == "train" else "evaluation"
-    episode = f"episode {divergence.episode:,}"
-    if divergence.after is not None:
-        episode = f"trial {divergence.episode:,} after {divergence.after:,} training episodes"
-    where = f"at {phase} step {divergence.step:,}, of {episode} at time {divergence.t:,}"
+def divergence_in_words(divergence: Divergence, cause: Cause | None) -> str:
+    """Return where two runs diverge and why, as far as that is known, in a sentence."""
+    return f"They diverge {where_in_words(divergence)}: {why_in_words(divergence, cause)}."
+
+
+def why_in_words(divergence: Divergence, cause: Cause | None) -> str:
+    """Return the cause of a divergence; where how they learn is not known, the values that differ."""
+    if cause is not None:
+        return cause.text
     if divergence.field == "digest":
-        where = f"in {phase}, {episode}, at step {divergence.step:,} at the latest"
-        return f"They diverge {where}", "the actions are the same, but observations or rewards differ"
+        return "the actions are the same, but observations or rewards differ"
     if divergence.field == "step":
         has, lacks = ("A", "B") if divergence.b == "none" else ("B", "A")
-        return f"They diverge {where}", f"{has} has that step, {lacks} ended before it"
-    field = divergence.field.removeprefix("reset.")
-    if field != divergence.field:
-        where = f"in the reset before {phase} step {divergence.step:,}, of {episode}"
-    values = f"{_text(divergence.a)} in A, {_text(divergence.b)} in B"
-    return f"They diverge {where}", f"{spoken(field)} is {values}"
+        return f"{has} has that step, {lacks} ended before it"
+    name = spoken(divergence.field.removeprefix("reset."))
+    return f"{name} is {_text(divergence.a)} in A, {_text(divergence.b)} in B"
 
 
-def evaluation_updates(difference: RunDiff, cause: Cause) -> list[str]:
+def evaluation_updates(difference: RunDiff, cause: Cause | None) -> list[str]:
     """Return how the tables came to differ that an evaluation used, in a sentence or two."""
     known = difference.cause
-    if known is not None and known.update is not None and known.update == cause.update:
-        return ["The tables came to differ by the same update as above."]
-    if cause.kind == "greedy_action" and cause.update is None and known is not None:
-        return ["Training had diverged before, so the tables are not the same."]
+    if cause is not None and known is not None:
+        if known.update is not None and known.update == cause.update:
+            return ["The tables came to differ by the same update as above."]
+        if cause.kind == "greedy_action" and cause.update is None:
+            return ["Training had diverged before, so the tables are not the same."]
     return updates_in_words(cause)
 
 
 def where_in_words(divergence: Divergence) -> str:
     """Return where two runs diverge: `in training episode 70, at t = 360 (training step 46,202)`."""
-    episode, t, step = f"{divergence.episode:,}", divergence.t, f"{divergence.step:,}"
-    if divergence.after is None:
-        return f"in training episode {episode}, at t = {t} (training step {step})"
-    return (
-        f"in the evaluation after {divergence.after:,} training episodes, in trial {episode}, "
-        f"at t = {t} (evaluation step {step} of A)"
-    )
+    step, episode = f"training step {divergence.step:,}", f"training episode {divergence.episode:,}"
+    if divergence.phase == "eval":
+        after = 0 if divergence.after is None else divergence.after
+        step = f"evaluation step {divergence.step:,} of A"
+        episode = f"the evaluation after {after:,} training episodes, in trial {divergence.episode:,}"
+    if divergence.field == "digest":
+        return f"in {episode}, at {step} at the latest"
+    if divergence.field.startswith("reset."):
+        return f"in the reset before {step}, in {episode}"
+    return f"in {episode}, at t = {divergence.t} ({step})"
 
 
-def updates_in_words(cause: Cause) -> list[str]:
+def updates_in_words(cause: Cause | None) -> list[str]:
     """Return how the tables came to differ, in a sentence or two; none if that is not the cause."""
-    update = cause.update
-    if update is None:
+    if cause is None or cause.update is None:
         return []
+    update = cause.update
     sentences = [
         f"The tables came to differ before, by the update of training step {update.step:,} in episode "
         f"{update.episode:,}: {spoken(update.agent)}'s value of {update.action} in the state "
@@ -269,10 +268,10 @@ def updates_in_words(cause: Cause) -> list[str]:
     return sentences
 
 
-def _q_rows(cause: Cause) -> list[Grid]:
+def _q_rows(cause: Cause | None) -> list[Grid]:
     """Return the Q-values of the state in which the greedy actions differ, the best of each agent."""
     grids = []
-    for row in cause.rows:
+    for row in () if cause is None else cause.rows:
         best = dict.fromkeys(values.index(max(values)) for values in (row.a, row.b))
         cells = [(row.actions[j], f"{row.a[j]:.6g}", f"{row.b[j]:.6g}") for j in best]
         grids.append(Grid((f"Q-values of {spoken(row.agent)} there, of the greedy actions", "A", "B"), cells))

@@ -14,13 +14,13 @@ from runner.analysis.diff.causes import Cause, Row
 from runner.analysis.diff.divergence import Divergence
 from runner.analysis.diff.sections import (
     evaluation_updates,
-    loop_divergence_in_words,
     overlap_in_words,
     sections,
     summary,
     updates_in_words,
     visits_grids,
     where_in_words,
+    why_in_words,
 )
 from runner.analysis.diff.tables import common_snapshots
 from runner.analysis.groups import Group
@@ -131,12 +131,7 @@ def _divergence(
     difference: RunDiff, divergence: Divergence, cause: Cause | None, a: Recording, b: Recording
 ) -> ShownDivergence:
     is_training = divergence.phase == "train"
-    if cause is None:
-        where, why = loop_divergence_in_words(divergence)
-        updates: list[str] = []
-    else:
-        where, why = where_in_words(divergence), cause.text
-        updates = updates_in_words(cause) if is_training else evaluation_updates(difference, cause)
+    where, why = where_in_words(divergence), why_in_words(divergence, cause)
     return ShownDivergence(
         id=f"divergence-{divergence.phase}",
         step=divergence.reference,
@@ -144,7 +139,7 @@ def _divergence(
         title="Where training diverges" if is_training else "Where an evaluation diverges",
         where=where[0].upper() + where[1:],
         cause=why[0].upper() + why[1:],
-        updates=updates,
+        updates=updates_in_words(cause) if is_training else evaluation_updates(difference, cause),
         pictures=list(_pictures(divergence, a, b)),
         rows=[_values(row) for row in (() if cause is None else cause.rows)],
     )

@@ -84,7 +84,9 @@ def test_what_changed_fails_with_the_first_difference_its_cause_and_a_page(folde
     code, output = pytest_over(folder, CHANGED, "--golden-pages", "pages")
     assert code == 1
     assert "config.lr (0.5 in A, 1.5 in B) differs" in output
-    assert "They diverge at training step 2, of episode 0 at time 2: action is 0 in A, 1 in B" in output
+    assert (
+        "They diverge in training episode 0, at t = 2 (training step 2): action is 0 in A, 1 in B" in output
+    )
     assert "epsilon" in output
     assert "They diverge in training episode" in output
     assert "IQM 17.65" in output

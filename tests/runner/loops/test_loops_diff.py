@@ -66,12 +66,12 @@ def diff_of_two(folder: Path, tested: int = 0, logged: float = 0.0) -> str:
 def test_diff_names_the_step_at_which_evaluations_of_loops_diverge(tmp_path):
     reply = diff_of_two(tmp_path, tested=1)
     assert "Training took the same steps, evaluation did not." in reply
-    assert "They diverge in the reset before evaluation step 0" in reply
+    assert "They diverge in the reset before evaluation step 0 of A, in the evaluation after" in reply
     diverged = json.loads(dualtaxi(tmp_path, "diff", "one", "two", "--json").stdout)
     assert (diverged["divergence"], diverged["evaluation_divergence"]["step"]) == (None, 0)
     page = tmp_path / "diff.html"
     dualtaxi(tmp_path, "diff", "one", "two", "--html", str(page))
-    assert "They diverge in the reset before evaluation step 0" in page.read_text()
+    assert "In the reset before evaluation step 0 of A, in the evaluation after" in page.read_text()
 
 
 def test_diff_names_the_topics_that_differ_between_loops_of_equal_steps(tmp_path):
@@ -125,7 +125,8 @@ def test_diff_names_the_reset_in_which_loops_diverge(tmp_path):
     for other in ("0.75", "0.5"):  # the actions of the last differ too, but after the reset
         reply = dualtaxi(tmp_path, "diff", "at0.25", f"at{other}").stdout
         assert (
-            "They diverge in the reset before training step 6, of episode 2: observation is [0.25, " in reply
+            "diverge in the reset before training step 6, in training episode 2: observation is [0.25, "
+            in reply
         )
         assert f" in A, [{other}, " in reply
     diverged = json.loads(dualtaxi(tmp_path, "diff", "at0.25", "at0.5", "--json").stdout)["divergence"]
@@ -172,7 +173,7 @@ def test_loops_recorded_by_their_actions_diverge_where_these_do(tmp_path):
     other = record_pole(tmp_path, "b", "actions", change=17)
     text = dualtaxi(tmp_path, "diff", "a", "b").stdout
     assert "Training takes the same actions for 17 steps." in text
-    assert "They diverge at training step 17, of episode 0 at time 17: action is 0 in A, 1 in B." in text
+    assert "diverge in training episode 0, at t = 17 (training step 17): action is 0 in A, 1 in B." in text
     assert f"B holds the actions of its steps alone, which are compared; `dualtaxi rerecord {other}`" in text
     assert "all steps are the same" not in text
     dualtaxi(tmp_path, "diff", "a", "b", "--html", str(tmp_path / "diff.html"))
@@ -202,7 +203,8 @@ def test_other_rewards_of_loops_recorded_by_their_actions_are_found(tmp_path):
     assert (divergence["episode"], divergence["step"]) == (episode, ends[episode])
     text = dualtaxi(tmp_path, "diff", "a", "b").stdout
     assert (
-        f"They diverge in training, episode {episode}, at step {ends[episode]} at the latest: the act" in text
+        f"They diverge in training episode {episode}, at training step {ends[episode]} at the latest: the act"
+        in text
     )
 
 
@@ -215,6 +217,7 @@ def test_a_loop_that_goes_on_longer_is_named_as_such(tmp_path):
     text = dualtaxi(tmp_path, "diff", "long", "short").stdout
     assert "Training is the same for 1 step." in text
     assert (
-        "They diverge at training step 1, of episode 0 at time 1: A has that step, B ended before it." in text
+        "They diverge in training episode 0, at t = 1 (training step 1): A has that step, B ended before it."
+        in text
     )
     assert "Note: how a loop learns is not recorded" in text
