@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from datetime import UTC, datetime
 
 import numpy as np
 import pyarrow as pa
@@ -20,17 +19,13 @@ def run_table(recording: Recording) -> pa.Table:
     """Return the table with one row that describes a run."""
     facts, config = recording.run_facts(), recording.config
     summary = facts["summary"]
-    try:
-        created = datetime.fromisoformat(facts["created"]).astimezone(UTC)
-    except (ValueError, OverflowError) as error:
-        raise RecordingError(f"{recording.path}: was created at {facts['created']!r}, not a time.") from error
     columns: dict[str, tuple[pa.DataType, object]] = {
         "run_id": (pa.string(), facts["run_id"]),
         "name": (pa.string(), recording.name),
         "seed": (pa.uint64(), facts["seed"]),
         "job": (pa.string(), recording.job),
         "status": (pa.string(), facts["status"]),
-        "created": (pa.timestamp("ms", tz="UTC"), created),
+        "created": (pa.timestamp("ms", tz="UTC"), recording.began),
         "content_digest": (pa.string(), summary.get("content_digest")),
         "episodes": (pa.int64(), summary.get("episodes")),
         "train_steps": (pa.int64(), summary.get("train_steps")),

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 
 from runner.errors import RunnerError, shortened
 from runner.export.contents import flat_text
-from runner.export.scalars import created, episodes, measures, times
+from runner.export.scalars import episodes, measures, times
 from runner.recording.reader import Recording
 from runner.util.extras import require
 
@@ -100,7 +100,7 @@ def _export(
             f"{tracking}: experiment {experiment!r} has the run {recording.run_id} "
             "with other content; --force replaces it."
         )
-    run = client.create_run(experiment_id, start_time=round(created(recording) * 1000), tags=tags)
+    run = client.create_run(experiment_id, start_time=round(recording.began.timestamp() * 1000), tags=tags)
     run_id = run.info.run_id
     try:
         names: dict[str, str] = {}
@@ -148,7 +148,7 @@ def _log_metrics(
     """Log all metrics, of a loop also length and return of its episodes; return their number, and the end."""
     from mlflow.entities import Metric
 
-    end, at = created(recording), times(recording)
+    end, at = recording.began.timestamp(), times(recording)
     phases = () if recording.has_reports else ("train", "eval")
     moments = chain(measures(recording), *(episodes(recording, phase) for phase in phases))
     metrics = (

@@ -15,13 +15,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from typing import Final
 
 import numpy as np
 
 from runner.analysis.series import training_step
-from runner.errors import RecordingError
 from runner.recording.clock import read_clock
 from runner.recording.messages import Message
 from runner.recording.metrics import METRICS
@@ -118,23 +116,9 @@ def times(recording: Recording) -> Callable[[int], float]:
 
     Where no clock was recorded, logical time is added to the time at which the run was created.
     """
-    began = created(recording)
+    began = recording.began.timestamp()
     passed = wall_clock(recording) or (lambda position: position * STEP_NANOSECONDS / 1e9)
     return lambda position: began + passed(position)
-
-
-def created(recording: Recording) -> float:
-    """Return when the run began, in seconds since 1970.
-
-    Raises:
-        RecordingError: the recording holds no such time.
-    """
-    try:
-        return datetime.fromisoformat(recording.created).timestamp()
-    except (ValueError, OverflowError) as error:
-        raise RecordingError(
-            f"{recording.path}: found {recording.created!r}, expected the time it was created."
-        ) from error
 
 
 def _measures(phase: str, row: Message, values: Mapping[str, float]) -> Measures:

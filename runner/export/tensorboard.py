@@ -10,7 +10,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
-from runner.export.scalars import created, episodes, measures, times
+from runner.export.scalars import episodes, measures, times
 from runner.recording.reader import Recording
 from runner.util.extras import require
 
@@ -32,7 +32,7 @@ def write_events(recording: Recording, folder: Path) -> int:
     from tensorboardX.proto.summary_pb2 import Summary
     from tensorboardX.record_writer import RecordWriter
 
-    began, at, count = created(recording), times(recording), 0
+    began, at, count = recording.began.timestamp(), times(recording), 0
     writer = RecordWriter(str(folder / f"events.out.tfevents.{int(began)}.{recording.run_id}"))
     try:
         writer.write(Event(wall_time=began, file_version="brain.Event:2").SerializeToString())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 
@@ -86,6 +87,20 @@ class RunDescription(ABC):
     def created(self) -> str:
         """When the run began, in ISO format."""
         return self.run["created"]
+
+    @property
+    def began(self) -> datetime:
+        """When the run began, in UTC.
+
+        Raises:
+            RecordingError: the recording does not state a time.
+        """
+        try:
+            return datetime.fromisoformat(self.created).astimezone(UTC)
+        except (ValueError, OverflowError) as error:
+            raise RecordingError(
+                f"{self.path}: found {self.created!r}, expected the time at which it was created."
+            ) from error
 
     @property
     def seed(self) -> int | None:

@@ -90,7 +90,7 @@ def iqm_band(values: Values) -> tuple[Values, Values, Values]:
         if n < FEWEST_FOR_IQM:
             result[:, chosen] = ordered.mean(axis=0), ordered[0], ordered[-1]
             continue
-        cut, weights = n // 4, _weights(n)
+        cut, weights = n // 4, _weights(n, _BAND_RESAMPLES, n // 4)
         result[0, chosen] = ordered[cut : n - cut].mean(axis=0)
         for start in range(0, len(chosen), _BATCH // _BAND_RESAMPLES):
             batch = slice(start, start + _BATCH // _BAND_RESAMPLES)
@@ -99,10 +99,13 @@ def iqm_band(values: Values) -> tuple[Values, Values, Values]:
 
 
 @lru_cache(maxsize=64)
-def _weights(n: int) -> Values:
-    """Return the weight of each of n sorted values in the IQM of each resample, [resamples, n]."""
-    drawn = np.random.default_rng(_SEED).integers(n, size=(_BAND_RESAMPLES, n))
-    kept = np.sort(drawn, axis=1)[:, n // 4 : n - n // 4]
+def _weights(n: int, resamples: int, cut: int = 0) -> Values:
+    """Return the weight of each of n sorted values in the mean of each resample, [resamples, n].
+
+    The mean is that without the `cut` lowest and highest values of the resample.
+    """
+    drawn = np.random.default_rng(_SEED).integers(n, size=(resamples, n))
+    kept = np.sort(drawn, axis=1)[:, cut : n - cut]
     counts = np.array([np.bincount(row, minlength=n) for row in kept], np.float64)
     return np.asarray(counts / kept.shape[1])
 
@@ -142,9 +145,7 @@ def bootstrap_means(values: Values) -> list[Estimate]:
     n = values.shape[1]
     low = high = np.full(len(values), np.nan)
     if n > 1:
-        drawn = np.random.default_rng(_SEED).integers(n, size=(RESAMPLES, n))
-        weights = np.array([np.bincount(row, minlength=n) for row in drawn], np.float64) / n
-        low, high = np.quantile(weights @ values.T, _TAILS, axis=0)
+        low, high = np.quantile(_weights(n, RESAMPLES) @ values.T, _TAILS, axis=0)
     rows = zip(values.mean(axis=1).tolist(), low.tolist(), high.tolist(), strict=True)
     return [Estimate(*row) for row in rows]
 
