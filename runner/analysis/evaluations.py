@@ -262,14 +262,18 @@ def loop_summary(recording: Recording) -> Summary:
     It has `last_evaluation` (None without one), `recent_training`, over the last `RECENT_EPISODES`, and
     `logged`, the last value logged under each name. A value that is unknown or not finite is None.
     """
-    evaluations, recent = evaluation_records(recording), recent_episodes(recording)
+    evaluations, recent = evaluations_of(recording), recent_episodes(recording)
+    last = None
+    if evaluations:
+        trials = recording.episodes("eval", evaluations[-1].start, evaluations[-1].stop)
+        last = _loop_record(recording, evaluations[-1], trials).summary()
     logged = (
         recording.result.logged
         if "logged" in recording.result
         else {one["name"]: finite(one["value"]) for one in recording.decoded(schema.SCALAR_TOPIC)}
     )
     return Summary(
-        last_evaluation=evaluations[-1].summary() if evaluations else None,
+        last_evaluation=last,
         recent_training=RecentTraining(
             len(recent), finite_mean(recent["length"]), finite_mean(recent["returns"].sum(axis=1))
         ),
