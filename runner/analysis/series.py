@@ -221,7 +221,7 @@ def read_series(recording: Recording, axis: Axis = EPISODES) -> RunSeries:
 
 def _environment(recording: Recording) -> str:
     kwargs = recording.config.get("env", {}).get("kwargs", {})
-    name = str(recording.environment["env_id"]).rpartition(":")[2]
+    name = recording.environment["env_id"].rpartition(":")[2]
     return " ".join([name, *(f"{key}={value}" for key, value in kwargs.items())])
 
 

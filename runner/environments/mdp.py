@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypedDict
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from runner.environments.scene import SceneDescription, scene_mistake
 from runner.errors import EnvironmentNotUsable
 from runner.util.arrays import Array
-from runner.util.values import Json, JsonView, is_text, is_whole
+from runner.util.values import JsonView, is_text, is_whole
 
 Indices = NDArray[np.integer[Any]]
 """Numbers of states or actions, as recorded in one integer type or another."""
@@ -44,6 +44,21 @@ class Transitions(TypedDict):
     rewards: NDArray[np.float64]
     terminated: NDArray[np.bool_]
     events: NDArray[np.uint32]
+
+
+class EnvironmentDescription(TypedDict):
+    """The fields of an `Mdp` that are not arrays, as JSON can hold them."""
+
+    env_id: str
+    kwargs: JsonView
+    step_limit: int
+    agents: Sequence[str]
+    action_counts: Sequence[int]
+    event_names: Sequence[str]
+    success_events: Sequence[str]
+    penalty_below: float | None
+    """None for no penalties."""
+    scene: SceneDescription | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +136,7 @@ class Mdp:
             "all: set `rewards: team`, or `tables: per_agent`."
         )
 
-    def description(self) -> Json:
+    def description(self) -> EnvironmentDescription:
         """Return all fields that are not arrays, as JSON can hold them."""
         return {
             "env_id": self.env_id,
@@ -132,7 +147,7 @@ class Mdp:
             "event_names": list(self.event_names),
             "success_events": list(self.success_events),
             "penalty_below": None if np.isinf(self.penalty_below) else self.penalty_below,
-            "scene": None if self.scene is None else dict(self.scene),
+            "scene": None if self.scene is None else SceneDescription(**self.scene),
         }
 
     def arrays(self) -> dict[str, Array]:
@@ -193,7 +208,7 @@ def _events(mdp: Mdp, steps: NDArray[np.void]) -> NDArray[np.uint32]:
     return np.where(likely.any(axis=1), mdp.events[state, action, outcome], np.uint32(0))
 
 
-def from_parts(description: JsonView, arrays: Mapping[str, NDArray[Any]]) -> Mdp:
+def from_parts(description: EnvironmentDescription, arrays: Mapping[str, NDArray[Any]]) -> Mdp:
     """Return the Mdp that `description()` and `arrays()` came from, checked like a new one.
 
     Raises:

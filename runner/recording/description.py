@@ -23,6 +23,7 @@ from runner.recording.maker import (
     parse_shards,
 )
 from runner.recording.metadata import (
+    RecordedEnvironment,
     environment_description,
     environment_of,
     json_object,
@@ -227,7 +228,7 @@ class RunDescription(ABC):
         return schema.KINDS[self.kind]
 
     @cached_property
-    def environment(self) -> Json:
+    def environment(self) -> RecordedEnvironment:
         """The environment's description without its arrays: agents, events, scene; not to be changed."""
         return environment_description(self.attachment("environment.json"), str(self.path))
 

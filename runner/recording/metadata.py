@@ -9,19 +9,28 @@ import base64
 import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 import zstandard
 
-from runner.environments.mdp import MAX_AGENTS, MAX_ARRAYS_BYTES, MAX_EVENTS, Mdp, from_parts
-from runner.errors import RecordingError
+from runner.environments.mdp import (
+    MAX_AGENTS,
+    MAX_ARRAYS_BYTES,
+    MAX_EVENTS,
+    EnvironmentDescription,
+    Mdp,
+    from_parts,
+)
+from runner.environments.scene import scene_mistake
+from runner.errors import RecordingError, shortened
 from runner.recording import schema
 from runner.recording.blocks import topic_dtype
 from runner.recording.index import Index
 from runner.recording.maker import MAKER_RECORD, EnvironmentMaker
 from runner.recording.packed_arrays import pack_array, unpack_array
 from runner.recording.records import MAX_METADATA_BYTES
+from runner.recording.run_file import Check
 from runner.recording.schema import Topic
 from runner.recording.spaces import dtype_of, leaves_of
 from runner.recording.writer import RecordingFile, storage_error
@@ -44,6 +53,37 @@ _RUN_COUNTS: Final = {"seed": 2**64 - 1, "learners": MAX_AGENTS, "events": MAX_E
 
 Attachments = Mapping[str, tuple[str, bytes]]
 """Name -> media type and content."""
+
+
+class RecordedEnvironment(EnvironmentDescription):
+    """The contents of `environment.json`."""
+
+    arrays: Sequence[str]
+    """The names of the arrays, each an attachment; empty without a transition table."""
+
+
+def _each(fits: Callable[[object], bool]) -> Callable[[object], bool]:
+    return lambda value: isinstance(value, list) and all(map(fits, value))
+
+
+def _is_str(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _is_amount(value: object) -> bool:
+    return is_whole(value, 0, 2**63 - 1)
+
+
+_NAMES: Final = Check(_each(_is_str), "a list of texts")
+_ENVIRONMENT: Final = {
+    **dict.fromkeys(("arrays", "event_names", "success_events", "agents"), _NAMES),
+    "action_counts": Check(_each(_is_amount), "a list of whole numbers"),
+    "env_id": Check(_is_str, "a text"),
+    "kwargs": Check(lambda value: isinstance(value, Mapping), "an object"),
+    "step_limit": Check(_is_amount, "a whole number from 0 up"),
+    "penalty_below": Check(lambda value: value is None or type(value) in (int, float), "a number or null"),
+}
+"""What each value of `environment.json` but the scene must be."""
 
 
 # --- the run ------------------------------------------------------------------------------------------
@@ -224,21 +264,26 @@ def _indented(text: str) -> str:
     return json.dumps(json.loads(text), indent=1, sort_keys=True)
 
 
-def environment_description(text: bytes, path: str) -> dict[str, object]:
+def environment_description(text: bytes, path: str) -> RecordedEnvironment:
     """Return the description in `environment.json`.
 
     Raises:
-        RecordingError: it does not name the environment's arrays and events.
+        RecordingError: a value is missing or impossible.
     """
     description = json_object(text, f"{path}: environment.json")
-    for key in ("arrays", "event_names", "success_events"):
-        names = description.get(key)
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise RecordingError(f"{path}: environment.json does not name the environment's {key}.")
-    return description
+    for key, check in _ENVIRONMENT.items():
+        if key not in description or not check.fits(description[key]):
+            found = shortened(repr(description[key]), 60) if key in description else "nothing"
+            raise RecordingError(
+                f"{path}: environment.json: found {found} as {key}, expected {check.expected}."
+            )
+    mistake = scene_mistake(description.get("scene"), None, None, 0)
+    if mistake is not None:
+        raise RecordingError(f"{path}: environment.json: {mistake}.")
+    return cast(RecordedEnvironment, {"scene": None} | description)
 
 
-def environment_of(description: JsonView, attachment: Callable[[str], bytes], path: str) -> Mdp:
+def environment_of(description: RecordedEnvironment, attachment: Callable[[str], bytes], path: str) -> Mdp:
     """Return the environment that a recording describes.
 
     Raises:
@@ -246,7 +291,7 @@ def environment_of(description: JsonView, attachment: Callable[[str], bytes], pa
     """
     if not description["arrays"]:
         raise RecordingError(
-            f"{path}: has no transition table of {description.get('env_id')}, which is not tabular: it was "
+            f"{path}: has no transition table of {description['env_id']}, which is not tabular: it was "
             "recorded from a loop over it; `dualtaxi view` shows what was recorded."
         )
     arrays: dict[str, Array] = {}

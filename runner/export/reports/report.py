@@ -275,9 +275,9 @@ def _replay(
                 raise
     if not shown:
         return None
-    picture, key, first = "", "", shown[0][1]
-    if first.grid is not None:
-        drawing = svg.Drawing(recording.environment["scene"])
+    picture, key, first, scene = "", "", shown[0][1], recording.environment["scene"]
+    if first.grid is not None and scene is not None:
+        drawing = svg.Drawing(scene)
         places = np.array(first.grid.places, np.int16)[first.grid.at[:1]].reshape(1, -1, 3)
         picture = drawing.frame(places[0], "The grid at the step shown below it", places, style="")
         key = drawing.key()
