@@ -20,6 +20,7 @@ from runner.environments.naming import numbered_actions, spoken
 from runner.recording.metrics import is_usable
 from runner.recording.reader import Recording
 from runner.recording.schema import RESET_ONLY, TRAIN_EPISODE
+from runner.recording.spaces import decode
 from runner.util.arrays import Array
 
 Values = NDArray[np.float64]
@@ -34,7 +35,6 @@ LEVELS: Final = 30
 _MAX_DISTINCT: Final = 20
 _MAX_PARTS: Final = 6
 """Numbers of an action, or agents, that have a histogram of their own."""
-_BATCH: Final = 4096
 
 
 @dataclass(frozen=True)
@@ -184,43 +184,28 @@ def _steps(
             columns.setdefault(("reward", line), _Column("reward", line, "reward of a step", _number))
     else:
         notes.append("Rewards have no histogram, as no whole steps of training were recorded.")
-    for block in _blocks(recording):
+    for block in recording.rows("/train/step"):
         taken = block["t"] != RESET_ONLY
         values: dict[tuple[str, str], Values] = {}
-        for part, own in _parts(recording, block["action"][taken], notes).items():
+        for part, own in _parts(recording, _uniform(recording, block["action"][taken]), notes).items():
             values["action", part] = own.astype(np.float64)
             if ("action", part) not in columns:
                 columns["action", part] = _Column("action", part, "action", _action_name(recording, part))
-        if "rewards" in (block if isinstance(block, dict) else block.dtype.names or ()):
+        if "rewards" in (block.dtype.names or ()):
             for i, line in enumerate(lines):
                 values["reward", line] = block["rewards"][taken][:, i].astype(np.float64)
         yield places.at(block["episode"][taken], block["step"][taken] + 1), values
 
 
-def _blocks(recording: Recording) -> Iterator[Any]:
-    """Yield the steps in blocks of arrays by field, also those that vary in size, or their actions alone."""
-    topic = recording.topic("/train/step")
-    if not recording.has_messages(topic.name):
-        if recording.has_actions:
-            yield from recording.actions("train")
-    elif topic in recording.dtypes:
-        yield from recording.blocks(topic)
-    else:
-        steps = recording.transitions("train")
-        while batch := list(itertools.islice(steps, _BATCH)):
-            names = ("t", "episode", "step", "rewards")
-            yield {
-                **{name: np.array([step[name] for step in batch]) for name in names},
-                "action": _uniform([step["action"] for step in batch]),
-            }
-
-
-def _uniform(actions: list[object]) -> Array:
+def _uniform(recording: Recording, actions: Array) -> Array:
     """Return actions as one array; an array of objects where they are no arrays of one shape."""
-    if all(isinstance(each, (np.ndarray, np.generic)) for each in actions):
+    if not actions.dtype.hasobject:
+        return actions
+    values = [decode(recording.spaces["action"], each, str(recording.path)) for each in actions]
+    if all(isinstance(each, (np.ndarray, np.generic)) for each in values):
         with contextlib.suppress(ValueError):
-            return np.array(actions)
-    return np.array([None] * len(actions))
+            return np.array(values)
+    return np.array([None] * len(values))
 
 
 def _parts(recording: Recording, actions: Array, notes: list[str]) -> dict[str, Array]:

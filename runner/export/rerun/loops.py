@@ -103,7 +103,6 @@ class LoopExporter:
 
     def export(self) -> None:
         """Send everything that is selected."""
-        recording = self._recording
         for phase in schema.PHASES:
             self._send_episodes(phase)
             self._frames.send_recorded(phase)
@@ -116,10 +115,7 @@ class LoopExporter:
             labels.log(self._stream, self._root)
             view.draw_background(self._stream)
         for phase, spans in self._selection.by_phase.items():
-            if recording.kind == "variable":
-                self._send_rewards(phase, spans)
-            else:
-                self._send_steps(phase, spans)
+            self._send_steps(phase, spans)
 
     def draw_frames(self, trust: bool, stage: Callable[[str], None]) -> None:
         """Send pictures of the chosen episodes that the environment draws; report what is missing."""
@@ -183,7 +179,7 @@ class LoopExporter:
         recording = self._recording
         grid: StepWriter | None = None
         training_ends = self._training_ends() if self._grid is not None and phase == "eval" else None
-        for steps in self._batches(recording.topic(f"/{phase}/step"), spans):
+        for steps in self._batches(f"/{phase}/step", spans):
             extras = recording.extras(phase).at(steps["step"])
             for member in self._members:
                 is_own = (
@@ -223,21 +219,6 @@ class LoopExporter:
         ends = [block["log_time"] for block in self._recording.blocks(schema.TRAIN_EPISODE)]
         return np.concatenate([np.empty(0, np.uint64), *ends])
 
-    def _send_rewards(self, phase: str, spans: Sequence[range]) -> None:
-        """Send the rewards of a loop whose steps vary in size."""
-        (member,) = self._members
-        for span in spans:
-            steps = islice(self._recording.transitions(phase), span.start, span.stop)
-            while batch := list(islice(steps, MAX_ROWS)):
-                times, episodes, numbers = (
-                    np.array([step[key] for step in batch]) for key in ("log_time", "episode", "step")
-                )
-                rewards = np.array([step["rewards"] for step in batch])
-                columns = self._times(times, episodes)
-                self._send_lines(phase, member, "reward", columns, rewards)
-                values = self._recording.extras(phase).at(numbers)
-                self._send_extras(phase, member, values, times, columns)
-
     def _send_extras(
         self,
         phase: str,
@@ -267,9 +248,17 @@ class LoopExporter:
             names = [f"{own}[{i}]" for i in range(numbers.shape[1])]
             self._send_lines(phase, member, quantity, times, numbers, names)
 
-    def _batches(self, topic: schema.Topic, spans: Sequence[range]) -> Iterator[NDArray[np.void]]:
+    def _batches(self, name: str, spans: Sequence[range]) -> Iterator[NDArray[np.void]]:
         """Yield the steps of all environments, at most a batch of each at a time."""
-        recording = self._recording
+        recording, topic = self._recording, self._recording.topic(name)
+        if topic not in recording.dtypes:  # they vary in size, so they are read from the first on
+            for span in spans:
+                for block in recording.rows(name):
+                    if block["step"][0] >= span.stop:
+                        break
+                    if len(own := block[(block["step"] >= span.start) & (block["step"] < span.stop)]):
+                        yield own
+            return
         size = recording.dtypes[topic].itemsize
         limit = max(1, min(MAX_ROWS * recording.environments, _BATCH_BYTES // size))
         for span in spans:
