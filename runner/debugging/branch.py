@@ -1,16 +1,89 @@
-"""`runner.branch`: take another action at a recorded step, or other settings, and see where that leads."""
+"""`runner.branch`: take another action at a recorded step, or other settings, and see where that leads.
+
+    branch = runner.branch(run, at="12:40", action=1, policy="random")
+    print(branch.parent.returns, branch.outcome.returns, branch.run.run_id)
+
+The environment of a loop is made again, and brought to the step by the recorded reset and actions, which also
+brings its random generators there. The branch is a run of one episode, equal to its parent's before the step.
+"""
 
 from __future__ import annotations
 
+import copy
+import json
 import os
-from collections.abc import Callable, Sequence
-from typing import Any
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
 
+from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.analysis.step_reference import StepRef, parse_step
-from runner.errors import ConfigError
+from runner.errors import CannotRedo, ConfigError, RunnerError
 from runner.execution.branching import TrainingBranch, branch_training
-from runner.loops.branch import MAX_STEPS, Branch, branch_episode
-from runner.runs.run import Run
+from runner.loops.actions import Names, action_in_words, action_names, parsed_action
+from runner.loops.env import record
+from runner.loops.parallel import record_parallel
+from runner.loops.policies import Policy, from_policy, policy_named
+from runner.recording.reader import Recording, open_recording
+from runner.recording.spaces import Value
+from runner.replay.engine import BLOCK_SECONDS, Replay
+from runner.replay.environment import stream_from_child
+from runner.replay.episodes import episode_at
+from runner.replay.makers import why_not_redone
+from runner.replay.stepping import RowStepper
+from runner.replay.steps import transitions_of
+from runner.runs.branches import BranchOrigin
+from runner.runs.listing import run_at
+from runner.runs.run import Run, recordings_folder
+from runner.util.files import storage_errors
+from runner.util.jsonable import as_json
+from runner.util.processes import report_progress
+from runner.util.values import checked_run_name
+
+POLICIES: Final = ("recorded", "random", "constant")
+MAX_STEPS: Final = 100_000
+"""The most steps that a branch takes unless chosen otherwise."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Where an episode led."""
+
+    returns: dict[str, float]
+    """The sum of the rewards of each agent."""
+    length: int
+    end: str
+    """`terminated` or `truncated`; else why the episode was not played to its end."""
+
+
+@dataclass(frozen=True)
+class Branch:
+    """A branch of an episode."""
+
+    run: Run
+    """The run that it was recorded in."""
+    origin: BranchOrigin
+    parent: Outcome
+    outcome: Outcome
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What to branch, and how."""
+
+    at: StepRef
+    action: Value
+    policy: str
+    seed: int
+    name: str | None
+    max_steps: int
+    trust: bool
+    user_folder: Path
+    """Where the module of a policy is looked for."""
 
 
 def branch(
@@ -32,22 +105,27 @@ def branch(
     """Change one step of a recorded run, and record what follows as a run of its own, with the same luck.
 
     The training of a job is changed at `at`, and goes on to its end: see
-    `runner.execution.branching.branch_training`, which takes `overrides` and `episodes`. For a loop, one
-    episode is played on: see `runner.loops.branch.branch_episode`, which takes `policy`, `seed`, `max_steps`
-    and `trust`. Both take the other arguments; `runner.what_if` plays actions of a job on without training.
+    `runner.execution.branching.branch_training`. For a loop, one episode is played on, in its environment
+    alone where it is one of a vector: in a child process with limits on memory and time, where it is compared
+    with the recording on the way to the step. What fails leaves no run. `runner.what_if` plays actions of a
+    job on without training.
 
     Args:
         run: the parent.
         at: the step: `EPISODE:T`; of a job also its number or `step:N`; of a loop also `eval:N:TRIAL:T`.
-        action: the action there; None for the recorded one.
-        overrides: `KEY=VALUE` each: the settings from this step on.
-        episodes: the training episodes in all; the parent's by default.
-        policy: what acts after the step.
+        action: the action there; None for the recorded one. For a loop as the environment takes it, or as
+            text: a number or a name, numbers separated by commas, JSON for `Dict` and `Tuple`; of a game a
+            mapping by agent, or `AGENT=VALUE`, where the other agents act as recorded.
+        overrides: for a job, `KEY=VALUE` each: the settings from this step on.
+        episodes: for a job, the training episodes in all; the parent's by default.
+        policy: for a loop, what acts after the step: `recorded`, the rest of the recorded actions, and where
+            they run out before the end the branch stops; `random`; `constant`, the action of the step; or
+            `module:function`, which takes an observation and returns an action (of a game both by agent).
         seed: of the policy `random`.
         name: of the new run; `NAME.branch` by default.
-        recordings: the folder of the new run.
-        max_steps: the most steps to take from the step on.
-        trust: whether to import what the recording names to make its environment again.
+        recordings: the folder of the new run: $DUALTAXI_RECORDINGS, or ./recordings, by default.
+        max_steps: for a loop, the most steps to take from the step on.
+        trust: whether to import what the recording of a loop names to make its environment again.
         report: called with the number of steps taken so far.
         stop: called every few milliseconds of training; return True to stop.
 
@@ -55,46 +133,186 @@ def branch(
         Its `run`, and the `origin` of the branch; of a loop also where parent and branch led.
 
     Raises:
-        ConfigError: an argument does not fit the run.
-        RunnerError: as both functions raise.
+        ConfigError: an argument does not fit the run, or the action is not in the environment's space.
+        CannotRedo: the environment of a loop cannot be made again, differs from the recording, or fails.
+        RecordingError: there is no such episode or step, or the recording is damaged.
+        RunnerError: see `branch_training`.
+        StorageError: the folder of the new run cannot be written.
     """
-    if not run.can_train_again:
-        place = parse_step(at) if isinstance(at, str) else at
-        if isinstance(place, int):
+    if run.can_train_again:
+        if (policy, seed, max_steps) != ("recorded", 0, MAX_STEPS):
             raise ConfigError(
-                f"at: found the number {place:,} of a step, expected EPISODE:T: the steps of a loop are "
-                "counted in its episodes."
+                f"run {run.run_id} was trained here, and a branch of it is trained as its "
+                "configuration says: policy, seed and max_steps are for loops."
             )
-        if overrides or episodes is not None:
-            raise ConfigError(
-                f"run {run.run_id} is a loop, of which an episode is branched; overrides and episodes are "
-                "for runs that were trained here."
-            )
-        return branch_episode(
+        return branch_training(
             run,
-            at=place,
+            at=at,
             action=action,
-            policy=policy,
-            seed=seed,
+            overrides=overrides,
+            episodes=episodes,
             name=name,
             recordings=recordings,
-            max_steps=max_steps,
-            trust=trust,
-            report=report,
+            report=lambda progress: report(progress.train_steps),
+            stop=stop,
         )
-    if (policy, seed, max_steps) != ("recorded", 0, MAX_STEPS):
+    at = parse_step(at) if isinstance(at, str) else at
+    if isinstance(at, int):
         raise ConfigError(
-            f"run {run.run_id} was trained here, and a branch of it is trained as its "
-            "configuration says: policy, seed and max_steps are for loops."
+            f"at: found the number {at:,} of a step, expected EPISODE:T: the steps of a loop are "
+            "counted in its episodes."
         )
-    return branch_training(
-        run,
-        at=at,
-        action=action,
-        overrides=overrides,
-        episodes=episodes,
-        name=name,
-        recordings=recordings,
-        report=lambda progress: report(progress.train_steps),
-        stop=stop,
-    )
+    if overrides or episodes is not None:
+        raise ConfigError(
+            f"run {run.run_id} is a loop, of which an episode is branched; overrides and episodes are for "
+            "runs that were trained here."
+        )
+    if policy not in POLICIES and ":" not in policy:
+        raise ConfigError(
+            f"policy: found {policy!r}, expected {', '.join(POLICIES)}, or module:function of your own"
+        )
+    if max_steps < 1:
+        raise ConfigError(f"max_steps: found {max_steps}, expected 1 or more")
+    task = _Task(at, action, policy, seed, checked_run_name(name), max_steps, trust, Path.cwd())
+    folder = recordings_folder(recordings).absolute()
+    with storage_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        staging = tempfile.TemporaryDirectory(prefix=".branch-", dir=folder)  # hidden: no run is listed there
+    with staging:
+        for found in stream_from_child(_record_branch, run.recording.absolute(), Path(staging.name), task):
+            if isinstance(found, int):
+                report(found)
+            else:
+                run_id, origin, stopped = found
+        with storage_errors(folder / run_id):
+            (Path(staging.name) / run_id).rename(folder / run_id)
+    own = run_at(folder / run_id)
+    with open_recording(run.recording) as recording:
+        before = _outcome(recording, origin.phase, origin.episode, "unfinished")
+    with open_recording(own.recording) as recording:
+        return Branch(own, origin, before, _outcome(recording, origin.phase, 0, stopped))
+
+
+def _outcome(recording: Recording, phase: str, episode: int, otherwise: str) -> Outcome:
+    """Return where an episode led; `otherwise` is its end if it has none."""
+    returns, length, end = [0.0] * len(recording.agents), 0, otherwise
+    for step in transitions_of(recording, phase, episode):
+        length += 1
+        returns = [sum(pair) for pair in zip(returns, map(float, step["rewards"]), strict=True)]
+        end = "terminated" if step["terminated"] else "truncated" if step["truncated"] else otherwise
+    return Outcome(dict(zip(recording.agents, returns, strict=True)), length, end)
+
+
+# --- in the child process -----------------------------------------------------------------------------
+
+
+def _record_branch(path: Path, folder: Path, task: _Task) -> None:
+    """Record a branch; report the steps taken, then its run id, its origin, and why it stopped early."""
+    os.chdir(task.user_folder)
+    with open_recording(path) as recording:
+        if recording.can_train_again:
+            raise RunnerError(
+                f"run {recording.run_id} was trained here; only episodes of loops are branched: runs whose "
+                "environment runner.record wrapped."
+            )
+        if reason := why_not_redone(recording, task.trust):
+            raise CannotRedo(reason)
+        player = _Player(recording, folder, task)
+        make = partial(Replay, recording, task.trust, 0.0, report_progress, False)
+        with episode_at(recording, player.phase, player.episode, task.at.t, make, player.begin):
+            stopped = player.play()
+    report_progress((player.rec.run.run_id, player.origin, stopped))
+
+
+class _Player:
+    """Records an episode from its reset on, and plays on from a step."""
+
+    rec: Any
+    """The recorded environment."""
+    origin: BranchOrigin
+
+    def __init__(self, recording: Recording, folder: Path, task: _Task) -> None:
+        self._recording, self._folder, self._task = recording, folder, task
+        self.phase, self.episode = "train", task.at.episode
+        if task.at.after is not None:
+            where = str(recording.path)
+            trials = evaluation_after(evaluations_of(recording), task.at.after, where)
+            self.phase, self.episode = "eval", trials.trial(task.at.episode, where)
+        self._function: Policy | None = policy_named(task.policy) if ":" in task.policy else None
+        self._is_game = False
+        self._actions: Iterator[Value] = iter(())
+
+    def begin(self, stepper: RowStepper, actions: Iterator[Value]) -> None:
+        """Record the environment from now on."""
+        env, task, recording = stepper.env, self._task, self._recording
+        maker = recording.maker_of(self.phase)
+        assert maker is not None  # or `why_not_redone` gave a reason
+        self._is_game, self._actions = maker.kind == "pettingzoo", actions
+        self._space = copy.deepcopy(stepper.action_space)
+        self._space.seed(task.seed)
+        names: Names = recording.action_names(self.phase) or action_names(env, self._space)
+        if self._is_game:
+            names = {agent: recording.action_names(self.phase, agent) for agent in recording.agents}
+        self._action = parsed_action(self._space, task.action, next(actions), names)
+        self.origin = BranchOrigin(
+            recording.run_id,
+            self.phase,
+            self.episode,
+            task.at.t,
+            str(task.at),
+            _text(self._action),
+            task.policy,
+            task.seed,
+            action_in_words(self._space, self._action, names),
+        )
+        wrap: Callable[..., Any] = record_parallel if self._is_game else record
+        self.rec = stepper.env = wrap(
+            env,
+            self._folder,
+            name=task.name or f"{recording.name[:90]}.branch",
+            seed=recording.seed,
+            config={"origin": self.origin},
+            make=maker.make if task.trust and maker.make else None,
+        )
+        self.rec._enter(self.phase)
+
+    def play(self) -> str:
+        """Take the action, and play on; return why that stopped before the end, empty if it did not."""
+        task, action, reported = self._task, self._action, time.monotonic()
+        for count in range(1, task.max_steps + 1):
+            try:
+                observation, _, terminated, truncated, _ = self.rec.step(action)
+            except (MemoryError, RunnerError):
+                raise
+            except Exception as error:  # foreign code raises anything
+                raise CannotRedo(
+                    f"The environment failed at t {task.at.t + count - 1:,} of the branch, with the action "
+                    f"{_text(action)}: {type(error).__name__}: {error}"
+                ) from error
+            if not self.rec.agents if self._is_game else terminated or truncated:
+                return ""
+            action = self._next(observation)
+            if action is None:
+                return "the recorded actions ran out"
+            if time.monotonic() - reported > BLOCK_SECONDS:
+                reported = time.monotonic()
+                report_progress(task.at.t + count)
+        return f"stopped after {task.max_steps:,} steps"
+
+    def _next(self, observation: object) -> Value:
+        """Return the policy's action; None where the recorded ones run out."""
+        if self._function is not None:
+            with from_policy(self._task.policy):
+                return self._function(observation)
+        if self._task.policy == "recorded":
+            action = next(self._actions, None)
+        else:
+            action = self._space.sample() if self._task.policy == "random" else self._action
+        if not self._is_game or action is None:
+            return action
+        agents = self.rec.agents
+        return {agent: action[agent] for agent in agents} if all(map(action.__contains__, agents)) else None
+
+
+def _text(action: object) -> str:
+    return json.dumps(as_json(action))

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from runner.config import from_mapping
 from runner.debugging.expressions import Array, Columns, Parser, Term
-from runner.environments.naming import action_names, actions_in_words, states_in_words
+from runner.environments.naming import actions_in_words, numbered_actions, states_in_words
 from runner.errors import RecordingError, RunnerError, nearest
 from runner.learning.learner import rules_of
 from runner.learning.watching import Changes, Watch, explorations
@@ -63,13 +63,8 @@ class JobVocabulary:
         self._mdp = recording.mdp
         self._learners = recording.agents
         self._learns = from_mapping(recording.config).algorithm != "random"
-        joint, own = [str(name) for name in actions_in_words(self._mdp)], action_names(self._mdp)
-        self._joint = joint
-        self._own = [joint]
-        if len(self._learners) > 1:
-            self._own = own or [
-                [f"action {action}" for action in range(count)] for count in self._mdp.action_counts
-            ]
+        self._joint = [str(name) for name in actions_in_words(self._mdp)]
+        self._own = numbered_actions(self._mdp) if len(self._learners) > 1 else [self._joint]
         self._state_names = [str(name) for name in states_in_words(self._mdp)]
         self.quantities: dict[Quantity, None] = {}
 

@@ -24,8 +24,8 @@ from runner.util.humanize import counted, number
 
 if TYPE_CHECKING:
     from runner.analysis.step_reference import StepRef
+    from runner.debugging.branch import Branch
     from runner.execution.branching import TrainingBranch
-    from runner.loops.branch import Branch
 
 
 @click.command("branch", cls=Command)
@@ -204,7 +204,7 @@ def _print_training(parent: Run, branch: TrainingBranch, as_json: bool) -> None:
 
 
 def _print_episode(parent: Run, branch: Branch, as_json: bool) -> None:
-    from runner.loops.branch import Outcome
+    from runner.debugging.branch import Outcome
 
     if as_json:
         both = {"parent": asdict(branch.parent), "branch": asdict(branch.outcome)}
