@@ -9,7 +9,7 @@ from typing import Any
 
 from runner.analysis.diff import can_compare_steps, divergences
 from runner.analysis.diff.sections import where_in_words
-from runner.analysis.evaluations import evaluation_after, evaluations_of
+from runner.analysis.evaluations import evaluation_after
 from runner.analysis.step_reference import StepRef
 from runner.errors import NotInRecording
 from runner.export.contents import require_steps
@@ -39,32 +39,18 @@ def locate(run: Run, request: Request, step: StepRef | None) -> Location:
             return Location(_default_time(recording, request), request)
         require_steps(recording, "look at")
         phase = "train" if step.after is None else "eval"
-        episodes, t = episodes_of(recording, phase), step.t
-        if step.after is None:
-            number, more = step.episode, Request(episodes=((step.episode, step.episode + 1),))
-            if recording.environments == 1 and number >= episodes.count:
-                raise NotInRecording(
-                    f"{recording.path}: found no training episode {number}; there are {episodes.count:,}, "
-                    "from 0."
-                )
-        else:
-            evaluations = evaluations_of(recording)
-            if recording.has_reports:
-                evaluations = evaluations_with_steps(recording, episodes_of(recording, "train"), episodes)
-            where = str(recording.path)
+        number, more = step.episode, Request(episodes=((step.episode, step.episode + 1),))
+        if step.after is not None:
+            train, evals = (episodes_of(recording, each) for each in schema.PHASES)
+            evaluations, where = evaluations_with_steps(recording, train, evals), str(recording.path)
             number = evaluation_after(evaluations, step.after, where).trial(step.episode, where)
-            # Where no evaluations are reported, the steps of all of them are exported.
-            is_chosen = recording.has_reports
-            more = Request(evaluations=(step.after,)) if is_chosen else Request(trials=(number,))
-        if recording.environments > 1:
-            steps = recording.episode_span(phase, number)
-        else:
-            steps = range(*episodes.first_step[number : number + 2].tolist())
-        if t >= len(steps):
+            more = Request(evaluations=(step.after,), trials=(number,))
+        steps = recording.episode_span(phase, number)
+        if step.t >= len(steps):
             raise NotInRecording(
-                f"{recording.path}: found no t = {t} there; the episode has {len(steps)} steps, from 0."
+                f"{recording.path}: found no t = {step.t} there; the episode has {len(steps)} steps, from 0."
             )
-        time = _time(recording, phase, steps[t])
+        time = _time(recording, phase, steps[step.t])
     if request.everything:
         return Location(time, request)
     added = dataclasses.replace(

@@ -10,8 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.evaluations import Evaluation, evaluation_after
-from runner.errors import RecordingError
+from runner.analysis.evaluations import Evaluation, evaluation_after, evaluations_of
 from runner.export.contents import require_steps, shortcomings, whole_ranges, why_no_steps
 from runner.recording import schema
 from runner.recording.reader import Recording
@@ -57,20 +56,32 @@ class Request:
 class Episodes:
     """The steps of each episode of a phase; the last episode may not have ended."""
 
-    first_step: NDArray[np.int64]
-    """[E + 1]: number of the first step within the phase; the last entry is the number of steps."""
+    start: NDArray[np.int64]
+    """[E]: number of the first step within the phase; in a vector that of all environments with it."""
+    stop: NDArray[np.int64]
+    """[E]: number after that of the last step; in a vector of all environments with it."""
     ended: int
 
     @property
     def count(self) -> int:
         """The number of episodes with steps."""
-        return len(self.first_step) - 1
+        return len(self.start)
+
+    @property
+    def lengths(self) -> NDArray[np.int64]:
+        """[E]: the number of steps."""
+        return self.stop - self.start
 
     def steps_of(self, numbers: NDArray[np.int64]) -> list[range]:
-        """Return the steps of these episodes, which ascend; those of neighbours are one range."""
-        groups = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
-        first = self.first_step
-        return [range(int(first[g[0]]), int(first[g[-1] + 1])) for g in groups if len(g)]
+        """Return the steps of these episodes; those that follow each other, or overlap, are one range."""
+        joined: list[range] = []
+        starts, stops = self.start[numbers], self.stop[numbers]
+        for k in np.argsort(starts, kind="stable").tolist():
+            start, stop = int(starts[k]), int(stops[k])
+            if joined and start <= joined[-1].stop:
+                start, stop = joined[-1].start, max(stop, joined.pop().stop)
+            joined.append(range(start, stop))
+        return joined
 
 
 @dataclass
@@ -80,7 +91,7 @@ class Selection:
     train: list[range] = field(default_factory=list)
     """The numbers of the steps of successive whole episodes."""
     evaluations: list[tuple[Evaluation, range]] = field(default_factory=list)
-    """Evaluations with their steps; all trials of a loop are one, whose other fields are 0."""
+    """Evaluations with their steps; the last steps of a loop's are one, whose other fields are 0."""
     drawn: dict[str, list[int]] = field(default_factory=dict)
     """Episodes of a loop of which pictures are drawn, by phase."""
     exported: list[str] = field(default_factory=list)
@@ -116,7 +127,7 @@ def select(recording: Recording, request: Request) -> Selection:
         return selection
     train, evals = episodes_of(recording, "train"), episodes_of(recording, "eval")
     available = evaluations_with_steps(recording, train, evals)
-    numbers = _training_episodes(recording, request, np.diff(train.first_step))
+    numbers = _training_episodes(recording, request, train.lengths)
     selection.train = train.steps_of(numbers)
     where = str(recording.path)
     chosen = {evaluation_after(available, after, where) for after in request.evaluations}
@@ -138,7 +149,11 @@ def select(recording: Recording, request: Request) -> Selection:
 def episodes_of(recording: Recording, phase: str) -> Episodes:
     """Return the episodes of a phase that have steps."""
     steps, episodes = schema.PHASES[phase]
-    total = recording.count(steps)
+    total, n = recording.count(steps), recording.environments
+    if n > 1:
+        records = recording.episodes(phase)
+        last, length = (records[name].astype(np.int64) for name in ("last_step", "length"))
+        return Episodes((last - (length - 1) * n) // n * n, (last // n + 1) * n, len(records))
     first = np.full(recording.count(episodes) + 1, -1, np.int64)
     first[0] = 0
     for block in recording.blocks(episodes):
@@ -149,20 +164,24 @@ def episodes_of(recording: Recording, phase: str) -> Episodes:
     # Steps of episodes that were lost in a repair count as those of the first episode after them.
     first = np.maximum.accumulate(first)
     first = first[first <= total]
-    return Episodes(np.append(first, total) if total > first[-1] else first, len(first) - 1)
+    ended = len(first) - 1
+    first = np.append(first, total) if total > first[-1] else first
+    return Episodes(first[:-1], first[1:], ended)
 
 
 def evaluations_with_steps(recording: Recording, train: Episodes, evals: Episodes) -> list[Evaluation]:
-    """Return the evaluations that have steps, including an incomplete one."""
+    """Return the evaluations that have steps; of a job including an incomplete one."""
+    if not recording.has_reports:
+        return evaluations_of(recording)
     evaluations = []
     trials = int(recording.config["evaluation"]["trials"]) if evals.count else 1
     for start in range(0, evals.count, trials):
         stop = min(start + trials, evals.count)
-        bounds = int(evals.first_step[start]), int(evals.first_step[stop])
+        bounds = int(evals.start[start]), int(evals.stop[stop - 1])
         block = next(recording.blocks(schema.EVAL_STEP, *bounds), None)
         if block is not None:  # otherwise all of its steps were lost in a repair
             trained = int(block["log_time"][0]) // schema.STEP_NANOSECONDS - (int(block["step"][0]) + 1)
-            after = int(np.searchsorted(train.first_step[1 : train.ended + 1], trained, side="right"))
+            after = int(np.searchsorted(train.stop[: train.ended], trained, side="right"))
             evaluations.append(Evaluation(after, trained, start, stop))
     return evaluations
 
@@ -242,32 +261,30 @@ def _select_loop(recording: Recording, request: Request, selection: Selection) -
     """Return the steps of a loop in a request; by default all of them unless there are too many.
 
     Raises:
-        RecordingError: an episode does not exist, or an evaluation is requested, of which a loop has none.
+        NotInRecording: an episode or an evaluation does not exist.
     """
-    if request.evaluations:
-        raise RecordingError(
-            f"{recording.path}: a loop has no numbered evaluations; --all exports all steps."
-        )
     if recording.kind == "variable":
         selection.warnings.append("Observations and actions vary in size (texts): they are not drawn.")
     total, tested = recording.count(schema.TRAIN_STEP), recording.count(schema.EVAL_STEP)
-    n = recording.environments
+    n, train = recording.environments, episodes_of(recording, "train")
     is_short = total <= DEFAULT_STEPS or recording.kind == "variable"
     if request.everything or (request.is_default and is_short):
         stop = total if request.everything else min(total, DEFAULT_STEPS)
         selection.train = [range(stop)] if stop else []
-    elif n > 1:
-        lengths = recording.episodes("train")["length"].astype(np.int64) * n
-        numbers = _training_episodes(recording, request, lengths)
-        selection.train = _joined([recording.episode_span("train", int(number)) for number in numbers])
     else:
-        train = episodes_of(recording, "train")
-        selection.train = train.steps_of(_training_episodes(recording, request, np.diff(train.first_step)))
+        selection.train = train.steps_of(_training_episodes(recording, request, train.lengths))
     if request.frames:
         _select_drawn(recording, request, selection)
     first = 0 if request.everything else max(0, tested - DEFAULT_STEPS)
+    evals, where = episodes_of(recording, "eval"), str(recording.path)
+    for after in sorted(set(request.evaluations)):
+        one = evaluation_after(evaluations_of(recording), after, where)
+        steps = evals.steps_of(np.arange(one.start, one.stop))
+        selection.evaluations += [(one, range(each.start, min(each.stop, first))) for each in steps]
     if tested:
-        selection.evaluations = [(Evaluation(0, 0, 0, 0), range(first, tested))]
+        selection.evaluations.append((Evaluation(0, 0, 0, 0), range(first, tested)))
+    selection.evaluations = [(one, steps) for one, steps in selection.evaluations if len(steps)]
+    first -= sum(len(steps) for _, steps in selection.evaluations[:-1])
     shown = sum(map(len, selection.train))
     evaluated = f", {tested - first:,} of {tested:,} of evaluation" if tested else ""
     environments = f" in {n} environments" if n > 1 else ""
@@ -286,9 +303,7 @@ def _select_drawn(recording: Recording, request: Request, selection: Selection) 
         if not recording.count(schema.PHASES[phase][0]):
             continue
         ended = recording.episodes(phase)
-        lengths = (
-            ended["length"].astype(np.int64) if n > 1 else np.diff(episodes_of(recording, phase).first_step)
-        )
+        lengths = episodes_of(recording, phase).lengths // n
         numbers = [np.empty(0, np.int64)]
         if request.everything:
             numbers.append(np.arange(len(lengths)))
@@ -315,16 +330,3 @@ def _select_drawn(recording: Recording, request: Request, selection: Selection) 
         selection.left_out.append(
             f"pictures of {total - drawn:,} episodes (--episodes START:STOP selects; --all: everything)"
         )
-
-
-def _joined(episodes: Sequence[range]) -> list[range]:
-    """Return the steps of episodes of a vector, and of its other environments meanwhile, as few ranges."""
-    joined: list[range] = []
-    for steps in sorted(episodes, key=lambda steps: steps.start):
-        start = steps.start // steps.step * steps.step
-        stop = steps.stop + -steps.stop % steps.step
-        if joined and start <= joined[-1].stop:
-            joined[-1] = range(joined[-1].start, max(stop, joined[-1].stop))
-        else:
-            joined.append(range(start, stop))
-    return joined

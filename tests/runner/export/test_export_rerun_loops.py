@@ -18,6 +18,7 @@ from runner.errors import RecordingError
 from runner.export.encoded import encoded_picture
 from runner.export.pictures import Source as PictureSource
 from runner.export.pictures import pictures
+from runner.export.rerun import selection
 from runner.export.rerun.location import locate
 from runner.export.rerun.runs import Source
 from runner.export.rerun.selection import Request, select
@@ -253,3 +254,26 @@ def test_a_run_with_tables_and_a_loop_are_shown_together(pictured, tmp_path):
     entities = {str(chunk.entity_path) for chunk in chunks}
     for run in runs:
         assert any(entity.startswith(f"/{run.run_id}/train/grid") for entity in entities), run
+
+
+def test_evaluations_of_a_loop_are_selected_by_number(tmp_path, monkeypatch):
+    monkeypatch.setattr(selection, "DEFAULT_STEPS", 6)
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="loop") as env:
+        for phase in ("eval", "train", "eval", "train", "eval"):
+            with env.phase(phase):
+                play_episode(env)
+    with open_recording(env.run.recording) as recording:
+        spans = [recording.episode_span("eval", number) for number in range(3)]
+        chosen = select(recording, Request(evaluations=(1,)))
+        assert set(spans[1]) <= {step for _, steps in chosen.evaluations for step in steps}
+        assert not set(spans[0]) & {step for _, steps in chosen.evaluations for step in steps}
+        with pytest.raises(RecordingError, match="found no evaluation after 7 episodes"):
+            select(recording, Request(evaluations=(7,)))
+    assert locate(env.run, Request(), StepRef(0, 1, 0)).request.evaluations == (0,)
+
+
+def play_episode(env):
+    """Take the same action until the episode is over."""
+    env.reset(seed=1)
+    while not any(env.step(0)[2:4]):
+        pass
