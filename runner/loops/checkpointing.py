@@ -11,13 +11,11 @@ from typing import Any, Final
 import numpy as np
 
 from runner.errors import ConfigError
-from runner.loops.values import as_array
+from runner.loops.values import numbers_of
 from runner.runs.checkpoints import MAX_NAME_LENGTH, is_checkpoint_name
 from runner.util.extras import require
 
 _MAX_KEYS: Final = 1 << 20
-_MAX_NUMBER: Final = 8
-"""Bytes of the widest number that safetensors have."""
 
 
 def content_of(name: str, value: object, pickle: bool) -> tuple[bytes | memoryview | Path, str]:
@@ -76,17 +74,9 @@ def _safetensors(name: str, values: Mapping[str, Any]) -> bytes:
     save = require(module, extra="safetensors", purpose="a checkpoint of arrays or tensors").save
     if is_torch:  # a copy of each: tensors that share memory are refused
         return bytes(save({key: value.detach().cpu().contiguous().clone() for key, value in values.items()}))
-    arrays = {}
-    for key, value in values.items():
-        try:
-            arrays[key] = np.array(as_array(value), order="C")
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise ConfigError(
-                f"checkpoint: found no array of numbers at {key!r} of {name!r} ({error})"
-            ) from error
-        if arrays[key].dtype.kind not in "biuf" or arrays[key].dtype.itemsize > _MAX_NUMBER:
-            raise ConfigError(
-                f"checkpoint: found {type(value).__name__} at {key!r} of {name!r}, expected an array of "
-                "numbers; pickle=True records any object"
-            )
+    expected = "an array of numbers; pickle=True records any object"
+    arrays = {
+        key: np.array(numbers_of(value, "checkpoint", f"at {key!r} of {name!r}", expected), order="C")
+        for key, value in values.items()
+    }
     return bytes(save(arrays))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import ConfigError, RunnerError
-from runner.loops.values import as_array
+from runner.loops.values import numbers_of
 from runner.loops.vector_rows import PhaseRows
 from runner.recording import schema
 from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAME_LENGTH, MAX_NAMES, ExtraLayout
@@ -301,15 +301,4 @@ def _fitting(name: str, value: object, base: np.dtype[np.generic], shape: tuple[
 
 
 def _numbers(name: str, value: object) -> Array:
-    try:
-        array = as_array(value)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise ConfigError(
-            f"extras: found no number and no array of numbers for {name!r} ({error})"
-        ) from error
-    if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8:
-        raise ConfigError(
-            f"extras: found {type(value).__name__} of {array.dtype} for {name!r}, expected a number or an "
-            "array of numbers"
-        )
-    return array
+    return numbers_of(value, "extras", f"for {name!r}", "a number or an array of numbers")

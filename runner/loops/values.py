@@ -80,20 +80,30 @@ def arrays_of(name: str, value: object) -> Iterator[tuple[str, Array]]:
         for key, part in inside.items():
             yield from arrays_of(f"{name}/{key}", part)
         return
-    try:
-        values = as_array(value)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ConfigError(f"snapshot: found no array of numbers for {name!r} ({error})") from error
-    if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8:
-        raise ConfigError(
-            f"snapshot: found {values.dtype} for {name!r}, expected an array of numbers and a name."
-        )
+    values = numbers_of(value, "snapshot", f"for {name!r}", "an array of numbers")
     if values.nbytes > MAX_ARRAY_BYTES:
         raise ConfigError(
             f"snapshot: found {values.nbytes:,} bytes for {name!r}, expected at most "
             f"{MAX_ARRAY_BYTES:,}; record it in parts."
         )
     yield name, values.astype(values.dtype.newbyteorder("<"), copy=False)
+
+
+def numbers_of(value: object, where: str, place: str, expected: str) -> Array:
+    """Return an array of numbers of at most 64 bits; the other arguments are for the error.
+
+    Raises:
+        ConfigError: it holds something else.
+    """
+    try:
+        values = as_array(value)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        found = f"found no array of numbers {place} ({error})"
+        raise ConfigError(f"{where}: {found}, expected {expected}") from error
+    if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8:
+        found = f"found {type(value).__name__} of {values.dtype} {place}"
+        raise ConfigError(f"{where}: {found}, expected {expected}")
+    return values
 
 
 def as_array(value: object) -> Array:

@@ -206,19 +206,18 @@ class Recording(RowReader):
         )
         return read_layouts(columns, str(self.path))
 
-    def transitions(self, phase: str, times: range | None = None) -> Iterator[Any]:
+    def transitions(self, phase: str) -> Iterator[Any]:
         """Yield the steps of a loop's phase one by one, with `action` and `next_observation` as values.
 
         Those of the kind `step` have `state`, `action` and `next_state`, counted from 0. They are NumPy
-        records where values have one size (`blocks` yields many at once), else dictionaries; of these
-        `times` selects some, as in `decoded`.
+        records where values have one size (`blocks` yields many at once), else dictionaries.
         """
         topic = self.topic(f"/{phase}/step")
-        yield from self._values(topic, times, action="action", next_observation="observation")
+        yield from self._values(topic, action="action", next_observation="observation")
 
     def resets(self, phase: str) -> Iterator[Any]:
         """Yield the resets of a phase one by one, as `transitions` yields steps."""
-        yield from self._values(self.topic(f"/{phase}/reset"), None, observation="observation")
+        yield from self._values(self.topic(f"/{phase}/reset"), observation="observation")
 
     def reset_states(self, phase: str, times: range | None = None) -> Iterator[ResetState]:
         """Yield what resets of a loop's phase without a seed depend on, in the order of the resets.
@@ -233,13 +232,13 @@ class Recording(RowReader):
             for _, state in self._parsed(topic, decode_reset_state, times=times):
                 yield state
 
-    def _values(self, topic: Topic, times: range | None, **spaces: str) -> Iterator[Any]:
+    def _values(self, topic: Topic, **spaces: str) -> Iterator[Any]:
         """Yield a topic's messages one by one; `spaces` names the space of each field that is a value."""
         if topic in self.dtypes:
             for block in self.blocks(topic):
                 yield from block
             return
-        for fields in self.decoded(topic, times=times):
+        for fields in self.decoded(topic):
             where = f"{self.path}: {topic.name} at {fields['log_time']} ns"
             for name, space in spaces.items():
                 fields[name] = decode_value(self.spaces[space], fields[name], where)
