@@ -281,37 +281,46 @@ def loop_summary(recording: Recording) -> Summary:
     )
 
 
+def metric_columns(records: Sequence[EvaluationRecord], is_narrow: bool = False) -> dict[str, list[str]]:
+    """Return position and metrics of evaluations as text, by heading; a loop's leave out unknown metrics.
+
+    Narrow ones join the values of several agents: `-800.0/-812.5`.
+    """
+    is_job = records[0].training is not None
+    columns = {"episode": [f"{record.episode:,}" for record in records]}
+    if not is_job:
+        columns["trials"] = [f"{record.trials:,}" for record in records]
+    for metric in METRICS:
+        if not is_job and all(record.value(metric.name) is None for record in records):
+            continue
+        values = [record.values[metric.name] for record in records]
+        texts = [list(map(humanize.number, own.values())) for own in values]
+        if is_narrow or len(texts[0]) == 1:
+            columns[metric.heading] = ["/".join(own) for own in texts]
+            continue
+        for agent, *own in zip(values[0], *texts, strict=True):
+            columns[f"{metric.heading} {spoken(agent)}"] = own
+    return columns
+
+
 def evaluations_section(recording: Recording, records: Sequence[EvaluationRecord]) -> Section:
     """Return evaluations of a recording, one at least, as a table; a loop's leaves out unknown metrics."""
-    agents, has_reports = recording.agents, recording.has_reports
-    metrics = [
-        metric
-        for metric in METRICS
-        if has_reports or any(record.value(metric.name) is not None for record in records)
-    ]
-    headings = ["episode"] if has_reports else ["episode", "trials"]
-    for metric in metrics:
-        whose = [f" {spoken(agent)}" for agent in agents] if metric.per_agent and len(agents) > 1 else [""]
-        headings += [f"{metric.heading}{agent}" for agent in whose]
+    columns = list(metric_columns(records).items())
     for name in recording.event_names:
         agent, dot, _ = name.rpartition(".")
         words = event_in_words(name)
-        headings.append(f"{words[: len(agent)]}\n{words[len(agent) + 1 :]}" if dot else words)
-    rows = []
-    for record in records:
-        cells = [f"{record.episode:,}"] if has_reports else [f"{record.episode:,}", f"{record.trials:,}"]
-        for metric in metrics:
-            cells += map(humanize.number, record.values[metric.name].values())
-        cells += [f"{count:,}" for count in record.events.values()]
-        if record.training:
-            cells.append("/".join(map(humanize.number, record.training.percent_filled.values())))
-        rows.append(tuple(cells))
+        heading = f"{words[: len(agent)]}\n{words[len(agent) + 1 :]}" if dot else words
+        columns.append((heading, [f"{record.events[name]:,}" for record in records]))
+    filled = [list(record.training.percent_filled.values()) for record in records if record.training]
+    if filled:
+        columns.append(("filled %", ["/".join(map(humanize.number, own)) for own in filled]))
     explanation = (
         f"Each row: {records[0].trials} trials with the greedy policy after that number of training "
         "episodes. Events are counted over all trials."
-        if has_reports
+        if recording.has_reports
         else "Each row: the evaluation episodes of the loop after that number of training episodes. Events "
         "are counted over all of them."
     )
-    grid = Grid((*headings, *(["filled %"] if has_reports else [])), rows)
+    headings, cells = zip(*columns, strict=True)
+    grid = Grid(headings, list(zip(*cells, strict=True)))
     return Section("Evaluations", [explanation], [grid])

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from runner.analysis.evaluations import metric_columns
 from runner.cli.output import UNBOUNDED, table
 from runner.environments.naming import spoken
-from runner.recording.metrics import METRICS
-from runner.util.humanize import number
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -48,11 +47,14 @@ def evaluation_table(
     Successes are shown for each agent (`12/9`), other events summed over the agents. Events that do not fit
     the terminal are left out, and named in the caption.
     """
+    measures = metric_columns(records, is_narrow=True)
+    if records[0].training is not None:  # the returns of a job take more room than they say
+        measures = {heading: own for heading, own in measures.items() if heading != "mean return"}
     events = _events(records[0].events, success_events)
     unbounded = console.options.update(width=UNBOUNDED)
     left_out: list[str] = []
     while True:
-        grid = _drawn(_measures(records) | _counts(records, events) | _fill(records))
+        grid = _drawn(measures | _counts(records, events) | _fill(records))
         if left_out:
             grid.caption = f"No room for: {', '.join(left_out)}."
             grid.caption_justify = "left"
@@ -70,20 +72,6 @@ def _events(names: Iterable[str], success_events: Sequence[str]) -> list[_Event]
         kinds.setdefault(name.rpartition(".")[2], []).append(name)
     events = [_Event(kind, tuple(own), own[0] in success_events) for kind, own in kinds.items()]
     return sorted(events, key=lambda event: (not event.is_success, len(event.names)))
-
-
-def _measures(records: Sequence[EvaluationRecord]) -> Columns:
-    """Return the columns of the metrics; of a loop also the returns, and only the metrics that it has."""
-    columns = {"episode": [f"{record.episode:,}" for record in records]}
-    has_reports = all(record.training for record in records)
-    if not has_reports:
-        columns["trials"] = [f"{record.trials:,}" for record in records]
-    for metric in METRICS:
-        values = [record.values[metric.name].values() for record in records]
-        is_known = any(value is not None for own in values for value in own)
-        if not metric.per_agent if has_reports else metric.per_agent or is_known:
-            columns[metric.heading] = ["/".join(map(number, own)) for own in values]
-    return columns
 
 
 def _counts(records: Sequence[EvaluationRecord], events: Sequence[_Event]) -> Columns:
