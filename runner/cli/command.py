@@ -18,6 +18,8 @@ import click
 
 from runner.errors import nearest
 
+_MAX_SHORT_HELP = 200
+
 Declared = Any
 """The default of a parameter, which stands for values of the parameter's own type."""
 
@@ -78,6 +80,17 @@ class Command(click.Command):
         super().__init__(name, **attributes | {"callback": call, "params": list(call.parameters())})
         self.help = _with_examples(self.help)
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments; where settings can be changed, an unknown option is probably one of them."""
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            if not any("--set" in parameter.opts for parameter in self.params):
+                raise
+            name = error.option_name.lstrip("-").replace("-", "_")
+            message = f"{error.message} A setting is changed by --set {name}=VALUE."
+            raise click.NoSuchOption(error.option_name, message, error.possibilities, ctx) from None
+
 
 class Group(click.Group):
     """A group of such commands, which suggests the nearest name for an unknown one."""
@@ -98,5 +111,19 @@ class Group(click.Group):
         """Find a command, or suggest one."""
         known = self.list_commands(ctx)
         if args[0] not in known and not args[0].startswith("-") and not ctx.resilient_parsing:
-            ctx.fail(f"there is no command {args[0]!r}.{nearest(args[0], known)}")
+            commands = {name: self.get_command(ctx, name) for name in known}
+            inside = [
+                f" Did you mean '{name} {args[0]}'?"
+                for name, command in commands.items()
+                if isinstance(command, click.Group) and args[0] in command.list_commands(ctx)
+            ]
+            near = inside[0] if inside else nearest(args[0], known)
+            ctx.fail(f"there is no command {args[0]!r}.{near}")
         return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        """List the commands with the first sentence of their help, wrapped instead of cut off."""
+        with formatter.section("Commands"):
+            formatter.write_dl(
+                [(name, each.get_short_help_str(_MAX_SHORT_HELP)) for name, each in self.commands.items()]
+            )

@@ -23,7 +23,7 @@ READ_BYTES: Final = 1 << 20
 TOKEN_VARIABLE: Final = "DUALTAXI_TOKEN"
 TOKEN_FILE_VARIABLE: Final = "DUALTAXI_TOKEN_FILE"
 _HOW_TO_GIVE_A_TOKEN: Final = (
-    f"a token is given by --token, --token-file, ${TOKEN_VARIABLE} or a file named by ${TOKEN_FILE_VARIABLE}."
+    f"give a token by --token, --token-file, ${TOKEN_VARIABLE} or a file named by ${TOKEN_FILE_VARIABLE}."
 )
 _MAX_TOKEN_FILE: Final = 4096
 FIRST_PAUSE: Final = 0.2
@@ -199,7 +199,7 @@ class Connection:
         with contextlib.suppress(ValueError, KeyError, TypeError):
             message = str(response.json()["error"]["message"])
         if response.status_code == HTTPStatus.UNAUTHORIZED and not self._has_token:
-            message = f"needs a token, and none was given; {_HOW_TO_GIVE_A_TOKEN}"
+            message = f"needs a token, found none; {_HOW_TO_GIVE_A_TOKEN}"
         kind = ServerUnavailable if response.status_code in _TEMPORARY else ServerError
         retry = response.headers.get("retry-after", "")
         seconds = float(retry) if retry.isdecimal() else 0.0

@@ -104,7 +104,11 @@ class Guard:
         if not any(path.startswith(each) if each.endswith("/") else path == each for each in OPEN_PATHS):
             token = request.state.token = self._token(request)
             if token is not None and not is_read and not token.can_write:
-                raise Refused(HTTPStatus.FORBIDDEN, "token: found one for reading, expected one for writing.")
+                raise Refused(
+                    HTTPStatus.FORBIDDEN,
+                    "token: found one for reading, expected one for writing, as `dualtaxi token create NAME "
+                    "--scope write` makes.",
+                )
             if token is None and self._settings.needs_token:
                 raise Unauthorized("token: found none, expected `Authorization: Bearer TOKEN`, or a login.")
             if "authorization" in headers:

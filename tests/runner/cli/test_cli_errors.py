@@ -35,6 +35,8 @@ def test_several_problems_follow_the_word_error(command, bad):
         (["ls", "status:::"], "unexpected ':'"),
         (["ls", "--nope"], "--nope"),
         (["shwo"], "Did you mean 'show'?"),
+        (["push"], "Did you mean 'remote push'?"),
+        (["run", "quick", "--episodes", "3"], "changed by --set episodes=VALUE"),
         (["view", "x", "--size", "foo"], "1600x900"),
     ],
     ids=lambda words: " ".join(words) if isinstance(words, list) else "",
