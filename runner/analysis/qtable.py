@@ -46,7 +46,7 @@ class ActionValue(TypedDict):
 class TablesDescription(TypedDict):
     """The Q-tables at a step; if a state was chosen, with its values."""
 
-    run: str
+    run_id: str
     step: int
     tables: list[TableSummary]
     state: NotRequired[int]
@@ -66,7 +66,7 @@ def replay_at(recording: Recording, step: int | None = None, episode: int | None
 def describe_tables(recording: Recording, replay: TableReplay, state: int | None = None) -> TablesDescription:
     """Return the tables at the step of a replay as JSON can hold them, with a state's values if given."""
     tables = [summarize(agent, q) for agent, q in zip(replay.agents, replay.tables, strict=True)]
-    description: TablesDescription = {"run": recording.run_id, "step": replay.step, "tables": tables}
+    description: TablesDescription = {"run_id": recording.run_id, "step": replay.step, "tables": tables}
     if state is not None:
         _add_state(description, recording, replay, state)
     return description

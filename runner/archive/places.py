@@ -16,7 +16,7 @@ from typing import Final
 
 from runner.errors import RecordingError, StorageError
 from runner.runs.run import RUN_FILE, Run
-from runner.util.files import CACHE_VARIABLE, RESTORED, cache_folder, storage_errors
+from runner.util.files import CACHE_VARIABLE, RESTORED, cache_folder, remove_oldest, storage_errors
 from runner.util.humanize import size
 from runner.util.processes import ChildProcess, OutOfMemory, ProcessDied, report_progress
 
@@ -60,11 +60,7 @@ def at_hand(run: Run, log: Callable[[str], None] = lambda _: None, report: Repor
             with FileLock(cached.with_suffix(".lock"), timeout=LOCK_SECONDS):
                 if not cached.is_file():
                     log(f"Run {run.run_id} is archived; restoring it from {run.archive.target}.")
-                    others = sorted(
-                        cached.parent.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True
-                    )
-                    for old in others[MAX_CACHED - 1 :]:
-                        old.unlink(missing_ok=True)
+                    remove_oldest(cached.parent, "*.mcap", keep=MAX_CACHED - 1)
                     fresh = cached.with_suffix(".restoring")
                     with archive_of(run) as folder:
                         restore_to(folder, fresh, digest, report)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from runner.errors import ConfigError
 from runner.loops.options import pillow
 from runner.loops.pictures import Picture
-from runner.loops.values import as_array
+from runner.loops.values import numbers_of
 from runner.util.arrays import Array
 from runner.util.extras import require
 from runner.util.jsonable import as_json
@@ -91,14 +91,8 @@ def histogram_of(values: object) -> dict[str, Array]:
     return {"counts": counts, "edges": edges}
 
 
-def _numbers(value: object) -> NDArray[Any]:
-    try:
-        array = as_array(value)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ConfigError(f"found {type(value).__name__}, expected an array of numbers ({error})") from error
-    if array.dtype.kind not in "biuf":
-        raise ConfigError(f"found {type(value).__name__} of {array.dtype}, expected an array of numbers")
-    return array
+def _numbers(value: object) -> Array:
+    return numbers_of(value, "media", "as data", "an array of numbers")
 
 
 def _tiled(images: NDArray[Any]) -> NDArray[Any]:

@@ -38,7 +38,7 @@ from runner.loops.vector import (
 from runner.recording.maker import EnvironmentMaker
 from runner.replay.games import MultiAgent
 from runner.runs.run import Run
-from runner.util.values import Json
+from runner.util.values import Json, flatten
 
 require_tested("ray", "rllib", ("2.60", "2.60"))
 
@@ -219,7 +219,7 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
             return
         steps = result.get(_STEPS, result.get("env_runners", {}).get(_STEPS, 0))
         self._run.at_step(int(steps))
-        self._run.log(dict(_numbers({key: result[key] for key in _RESULTS if key in result})))
+        self._run.log(_numbers({key: result[key] for key in _RESULTS if key in result}))
         self._iterations += 1
         every = self._recording.checkpoint_every
         if every and self._iterations % every == 0:
@@ -233,8 +233,9 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
             "module": algorithm.get_module()
         }
         for name, module in modules.items():
-            if state := dict(_arrays(module.get_state(inference_only=True))):
-                self._run.checkpoint(name, state)
+            state = flatten(module.get_state(inference_only=True), separator="/")
+            if arrays := {key: value for key, value in state.items() if hasattr(value, "dtype")}:
+                self._run.checkpoint(name, arrays)
 
     def _end(self, algorithm: Algorithm) -> None:
         """End the run; the env runners are still there."""
@@ -362,20 +363,10 @@ def _leave(env_runner: object) -> None:
         recorded._loop.close()
 
 
-def _numbers(values: Mapping[object, object], prefix: str = "") -> Iterator[tuple[str, float]]:
-    """Yield the numbers in nested mappings by their names, joined by `/`."""
-    for key, value in values.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, Mapping):
-            yield from _numbers(value, f"{name}/")
-        elif isinstance(value, int | float | np.number) and not _CLOCK.search(name):
-            yield name, float(value)
-
-
-def _arrays(state: Mapping[object, object], prefix: str = "") -> Iterator[tuple[str, object]]:
-    """Yield the arrays in nested mappings by their names, joined by `/`."""
-    for key, value in state.items():
-        if isinstance(value, Mapping):
-            yield from _arrays(value, f"{prefix}{key}/")
-        elif hasattr(value, "dtype"):
-            yield f"{prefix}{key}", value
+def _numbers(values: Mapping[str, object]) -> dict[str, float]:
+    """Return the numbers in nested mappings by their names, joined by `/`."""
+    return {
+        name: float(value)
+        for name, value in flatten(values, separator="/").items()
+        if isinstance(value, int | float | np.number) and not _CLOCK.search(name)
+    }

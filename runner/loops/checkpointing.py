@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,6 +14,7 @@ from runner.errors import ConfigError
 from runner.loops.values import numbers_of
 from runner.runs.checkpoints import MAX_NAME_LENGTH, is_checkpoint_name
 from runner.util.extras import require
+from runner.util.values import flatten
 
 _MAX_KEYS: Final = 1 << 20
 
@@ -49,20 +50,11 @@ def content_of(name: str, value: object, pickle: bool) -> tuple[bytes | memoryvi
             )
         return path, "safetensors" if path.suffix == ".safetensors" else "file"
     if isinstance(value, Mapping):
-        return _safetensors(name, dict(_leaves(value, ""))), "safetensors"
+        return _safetensors(name, flatten(value, separator="/")), "safetensors"
     raise ConfigError(
         f"checkpoint: found {type(value).__name__} for {name!r}, expected bytes, a path, or a mapping of "
         "arrays or tensors, such as model.state_dict(); pickle=True records any other object"
     )
-
-
-def _leaves(values: Mapping[object, object], prefix: str) -> Iterator[tuple[str, object]]:
-    """Yield the values of nested mappings, named `outer/inner`."""
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{prefix}{key}/")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def _safetensors(name: str, values: Mapping[str, Any]) -> bytes:

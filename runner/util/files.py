@@ -36,6 +36,13 @@ def cache_folder() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "dualtaxi"
 
 
+def remove_oldest(folder: Path, pattern: str, keep: int) -> None:
+    """Remove the files of a pattern in a folder, but for those that were changed last."""
+    files = sorted(folder.glob(pattern), key=lambda path: path.stat().st_mtime, reverse=True)
+    for old in files[keep:]:
+        old.unlink(missing_ok=True)
+
+
 def open_regular(path: str | os.PathLike[str], follow_link: bool = True) -> BinaryIO:
     """Return a regular file, opened for reading.
 

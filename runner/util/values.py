@@ -72,7 +72,9 @@ def as_utf8(text: str) -> str:
     return text.encode(errors="surrogateescape").decode(errors="backslashreplace")
 
 
-def flatten(values: Mapping[str, object], keep_empty: bool = False, prefix: str = "") -> dict[str, object]:
+def flatten(
+    values: Mapping[str, object], keep_empty: bool = False, prefix: str = "", separator: str = "."
+) -> dict[str, object]:
     """Return the values in nested mappings by dotted key, such as `evaluation.trials`.
 
     Args:
@@ -81,7 +83,7 @@ def flatten(values: Mapping[str, object], keep_empty: bool = False, prefix: str 
     flat: dict[str, object] = {}
     for key, value in values.items():
         if isinstance(value, Mapping) and (value or not keep_empty):
-            flat |= flatten(value, keep_empty, f"{prefix}{key}.")
+            flat |= flatten(value, keep_empty, f"{prefix}{key}{separator}", separator)
         else:
             flat[f"{prefix}{key}"] = value
     return flat

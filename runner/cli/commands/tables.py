@@ -95,7 +95,7 @@ def qtable_command(
 
 
 def _draw(values: TablesDescription) -> None:
-    head = {"run": values["run"], "step": f"after {values['step']:,} training steps"}
+    head = {"run": values["run_id"], "step": f"after {values['step']:,} training steps"}
     for each in values["tables"]:
         head[each["agent"]] = (
             f"{each['states']:,} states, {each['actions']} actions, {each['percent_filled']:.1f} % filled, "

@@ -36,9 +36,7 @@ def cached_export(
 
         with storage_errors(folder, f"set {CACHE_VARIABLE} to another folder"):
             folder.mkdir(parents=True, exist_ok=True)
-            cached = sorted(folder.glob("*.rrd"), key=lambda file: file.stat().st_mtime, reverse=True)
-            for old in cached[MAX_CACHED - 1 :]:
-                old.unlink(missing_ok=True)
+            files.remove_oldest(folder, "*.rrd", keep=MAX_CACHED - 1)
         return path, export_runs(runs, recordings, request, path, stage)
 
 
