@@ -229,7 +229,7 @@ def _plain_columns(records: NDArray[np.void], names: Sequence[str]) -> dict[str,
 
 
 def _spread(columns: Mapping[str, NDArray[Any]]) -> dict[str, Array]:
-    """Return columns of which those of composed values, such as a `Dict` space's, are a column a part."""
+    """Return columns in which composed values, such as those of a `Dict` space, have one for each part."""
     spread: dict[str, Array] = {}
     for name, values in columns.items():
         if values.dtype.names is None:

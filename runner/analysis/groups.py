@@ -68,8 +68,8 @@ def grouped(
     """Return runs in groups for a comparison, and notes on them, a sentence each.
 
     A group has the runs whose configurations differ in nothing but the seed, whatever their names and however
-    they were recorded; or, with `by`, those that have the same value there. Of a job that was run twice one
-    run counts, as in `groups_of`. Several loops of one configuration and seed, such as the workers of one
+    they were recorded; or, with `by`, those that have the same value there. A job that was run twice
+    counts once, as in `groups_of`. Several loops of one configuration and seed, such as the workers of one
     training, all count: the value of their seed is the mean over them.
 
     Args:

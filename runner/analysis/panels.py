@@ -27,7 +27,7 @@ class NoMetrics(RunnerError):
 class Curve:
     """One line of a panel, float64 arrays of equal length.
 
-    Of several runs it is their interquartile mean with its 95 % interval, or below four runs their mean and
+    For several runs it is their interquartile mean with its 95 % interval, or below four runs their mean and
     range.
     """
 

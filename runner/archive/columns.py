@@ -46,7 +46,7 @@ class Shape:
     dtypes: Mapping[Topic, np.dtype[np.void]]
     """The dtype of each fixed-width topic's message records."""
     spaces: Mapping[str, SpaceColumns] = field(default_factory=dict)
-    """Of a loop, by the field with the values: `action`, `next_observation`, `observation`, `extra`."""
+    """The spaces of a loop by field: `action`, `next_observation`, `observation`, `extra`."""
     extras: tuple[ExtraLayout, ...] = ()
     """The names of extras, from when on."""
 

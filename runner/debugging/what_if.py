@@ -50,7 +50,7 @@ class Branched:
     """The episode to which an action leads."""
 
     place: EpisodePlace
-    """Of the recorded episode."""
+    """Where the recorded episode is."""
     steps: NDArray[np.void]
     """Those up to the branch as they were recorded, then those played."""
     outcome: Outcome

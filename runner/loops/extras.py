@@ -37,7 +37,7 @@ class _Column(NamedTuple):
 
     dtype: np.dtype[np.generic]
     shape: tuple[int, ...]
-    """Of a row: [*batch, ...]."""
+    """The shape of a row: [*batch, ...]."""
     scalars: frozenset[type]
     """The classes of single numbers that it holds exactly."""
     values: Array

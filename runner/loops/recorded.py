@@ -114,8 +114,8 @@ class Recorded(Generic[R]):
             rec.note_step(td_error=error)
             rec.note_step({"td error": error})
 
-        A name keeps the dtype and the shape of its first value. Of a vector environment a value is an array
-        [N, ...]; of several agents it is a mapping of names for each agent.
+        A name keeps the dtype and the shape of its first value. In a vector environment a value is an array
+        [N, ...]; with several agents it is a mapping of names for each agent.
 
         Raises:
             ConfigError: a name or a value cannot be recorded.

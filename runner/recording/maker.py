@@ -89,7 +89,7 @@ class EnvironmentMaker:
     action_names: tuple[str, ...] = ()
     """The names of the actions of a `Discrete` space, the least action's first; empty if unknown."""
     agent_action_names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """Of a game, the same by agent; agents without names are left out."""
+    """The same for each agent of a game; agents without names are left out."""
 
     def is_like(self, other: EnvironmentMaker) -> bool:
         """Return whether another maker makes the environment, or each of a vector, in the same way."""

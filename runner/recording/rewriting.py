@@ -41,8 +41,8 @@ def rewrite(
 ) -> None:
     """Write a recording into a new file with its metadata changed.
 
-    Of a recording that was cut off, everything up to its last whole chunk is written; the new file has
-    an index and a summary, but no result either.
+    A recording that was cut off is written up to its last whole chunk; the new file has an index and a
+    summary, but no result either.
 
     Args:
         change: what becomes of each metadata record.

@@ -134,7 +134,7 @@ class RowReader(TopicReader):
     def whole_steps(self, phase: str) -> int:
         """Return how many steps of a loop's phase are known to have their resets.
 
-        Of a recording that was cut off these are the steps up to the first end of an episode after its last
+        In a recording that was cut off these are the steps up to the first end of an episode after its last
         reset: what comes later may lack its reset, since topics are written one after the other.
         """
         n, total = self.environments, self.step_count(phase)

@@ -36,9 +36,9 @@ class Dtypes:
     """The dtypes of recorded observations; `object` where values vary in size."""
 
     step: np.dtype[np.generic]
-    """Of the observation after a step."""
+    """That of the observation after a step."""
     reset: np.dtype[np.generic]
-    """Of the first observation of an episode."""
+    """That of the first observation of an episode."""
 
 
 class Results:

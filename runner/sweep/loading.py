@@ -31,8 +31,8 @@ _MAX_COMBINATIONS: Final = 64
 def load_sweep(path: str | os.PathLike[str], name: str | None = None) -> Sweep:
     """Return the sweep that a YAML file describes, or a shipped one such as `modes`.
 
-    The name replaces that in the file, or that of the file without its ending. Of a bad file, the
-    `ConfigError` has a line for each problem, with file, line, column and key.
+    The name replaces the one in the file, or the file's own without its ending. The `ConfigError` of a bad
+    file has a line for each problem, with file, line, column and key.
     """
     file = config_path(path)
     document = read_yaml(read_text(file), str(file))

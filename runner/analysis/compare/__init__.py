@@ -72,9 +72,9 @@ class PairResult:
     """Seeds that only A has."""
     left_out_b: list[Seed]
     median: float
-    """Of the differences A - B, seed by seed; nan without a common seed."""
+    """That of the differences A - B, seed by seed; nan without a common seed."""
     iqm: Estimate
-    """Of the same differences."""
+    """That of the same differences."""
     simultaneous: Estimate
     """The same IQM with an interval that holds together with all others; nan for a single pair."""
     improvement: Estimate

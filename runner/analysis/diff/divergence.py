@@ -39,7 +39,7 @@ _TRANSITION_FIELDS: Final = (
 """The same of a step in spaces that are not both `Discrete`."""
 _EVALUATION_FIELDS: Final = FIELDS[1:]  # trials are numbered over all evaluations of a run
 _MAX_NUMBERS: Final = 16
-"""Of a longer value the first number that differs is reported."""
+"""Where a value has more numbers, the first that differs is reported."""
 
 
 @dataclass(frozen=True, eq=False)

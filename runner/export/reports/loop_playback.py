@@ -56,7 +56,7 @@ class _ShownPart:
     agent: str
     """Whose part it is; empty where there is one agent."""
     names: tuple[str, ...]
-    """Of its numbers, or of its text."""
+    """The names of its numbers, or of its text."""
     path: tuple[str, ...]
     is_text: bool
 

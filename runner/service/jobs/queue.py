@@ -25,7 +25,7 @@ class QueueStatus:
     running: int
     queued: int
     free_bytes: int
-    """Of the disk of the recordings."""
+    """Free space on the disk of the recordings."""
     waiting_for: str
     """Why no further job is started although there is a worker; empty if one would be."""
 

@@ -62,7 +62,7 @@ class Heading(NamedTuple):
     sorted: str | None
     """`ascending` or `descending` if the rows are sorted by it."""
     address: str
-    """Of the table sorted by it; empty if it cannot be."""
+    """The address of the table sorted by it; empty if it cannot be."""
 
 
 class Cell(NamedTuple):
