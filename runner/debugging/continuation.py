@@ -28,7 +28,7 @@ class Moment(NamedTuple):
     t: int
     state: int
     trained_episode: int
-    """Of training, at which schedules are read: that of a trial is the one after its evaluation."""
+    """The training episode at which schedules are read; that of a trial is the one after its evaluation."""
     trained_step: int
 
 

@@ -54,7 +54,7 @@ class Redone:
     reason: str = ""
     """Why it is impossible, as a sentence."""
     of_episodes: int | None = None
-    """Of how many episodes those compared are a sample; None if all were to be compared."""
+    """The number of episodes that a sample was compared of; None if all were to be compared."""
     tolerance: float = 0.0
     """Absolute and relative, for floating-point values; 0 if bytes were compared."""
     assumed: tuple[str, ...] = ()

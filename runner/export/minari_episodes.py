@@ -40,7 +40,7 @@ class Episode:
     acted: NDArray[np.uint32] | None = None
     """[T]: bit i, whether agent i took part; None where all always do."""
     seed: int | None = None
-    """That of its reset, if it had one."""
+    """The seed of its reset, if it had one."""
 
     @property
     def is_abandoned(self) -> bool:

@@ -17,7 +17,7 @@ from runner.recording.schema import Topic
 MAX_NAMES: Final = 64
 """The most names whose last logged value is in a summary."""
 MAX_TRIALS: Final = 1 << 17
-"""Of an evaluation with more trials, the last of them are in a summary."""
+"""The most trials of an evaluation that are in a summary, the last ones."""
 
 
 class Outcomes:

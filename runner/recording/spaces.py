@@ -46,7 +46,7 @@ class Leaf:
     path: tuple[str, ...]
     """Keys of `Dict`s and numbers of `Tuple`s, from the outermost in."""
     dtype: np.dtype[np.generic] | None
-    """Of its value, its shape included; None for a text."""
+    """The dtype of its value, including the shape; None for a text."""
 
 
 def leaves_of(description: object, where: str) -> list[Leaf]:

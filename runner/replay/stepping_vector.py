@@ -41,7 +41,7 @@ class VectorStepper(Stepper):
             raise CannotRedo(f"The vector has {env.num_envs} environments, and the recording {self._n}.")
         self._leaves = leaves_of(self.observation_space, "observation")
         self._over = np.zeros(self._n, np.bool_)
-        """Whose episode ended with the last step."""
+        """The environments whose episode ended with the last step."""
         self._last = np.zeros(self._n, self.dtypes.reset)
         """What the vector returned last."""
         self._put = filler(self._leaves, self._last[np.newaxis], (self._n,))

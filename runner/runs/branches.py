@@ -134,9 +134,9 @@ class BranchNode:
     """None if the run was removed, or is in another folder."""
     status: str
     success_percent: float | None
-    """Of its last evaluation."""
+    """That of its last evaluation."""
     mean_return: float | None
-    """Of its last evaluation; of a loop without one, of its last training episodes."""
+    """That of its last evaluation; without one, of a loop's last training episodes."""
     origin: Origin | None
     """What it was branched from."""
     branches: tuple[BranchNode, ...]

@@ -70,11 +70,11 @@ class ShownCurve:
     unit: str
     positions: list[float]
     values: list[float | None]
-    """Of several runs, their interquartile mean; below four runs, their mean."""
+    """The interquartile mean over several runs; below four runs, their mean."""
     smoothed: list[float | None] | None
     """The exponential mean of the values, if it was requested."""
     low: list[float | None] | None
-    """Of several runs, the lower end of the 95 % interval; below four runs, the lowest."""
+    """The lower end of the 95 % interval over several runs; below four runs, the lowest."""
     high: list[float | None] | None
     runs: list[list[float | None]]
     """The values of each run of the group, if they were requested."""

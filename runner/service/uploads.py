@@ -84,7 +84,7 @@ class Upload(UploadStatus):
     """An upload as the server stores it."""
 
     owner: str
-    """Who may continue it."""
+    """The id of the token that may continue it; empty without tokens."""
     source: UploadSource
     folder: str = field(default_factory=partial(secrets.token_hex, 16))
 

@@ -54,7 +54,7 @@ class _ShownPart:
     """A part of a space, and what is shown of it."""
 
     agent: str
-    """Whose part it is; empty where there is one agent."""
+    """The agent that it is of; empty where there is only one."""
     names: tuple[str, ...]
     """The names of its numbers, or of its text."""
     path: tuple[str, ...]

@@ -35,7 +35,7 @@ class Words:
     """The texts of frames, or of steps."""
 
     agent: str
-    """Whose they are; empty for all agents together."""
+    """The agent that they are of; empty for all together."""
     name: str
     values: list[str]
     """The different texts."""
@@ -48,7 +48,7 @@ class Series:
     """A number at each frame."""
 
     agent: str
-    """Whose it is; empty for all agents together."""
+    """The agent that it is of; empty for all together."""
     kind: str
     """What it is a part of, such as `observation`."""
     name: str
@@ -88,7 +88,7 @@ class Playback:
     end: str
     """How the episode ended, as text; empty if it did not."""
     agents: list[str]
-    """Who is rewarded."""
+    """The names of those that are rewarded."""
     before: list[Value]
     """The sum of each agent's earlier rewards; empty at the beginning."""
     reward: list[list[Value]]

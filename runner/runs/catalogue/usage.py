@@ -61,7 +61,7 @@ class Contents:
     other: int = 0
     """All other files, including foreign ones."""
     left_over: int = 0
-    """Of these: files left by a repair or an interrupted command."""
+    """Those of them that a repair or an interrupted command left."""
     freed: int = 0
     """Freed by removing the run's own files; those with other links free nothing."""
     foreign: list[str] = field(default_factory=list)
