@@ -18,6 +18,7 @@ from runner.recording.episode_log import Flags
 from runner.recording.gym_values import filler, filler_by_agent, leaves_by_agent, value_bytes
 from runner.recording.messages import encode
 from runner.util.arrays import Ints
+from runner.util.values import Json
 
 _DISCRETE: Final = struct.Struct("<qqd??")
 _DISCRETE_DTYPE: Final = np.dtype(
@@ -282,7 +283,7 @@ class VariableRows(Rows):
         }
         self._put_message(fields)
 
-    def _put_message(self, fields: dict[str, Any]) -> None:
+    def _put_message(self, fields: Json) -> None:
         """Record a step, given by its fields but its number and that of its episode."""
         fields |= {"step": self.place[0], "episode": self._episode}
         position = sum(self._recorder.steps.values()) + self.filled + 1
@@ -295,7 +296,7 @@ class VariableRows(Rows):
         fields = {"seed": seed or 0, "seeded": seed is not None}
         self._put_reset_message(fields | {"observation": value_bytes(self._observation_leaves, observation)})
 
-    def _put_reset_message(self, fields: dict[str, Any]) -> None:
+    def _put_reset_message(self, fields: Json) -> None:
         """Record a reset, given by its fields but the numbers of reset, episode and step."""
         fields |= {"reset": self.resets, "episode": self._episode, "step": self.place[0]}
         position = sum(self._recorder.steps.values()) + self.filled

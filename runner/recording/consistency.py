@@ -8,6 +8,7 @@ a block at a time, and compared.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,9 @@ from runner.recording.loop_blocks import Block, Blocks, Inconsistent, OnBlock
 from runner.recording.reader import Recording
 from runner.recording.schema import RESET_ONLY
 from runner.util.arrays import Array, Ints
+
+_MAX_STEPS: Final = 2**62
+"""More steps than a recording has."""
 
 
 @dataclass
@@ -65,6 +69,8 @@ def check_extras(recording: Recording, phase: str, complete: bool, on_block: OnB
     steps, topic = recording.topic(f"/{phase}/step"), recording.topic(f"/{phase}/extra")
     # Steps of varying size are not looked up: their extras are only counted, and compared with one another.
     total = recording.step_count(phase) if extras else 0
+    if recording.leaves_out_steps and not recording.has_actions_of(phase):
+        total = recording.result.get(f"{phase}_steps", _MAX_STEPS)
     for block in extras.blocks(stop=None if complete else total):
         on_block(topic, block)
         numbers, where = block["step"], f"{topic.name}, step {block['step'][0]} and later"

@@ -27,6 +27,7 @@ from runner.recording.blocks import message_record
 from runner.recording.chunks import encode_chunk, message_index
 from runner.recording.integrity import survey
 from runner.recording.messages import encode
+from runner.recording.reader import open_recording
 from runner.recording.records import attachment_of, copied_chunk, metadata_of, read_chunk, walk
 from runner.recording.writer import RecordingFile
 from runner.util.files import open_regular
@@ -268,6 +269,18 @@ for k in range(10**9):
         print("ready", flush=True)
         time.sleep(60)
 """
+
+
+def test_extras_are_sound_where_the_steps_were_left_out(tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path, steps="none") as rec:
+        rec.reset(seed=1)
+        for step in range(5):
+            rec.step(step % 2, extras={"value": step / 2})
+    found = verify(rec.run.recording)
+    assert found.sound, found.finding
+    with open_recording(rec.run.recording) as recording:
+        (block,) = recording.extras("train").blocks()
+    assert block["values"]["value"].tolist() == [0.0, 0.5, 1.0, 1.5, 2.0]
 
 
 def test_a_killed_loop_keeps_its_extras_and_a_repair_too(tmp_path):
