@@ -8,8 +8,10 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 from urllib.parse import urlsplit
+
+from pydantic import TypeAdapter
 
 from runner.errors import RunnerError
 from runner.util.extras import require
@@ -35,6 +37,7 @@ _TEMPORARY: Final = (408, 429, 500, 502, 503, 504, 507)
 _NOT_THE_REQUEST: Final = (408, 425, 429)
 """Status codes of refusals that say nothing against the request: too slow, too early, too many."""
 
+Record = TypeVar("Record")
 Report = Callable[[int, int], object]
 """Called with the bytes transferred so far, and the bytes in total."""
 
@@ -152,10 +155,14 @@ class Connection:
 
     def request_object(self, method: str, path: str, **options: object) -> Json:
         """Return the JSON object that a server responds with; errors as for `request`."""
+        return self.request_record(dict, method, path, **options)
+
+    def request_record(self, kind: type[Record], method: str, path: str, **options: object) -> Record:
+        """Return the dataclass whose fields a server responds with; errors as for `request`."""
         response = self.request(method, path, **options)
         try:
-            return dict(response.json())
-        except (ValueError, TypeError) as error:
+            return TypeAdapter(kind).validate_json(response.content)
+        except ValueError as error:
             raise self.unexpected_response() from error
 
     @contextlib.contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 from pathlib import Path
 from typing import Final
 from urllib.parse import quote
@@ -12,12 +11,11 @@ from blake3 import blake3
 from filelock import FileLock, Timeout
 
 from runner.client.connection import Connection, Report, ServerUnavailable
-from runner.errors import RecordingError, RunnerError, StorageError
-from runner.recording.labels import labels_from
+from runner.errors import RecordingError, RunnerError
 from runner.runs.importing import Imported, import_recording
 from runner.runs.run import Run
 from runner.runs.store import Store
-from runner.util.files import storage_errors
+from runner.util.files import require_room, storage_errors
 
 FOLDER: Final = ".pulling"
 
@@ -57,8 +55,13 @@ def pull(client: Connection, name: str, recordings: Path, report: Report = lambd
             with FileLock(lock, timeout=0):
                 _download(client, path, tag, size, part, report)
                 summary = {key: facts.get(key) for key in ("seconds", "error", "bytes")}
-                details = {"status": status, "summary": summary}  # the name is the recording's own
-                imported = import_recording(part, recordings, details, labels_from(facts))
+                labels = {key: facts.get(key) for key in ("name", "tags", "note")}
+                details = {
+                    "status": status,
+                    "summary": summary,
+                    "labels": labels,
+                }  # the name is the recording's
+                imported = import_recording(part, recordings, details)
                 part.unlink()
                 _pull_contents(client, imported.run, report)
         except Timeout:
@@ -100,9 +103,7 @@ def _download(client: Connection, path: str, tag: str, size: int, part: Path, re
     """
     backoff = client.backoff()
     with part.open("ab") as stream:
-        missing, free = size - stream.tell(), shutil.disk_usage(part.parent).free
-        if missing > free:
-            raise StorageError(f"{part.parent.parent}: found room for {free:,} bytes, expected {missing:,}.")
+        require_room(part.parent, size - stream.tell())
         while stream.tell() < size:
             try:
                 for piece in client.download(path, tag, stream.tell(), size):

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from http import HTTPStatus
 from pathlib import Path
 from typing import Final, Literal
 
 from runner.client.connection import Connection, Report, ServerError, ServerUnavailable
 from runner.errors import RunnerError
-from runner.recording.labels import as_json
+from runner.runs.importing import import_record
 from runner.runs.run import Run
 from runner.util.files import hash_of
 from runner.util.values import Json
@@ -51,13 +51,9 @@ class UploadStatus:
 
 
 def push(server: Connection, run: Run, report: Report = lambda *_: None, begun: str = "") -> UploadStatus:
-    """Upload a run with the contents of its checkpoints; return the result when the server has stored it.
+    """Upload a run that is over, with the contents of its checkpoints; return the result when it is stored.
 
-    Args:
-        server: a connection to the server.
-        run: a run that is over.
-        report: called with the progress.
-        begun: the id of an upload that has its first bytes already.
+    `report` is called with the progress; `begun` is the id of an upload that has the first bytes already.
 
     Raises:
         ServerError: it was refused, with the reason.
@@ -72,43 +68,38 @@ def push(server: Connection, run: Run, report: Report = lambda *_: None, begun: 
         raise RunnerError(f"{run.recording}: cannot be read ({error.strerror}).") from error
     source: Json = {"digest": digest, "size": size, "name": run.name, "run_id": run.run_id}
     source["content_digest"] = run.summary.content_digest
-    if not run.stands_alone:  # an exported recording carries its own record of the run
-        summary = {"seconds": run.summary.seconds, "error": run.summary.error}
-        facts = {"name": run.file.name, "status": run.status, "proof": run.file.proof, "summary": summary}
-        source |= {"run": facts, "labels": as_json(run.labels)}
-    upload = _send(server, begun or digest, source, run.recording, report)
-    if upload.state == "refused" and begun:  # the file has changed since it began
-        upload = _send(server, digest, source, run.recording, report)
-    if upload.state == "refused":
-        raise ServerError(f"{server.url}: refused the run {run.run_id}: {upload.problem}")
-    for checkpoint in {each.digest: each for each in run.checkpoints() if each.is_here}.values():
-        source = {"digest": checkpoint.digest, "size": checkpoint.size, "checkpoint_of": upload.run_id}
-        sent = _send(server, checkpoint.digest, source, checkpoint.path, report)
-        if sent.state == "refused":
-            raise ServerError(f"{server.url}: refused {checkpoint.reference}: {sent.problem}")
+    source["run"] = {} if run.stands_alone else import_record(run)
+    upload = _send(server, begun or digest, source, run.recording, f"the run {run.run_id}", report)
+    for each in {each.digest: each for each in run.checkpoints() if each.is_here}.values():
+        source = {"digest": each.digest, "size": each.size, "checkpoint_of": upload.run_id}
+        _send(server, each.digest, source, each.path, each.reference, report)
     return upload
 
 
-def _send(server: Connection, upload_id: str, source: Json, path: Path, report: Report) -> UploadStatus:
-    """Upload a file until it is stored or refused; what fails for now is repeated."""
-    furthest, pause, backoff, is_known = -1, POLL_SECONDS / 16, server.backoff(), False
+def _send(
+    server: Connection, upload_id: str, source: Json, path: Path, what: str, report: Report
+) -> UploadStatus:
+    """Upload a file until it is stored; what fails for now is repeated."""
+    furthest, pause, backoff, is_new = -1, POLL_SECONDS / 16, server.backoff(), True
     while True:
         try:
             upload = put_upload(server, upload_id, **source)
-            if upload.is_over and not is_known:  # since an earlier push
-                if upload.state == "stored":
-                    return replace(upload, already=True)
+            if upload.state == "stored":
+                return replace(upload, already=upload.already or is_new)
+            if upload.state == "refused":
+                if upload_id == source["digest"] and not is_new:
+                    raise ServerError(f"{server.url}: refused {what}: {upload.problem}")
+                # By an earlier push, or because its file has changed since it began.
                 server.request("DELETE", f"/uploads/{upload_id}")
+                upload_id, is_new = source["digest"], True
                 continue
-            is_known = True
+            is_new = False
             while upload.state == "receiving":
                 if upload.offset > furthest:
                     furthest = upload.offset
                     backoff.reset()
                 upload = append_upload(server, upload, path, source["size"])
                 report(upload.offset, source["size"])
-            if upload.is_over:
-                return upload
             time.sleep(pause)
             pause = min(2 * pause, POLL_SECONDS)
         except ServerError as error:
@@ -119,14 +110,11 @@ def _send(server: Connection, upload_id: str, source: Json, path: Path, report: 
 
 
 def put_upload(server: Connection, upload_id: str, **source: object) -> UploadStatus:
-    """Begin or continue an upload, with what is known of its file; return its state.
+    """Begin or continue an upload, with the fields of `UploadSource` that are known; return its state.
 
-    Args:
-        server: a connection to the server.
-        upload_id: 64 hexadecimal digits: the BLAKE3 of the file, or random ones while it is growing.
-        source: the fields of `UploadSource`.
+    The id has 64 hexadecimal digits: the BLAKE3 of the file, or random ones while it is growing.
     """
-    return _request(server, "PUT", upload_id, json=source)
+    return server.request_record(UploadStatus, "PUT", f"/uploads/{upload_id}", json=source)
 
 
 def append_upload(server: Connection, upload: UploadStatus, path: Path, end: int) -> UploadStatus:
@@ -140,13 +128,5 @@ def append_upload(server: Connection, upload: UploadStatus, path: Path, end: int
         piece = stream.read(min(end - upload.offset, PIECE))
     if not piece:
         raise RunnerError(f"{path}: became shorter while it was sent; try again.")
-    headers = {"Upload-Offset": str(upload.offset)}
-    return _request(server, "PATCH", upload.id, content=piece, headers=headers)
-
-
-def _request(server: Connection, method: str, upload_id: str, **options: object) -> UploadStatus:
-    response = server.request_object(method, f"/uploads/{upload_id}", **options)
-    try:
-        return UploadStatus(**{field.name: response[field.name] for field in fields(UploadStatus)})
-    except KeyError as error:
-        raise server.unexpected_response() from error
+    options = {"content": piece, "headers": {"Upload-Offset": str(upload.offset)}}
+    return server.request_record(UploadStatus, "PATCH", f"/uploads/{upload.id}", **options)

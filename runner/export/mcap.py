@@ -10,13 +10,12 @@ from typing import Final, NamedTuple
 from runner.errors import RecordingError, RunnerError
 from runner.export.places import write_new
 from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD
-from runner.recording.labels import Labels, as_json
+from runner.recording.labels import Labels
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import rewrite
 from runner.recording.schema import CONSOLE_TOPIC
-from runner.runs.importing import EXPORT_RECORD
+from runner.runs.importing import EXPORT_RECORD, import_record
 from runner.runs.run import Run
-from runner.util.values import Json
 
 PRIVATE: Final = ("host", "user", "command", "directory")
 """The entries of provenance that identify persons and places."""
@@ -45,7 +44,10 @@ def export_mcap(run: Run, target: Path, anonymous: bool = False, force: bool = F
         raise RunnerError(f"run {run.run_id} is only in an archive; `dualtaxi restore` brings it back.")
     if not target.absolute().parent.is_dir():
         raise RunnerError(f"{target}: its folder does not exist; choose another place by -o.")
-    record = {"json": json.dumps(_record(run, anonymous), sort_keys=True, ensure_ascii=False)}
+    facts = import_record(run) | {"anonymous": anonymous}
+    if anonymous and "error" in facts["summary"]:
+        facts["summary"]["error"] = LEFT_OUT
+    record = {"json": json.dumps(facts, sort_keys=True, ensure_ascii=False)}
 
     def change(name: str, entries: dict[str, str]) -> dict[str, str] | None:
         if name == EXPORT_RECORD or (anonymous and name == CODE_RECORD):
@@ -59,16 +61,6 @@ def export_mcap(run: Run, target: Path, anonymous: bool = False, force: bool = F
         lambda temporary: rewrite(run.recording, temporary, change, {EXPORT_RECORD: record}, left_out),
     )
     return McapExport(target, list(_warnings(run)) if anonymous else [])
-
-
-def _record(run: Run, anonymous: bool) -> dict[str, object]:
-    """Return what an importer needs besides the recording."""
-    summary = {key: run.summary[key] for key in ("seconds", "error", "bytes") if key in run.summary}
-    if anonymous and "error" in summary:
-        summary["error"] = LEFT_OUT
-    record: Json = {"anonymous": anonymous, "status": run.status, "name": run.file.name}
-    record |= {"summary": summary, "labels": as_json(run.labels)}
-    return record | ({"proof": run.file.proof} if run.file.proof else {})
 
 
 def _without_names(name: str, entries: dict[str, str], recording: Path) -> dict[str, str]:

@@ -28,7 +28,7 @@ from runner.runs.locking import locked
 from runner.runs.resolve import run_with_id
 from runner.runs.run import PREVIEW, RECORDING_FILE, RUN_FILE, Run, made_by, new_run_id
 from runner.runs.store import Store
-from runner.util.files import storage_errors, sync, write_object
+from runner.util.files import require_room, storage_errors, sync, write_object
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN, Json, JsonView
 
 EXPORT_RECORD: Final = "export"
@@ -62,12 +62,15 @@ class Imported:
     """Whether the file was exported without the names of persons and places."""
 
 
+def import_record(run: Run) -> Json:
+    """Return what `import_recording` needs of a run besides its recording."""
+    summary = {key: run.summary[key] for key in ("seconds", "error", "bytes") if key in run.summary}
+    record: Json = {"status": run.status, "name": run.file.name, "summary": summary}
+    return record | {"labels": as_json(run.labels)} | ({"proof": run.file.proof} if run.file.proof else {})
+
+
 def import_recording(
-    recording: Path,
-    recordings: Path,
-    details: JsonView | None = None,
-    labels: Labels | None = None,
-    as_new: bool = False,
+    recording: Path, recordings: Path, details: JsonView | None = None, as_new: bool = False
 ) -> Imported:
     """Import a recording into a folder of runs; the file stays where it is.
 
@@ -78,9 +81,8 @@ def import_recording(
     Args:
         recording: the file, to which nothing is written any more. If it is finished, nothing in it changes
             and it is on the same disk, it is linked instead of copied.
-        details: the contents of `run.json` where the run comes from; the file's own record of it by default.
-            Values that the recording contradicts are ignored.
-        labels: name, tags and note of the run; the file's own record of them by default.
+        details: the run where it comes from, as `import_record` returns it; the file's own record of it by
+            default. Values that are invalid, or that the recording contradicts, are ignored.
         as_new: give the run a new id, so that it can stand next to another run of its id.
 
     Raises:
@@ -91,14 +93,14 @@ def import_recording(
     """
     with open_recording(recording) as opened:
         exported = _export_record(opened)
-        facts = checked_facts(opened, exported if details is None else details)
+        record = exported if details is None else details
+        facts = checked_facts(opened, record)
         finished = opened.finished
         contents = [checkpoint.digest for checkpoint in read_checkpoints(opened, recordings)]
     if not finished and not is_merely_cut_off(recording):
         raise RecordingError(f"{recording}: is damaged, not merely cut off; `dualtaxi repair` repairs it.")
-    if labels is None:
-        found = exported.get("labels")
-        labels = labels_from(found) if isinstance(found, dict) else Labels()
+    found = record.get("labels")
+    labels = labels_from(found) if isinstance(found, dict) else Labels()
     digest, anonymous = content_of(recording), exported.get("anonymous") is True
     if as_new:
         facts["run_id"] = new_run_id(recordings)
@@ -303,9 +305,7 @@ def _staging_folder(recordings: Path, recording: Path) -> Iterator[Path]:
     hidden = recordings / f".importing-{secrets.token_hex(4)}"
     try:
         (hidden / "run").mkdir(parents=True)
-        size, free = recording.stat().st_size, shutil.disk_usage(hidden).free
-        if size > free:
-            raise StorageError(f"{recordings}: found {free:,} bytes free, expected {size:,}; free some disk.")
+        require_room(hidden, recording.stat().st_size)
         yield hidden / "run"
     except OSError as error:
         raise StorageError(

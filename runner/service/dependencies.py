@@ -45,6 +45,14 @@ PicturesOf = Annotated[PictureStreams, _state("pictures")]
 CacheOf = Annotated[ResponseCache, _state("cache")]
 JobsOf = Annotated[JobQueue, _state("jobs")]
 UploadsOf = Annotated[Uploads, _state("uploads")]
+
+
+def owner_of(request: Request) -> str:
+    """Return the owner of a request's uploads: the id of its token, or nothing."""
+    return request.state.token.id if request.state.token else ""
+
+
+OwnerOf = Annotated[str, Depends(owner_of)]
 Spooling = Annotated[CapacityLimiter, _state("spooling")]
 MAX_WAITING: Final = 16
 """Calls with large temporary files that may wait for the one that runs."""

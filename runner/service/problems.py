@@ -14,6 +14,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from runner.errors import (
     ConfigError,
@@ -110,6 +111,7 @@ def add_error_handlers(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(OSError, _system_error)
+    app.add_exception_handler(ClientDisconnect, _disconnected)
     app.add_exception_handler(Exception, _unexpected)
 
 
@@ -142,6 +144,11 @@ async def _invalid(request: Request, error: Exception) -> Response:  # noqa: ARG
     ]
     message = "; ".join(f"{problem.path}: {problem.message}" for problem in problems)
     return json_error(HTTPStatus.UNPROCESSABLE_ENTITY, ErrorBody(message=message, problems=problems))
+
+
+async def _disconnected(request: Request, error: Exception) -> Response:  # noqa: ARG001
+    body = ErrorBody(message="the connection was closed before the body was complete.")
+    return json_error(HTTPStatus.BAD_REQUEST, body)
 
 
 async def _system_error(request: Request, error: Exception) -> Response:

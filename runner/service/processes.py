@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import signal
 import threading
 import time
 from collections.abc import Callable
@@ -53,6 +54,17 @@ def lower_priority() -> None:
     """Let this process, which trains or verifies, yield to the server, whose users are waiting."""
     with contextlib.suppress(OSError, AttributeError):  # not on Windows
         os.nice(5)
+
+
+def _call_unstopped(function: Callable[Args, Result], *args: Args.args, **keywords: Args.kwargs) -> Result:
+    """Call a function in a child process that ignores signals to stop.
+
+    They may go to all processes of the service, which kills this one itself when running requests are over.
+    """
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    with contextlib.suppress(AttributeError):  # not on Windows
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    return function(*args, **keywords)
 
 
 class ProcessPool:
@@ -116,8 +128,8 @@ class ProcessPool:
         """Return the future result of a function of a module, called in a child process.
 
         Arguments and result are pickled, between our own processes. The future raises the function's own
-        `RunnerError` or `OSError`, or `TimedOut`, `OutOfMemory`, `ProcessDied`; `Busy` is raised if too many
-        calls are waiting.
+        `RunnerError` or `OSError`, or `TimedOut`, `OutOfMemory`, `ProcessDied`, or `Busy` when the pool is
+        closed; `Busy` is raised if too many calls are waiting.
         """
         return self.submit_within(self._seconds, function, *args, **keywords)
 
@@ -129,7 +141,7 @@ class ProcessPool:
             raise Busy
         try:
             future = self._threads.submit(
-                self._call, lambda child: child.call(function, seconds, *args, **keywords)
+                self._call, lambda child: child.call(_call_unstopped, seconds, function, *args, **keywords)
             )
         except BaseException:
             self._places.release()
@@ -153,6 +165,8 @@ class ProcessPool:
             return call(child)
         except CallFailed:
             is_reusable = False
+            if self._closed.is_set():
+                raise Busy("the service is stopping.") from None
             raise
         finally:
             if is_reusable:
@@ -162,7 +176,7 @@ class ProcessPool:
 
     def _start(self) -> ChildProcess:
         if self._closed.is_set():
-            raise ProcessDied("the service is stopping.")
+            raise Busy("the service is stopping.")
         try:
             child = ChildProcess(self._memory_bytes, self._context)
         except OSError as error:

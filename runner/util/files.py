@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import secrets
+import shutil
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -100,14 +101,24 @@ def write_object(path: Path, value: JsonView, mode: int = 0o666) -> None:
     """
     # A line for each key: with `indent`, `json` takes much longer.
     lines = [f" {_to_json(key)}: {_to_json(own)}" for key, own in value.items()]
-    left = memoryview(("{\n" + ",\n".join(lines) + "\n}\n").encode())
+    data = ("{\n" + ",\n".join(lines) + "\n}\n").encode()
     with replacing(path) as fresh:
         descriptor = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BINARY, mode)
         try:
-            while left:
-                left = left[os.write(descriptor, left) :]
+            write_all(descriptor, data)
         finally:
             os.close(descriptor)
+
+
+def write_all(descriptor: int, data: bytes) -> None:
+    """Write bytes to an open file, all of them.
+
+    Raises:
+        OSError: it failed; the first ones may be written.
+    """
+    left = memoryview(data)
+    while left:
+        left = left[os.write(descriptor, left) :]
 
 
 @contextlib.contextmanager
@@ -146,6 +157,17 @@ def storage_errors(path: str | os.PathLike[str], advice: str = "") -> Iterator[N
     except OSError as error:
         reason = f"{os.fspath(path)}: cannot be written ({error.strerror or error})"
         raise StorageError(f"{reason}; {advice}." if advice else f"{reason}.") from error
+
+
+def require_room(folder: Path, needed: int, spare: int = 0) -> None:
+    """Raise an error if the disk of a folder has no room for some bytes, with others to spare.
+
+    Raises:
+        StorageError: it has less.
+    """
+    free = max(shutil.disk_usage(folder).free - spare, 0)
+    if needed > free:
+        raise StorageError(f"{folder}: found room for {free:,} bytes, expected {needed:,}; free some disk.")
 
 
 def sync(path: Path) -> None:

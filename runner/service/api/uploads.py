@@ -8,14 +8,11 @@ from http import HTTPStatus
 from typing import Annotated, Final
 
 from anyio.to_thread import run_sync
-from fastapi import APIRouter, Depends, Header, Path, Query, Request
+from fastapi import APIRouter, Header, Path, Query, Request
 from pydantic import BaseModel
-from starlette.concurrency import run_in_threadpool
-from starlette.requests import ClientDisconnect
 
 from runner.client.uploads import UploadState, UploadStatus
-from runner.service.dependencies import UploadsOf
-from runner.service.errors import Refused
+from runner.service.dependencies import OwnerOf, UploadsOf
 from runner.service.problems import error_docs
 from runner.service.uploads import UploadSource
 
@@ -24,8 +21,13 @@ WRITE_BYTES: Final = 1 << 20
 WRITERS: Final = 4
 """Threads that write to the disk."""
 _BYTES: Final = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+_BODY: Final = {"requestBody": {"required": True, "content": _BYTES}}
+_ID_IS: Final = "64 hexadecimal digits: the BLAKE3 of the file, or random ones while it is growing."
+UploadId = Annotated[str, Path(pattern="^[0-9a-f]{64}$", description=_ID_IS)]
 
-router = APIRouter(tags=["uploads"], responses=error_docs(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT))
+router = APIRouter(
+    prefix="/uploads", tags=["uploads"], responses=error_docs(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT)
+)
 
 
 class UploadsResponse(BaseModel):
@@ -34,17 +36,7 @@ class UploadsResponse(BaseModel):
     uploads: list[UploadStatus]
 
 
-def owner_of(request: Request) -> str:
-    """Return the owner of a request's uploads: the id of its token, or nothing."""
-    return request.state.token.id if request.state.token else ""
-
-
-OwnerOf = Annotated[str, Depends(owner_of)]
-_ID_IS: Final = "64 hexadecimal digits: the BLAKE3 of the file, or random ones while it is growing."
-UploadId = Annotated[str, Path(pattern="^[0-9a-f]{64}$", description=_ID_IS)]
-
-
-@router.get("/uploads", summary="List uploads in progress and the results of others.")
+@router.get("", summary="List uploads in progress and the results of others.")
 def list_uploads(
     uploads: UploadsOf, owner: OwnerOf, state: Annotated[UploadState | None, Query()] = None
 ) -> UploadsResponse:
@@ -55,21 +47,17 @@ def list_uploads(
     )
 
 
-@router.put("/uploads/{upload_id}", summary="Begin an upload, or continue it; return its state.")
+@router.put("/{upload_id}", summary="Begin an upload, or continue it; return its state.")
 def put(uploads: UploadsOf, owner: OwnerOf, upload_id: UploadId, source: UploadSource) -> UploadStatus:
     """Announce a file: it is verified when its digest is known and all of its bytes are here.
 
     The response has the offset of the next bytes. After the last, send the same again until it is stored or
     refused.
     """
-    return uploads.alive(uploads.put(owner, upload_id, source))
+    return uploads.put(owner, upload_id, source)
 
 
-@router.patch(
-    "/uploads/{upload_id}",
-    openapi_extra={"requestBody": {"required": True, "content": _BYTES}},
-    summary="Send bytes from an offset on.",
-)
+@router.patch("/{upload_id}", openapi_extra=_BODY, summary="Send bytes from an offset on.")
 async def append(
     uploads: UploadsOf,
     owner: OwnerOf,
@@ -79,30 +67,23 @@ async def append(
     content_length: Annotated[int, Header(ge=0, lt=1 << 62, include_in_schema=False)] = 0,
 ) -> UploadStatus:
     """Append bytes; those that were received stay, even if the connection breaks."""
-    offset, collected = upload_offset, bytearray()
     append_here = partial(uploads.append, owner, upload_id)
     write = partial(run_sync, append_here, limiter=request.app.state.writers)
-    await write(offset, b"", content_length)  # refused before anything is read
+    upload = await write(upload_offset, b"", content_length)  # refused before anything is read
+    collected = bytearray()
     try:
         async for data in request.stream():
             collected += data
             if len(collected) >= WRITE_BYTES:
                 piece, collected = bytes(collected), bytearray()
-                offset = (await write(offset, piece)).offset
-    except ClientDisconnect:
-        message = "the connection was closed; continue from the offset."
-        raise Refused(HTTPStatus.BAD_REQUEST, message) from None
+                upload = await write(upload.offset, piece)
     finally:
         if collected:
-            await write(offset, bytes(collected))
-    return await run_in_threadpool(uploads.alive, uploads.get(owner, upload_id))
+            upload = await write(upload.offset, bytes(collected))
+    return upload
 
 
-@router.delete(
-    "/uploads/{upload_id}",
-    status_code=HTTPStatus.NO_CONTENT,
-    summary="Delete an upload; a run that it became stays.",
-)
+@router.delete("/{upload_id}", status_code=HTTPStatus.NO_CONTENT, summary="Delete an upload; its run stays.")
 def delete(uploads: UploadsOf, owner: OwnerOf, upload_id: UploadId) -> None:
     """Forget an upload, and remove what was received."""
     uploads.delete(owner, upload_id)

@@ -16,8 +16,8 @@ from runner.debugging.explanation_files import explanations_in
 from runner.export.reports.rendering import View
 from runner.service.addresses import Paging
 from runner.service.api.jobs import JobResponse, Number, job_response
-from runner.service.api.uploads import OwnerOf, list_uploads
-from runner.service.dependencies import JobsOf, UploadsOf
+from runner.service.api.uploads import list_uploads
+from runner.service.dependencies import JobsOf, OwnerOf, UploadsOf
 from runner.service.jobs.queue import JobQueue, QueueStatus
 from runner.service.jobs.store import Job
 from runner.service.pages.rendering import page

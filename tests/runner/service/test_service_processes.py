@@ -10,6 +10,7 @@ import time
 import pytest
 
 from runner.errors import RecordingError
+from runner.service.errors import Busy
 from runner.service.processes import ProcessPool
 from runner.util.processes import OutOfMemory, ProcessDied, TimedOut
 
@@ -56,7 +57,7 @@ def test_closing_ends_running_calls():
     pool = ProcessPool(1, 600, MEMORY)
     calls = [pool.submit(time.sleep, 600) for _ in range(3)]
     pool.close()
-    assert all(isinstance(call.exception(), ProcessDied) for call in calls)
+    assert all(isinstance(call.exception(), Busy) for call in calls)
 
 
 def test_a_process_can_be_reused():

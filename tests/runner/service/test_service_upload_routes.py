@@ -64,7 +64,7 @@ def message(answer):
 
 def test_a_run_is_sent_in_pieces_and_listed_when_it_is_verified(connect, elsewhere, data):
     client = connect(elsewhere)
-    upload = begin(client, data, name="mine", run_id="abc", labels={"tags": ["sent"]})
+    upload = begin(client, data, name="mine", run_id="abc", run={"labels": {"tags": ["sent"]}})
     half = len(data) // 2
     answer = patch(client, upload, data[:half], 0)
     assert (answer.status_code, answer.json()["offset"]) == (200, half)
@@ -76,7 +76,7 @@ def test_a_run_is_sent_in_pieces_and_listed_when_it_is_verified(connect, elsewhe
     assert patch(client, upload, data[-9:], len(data) - 9).json()["state"] == "verifying"
     (listed,) = client.get(UPLOADS).json()["uploads"]
     assert (listed["state"], listed["name"]) in (("verifying", "mine"), ("stored", "mine"))
-    stored = over(client, upload, data, labels={"tags": ["sent"]})
+    stored = over(client, upload, data, run={"labels": {"tags": ["sent"]}})
     assert (stored["state"], stored["problem"]) == ("stored", "")
     (run,) = client.get("/api/v1/runs").json()["runs"]
     assert (run["run_id"], run["tags"]) == (stored["run_id"], ["sent"])

@@ -157,7 +157,7 @@ def test_another_run_of_the_same_id_is_not_replaced(uploads, lake, taxis, tmp_pa
 def test_a_run_that_is_announced_otherwise_later_is_not_left_in_the_list(uploads, lake, tmp_path):
     data = lake.recording.read_bytes()
     upload = grow(uploads, ANNA, run_id=lake.run_id)
-    uploads.alive(uploads.append(ANNA, upload.id, 0, data))
+    uploads.append(ANNA, upload.id, 0, data)
     assert visible(tmp_path / "runs") == [lake.run_id]
     uploads.put(ANNA, upload.id, UploadSource(run_id="another"))
     assert visible(tmp_path / "runs") == []

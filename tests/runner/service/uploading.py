@@ -39,7 +39,7 @@ def grow(uploads, owner, **known):
 
 def send(uploads, data, owner=ANNA, labels=None, **details):
     """Upload bytes in one go, and return the upload when its verification is over."""
-    upload = begin(uploads, owner, data, run=details, labels=labels or {})
+    upload = begin(uploads, owner, data, run=details | ({"labels": labels} if labels else {}))
     if upload.state == "receiving" and data:
         upload = uploads.append(owner, upload.id, 0, data)
     return over(uploads, upload)
