@@ -13,7 +13,7 @@ from runner.environments.mdp import events_of
 from runner.environments.naming import actions_in_words, states_in_words
 from runner.export.contents import Step
 from runner.export.pictures import Moment, moments_of
-from runner.export.values import action_in_words, plain_value, value_in_words
+from runner.export.values import acted, action_in_words, plain_value, value_in_words
 from runner.replay.steps import check_steps, transitions_of
 from runner.util.humanize import number
 from runner.util.jsonable import as_json
@@ -159,7 +159,7 @@ def _valued(recording: Recording, phase: str) -> Callable[[Step], dict[str, obje
             found["acted"] = [agent for i, agent in enumerate(agents) if int(row["acted"]) >> i & 1]
             own = {agent: words[agent](row["action"][agent]) for agent in found["acted"] if agent in words}
             return found | ({"action_in_words": own} if own else {})
-        return found | ({"action_in_words": words[""](row["action"])} if words else {})
+        return found | ({"action_in_words": words[""](acted(recording, row))} if words else {})
 
     return describe
 

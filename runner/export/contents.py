@@ -13,7 +13,6 @@ from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.metadata import RECORDING_STOPPED
 from runner.recording.reader import Recording
-from runner.util.arrays import Records
 from runner.util.values import flatten, is_whole
 
 ENDINGS: Final = {
@@ -28,8 +27,6 @@ ENDINGS: Final = {
 
 Step = np.void | Message
 """A step: a record, or the fields of a message where values vary in size."""
-Steps = Records | list[Message]
-"""Consecutive steps."""
 Ranges = tuple[tuple[int, int | None], ...]
 """Ranges of episodes: the first, and the one after the last or None for the end."""
 

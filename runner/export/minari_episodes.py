@@ -7,17 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.export.contents import Ranges, Step, Steps
-from runner.export.values import observed
+from runner.export.contents import Ranges
+from runner.export.values import acted, observed
 from runner.recording import schema
-from runner.recording.messages import Message
 from runner.recording.reader import Recording
 from runner.recording.spaces import Description, Value
 from runner.util.arrays import Records
@@ -61,8 +59,7 @@ def episodes_in(recording: Recording, phase: str, ranges: Ranges) -> Iterator[Ep
     if not lengths:
         return
     resets = _Resets(recording, phase)
-    steps_of = _variable_steps if recording.kind == "variable" else _fixed_steps
-    for environment, steps in steps_of(recording, phase, lengths):
+    for environment, steps in _steps(recording, phase, lengths):
         seed, first = resets.before(environment, steps)
         resets.keep_last(environment, steps[-1])
         if first is not None and lengths.get(int(steps[-1]["step"])) == len(steps):
@@ -81,7 +78,7 @@ class _Resets:
         """By environment and episode."""
         self._last: dict[int, Value] = {}
 
-    def before(self, environment: int, steps: Steps) -> tuple[int | None, Value]:
+    def before(self, environment: int, steps: Records) -> tuple[int | None, Value]:
         """Return seed and observation of the reset before steps, or None and the last observation."""
         while self._next is not None and int(self._next["step"]) <= int(steps[0]["step"]):
             reset = self._next
@@ -95,7 +92,7 @@ class _Resets:
             first = steps[0]["state"].astype(np.int64) + self._recording.spaces["observation"]["start"]
         return seed, first
 
-    def keep_last(self, environment: int, step: Step) -> None:
+    def keep_last(self, environment: int, step: np.void) -> None:
         """Keep the last observation of an environment, since an episode may continue after its end."""
         self._last[environment] = _copy(observed(self._recording, step))
 
@@ -105,14 +102,16 @@ def _copy(value: Value) -> Value:
     return value.copy() if isinstance(value, np.ndarray | np.void) else value
 
 
-def _fixed_steps(
-    recording: Recording, phase: str, lengths: Mapping[int, int]
-) -> Iterator[tuple[int, Records]]:
+def _steps(recording: Recording, phase: str, lengths: Mapping[int, int]) -> Iterator[tuple[int, Records]]:
     """Yield environment and steps of each episode; the last one of an environment may not have ended."""
-    topic, n = recording.topic(f"/{phase}/step"), recording.environments
+    name, n = f"/{phase}/step", recording.environments
+    topic = recording.topic(name)
     first = max(min(last - (length - 1) * n for last, length in lengths.items()), 0)
     open_parts: dict[int, list[Records]] = {environment: [] for environment in range(n)}
-    for block in recording.blocks(topic, first, max(lengths) + 1):
+    is_fixed = topic in recording.dtypes
+    for block in recording.blocks(topic, first, max(lengths) + 1) if is_fixed else recording.rows(name):
+        if block["step"][0] > max(lengths):
+            break
         ended: list[tuple[int, Records]] = []
         for environment, parts in open_parts.items():
             rows = block[(environment - int(block["step"][0])) % n :: n]
@@ -141,39 +140,21 @@ def _extend(recording: Recording, parts: list[Records], part: Records) -> Iterat
         parts.clear()
 
 
-def _variable_steps(
-    recording: Recording, phase: str, lengths: Mapping[int, int]
-) -> Iterator[tuple[int, list[Message]]]:
-    """Yield the steps of each episode of the only environment."""
-    for _, group in groupby(recording.transitions(phase), key=lambda step: step["episode"]):
-        steps = list(group)
-        yield 0, steps
-        if steps[-1]["step"] >= max(lengths):
-            return
-
-
-def _episode(recording: Recording, steps: Steps, first: Value, seed: int | None) -> Episode:
+def _episode(recording: Recording, steps: Records, first: Value, seed: int | None) -> Episode:
     """Return an episode of its steps and the observation of its reset."""
-    after, actions = observed(recording, steps), _column(steps, "action")
-    seen, acted = (recording.spaces[name] for name in ("observation", "action"))
-    if recording.has_states:
-        actions = actions.astype(np.int64) + acted["start"]
+    after, actions = observed(recording, steps), acted(recording, steps)
+    seen, done = (recording.spaces[name] for name in ("observation", "action"))
     if isinstance(after, list):
-        observations, taken = _collected(seen, [first, *after]), _collected(acted, actions)
+        observations = _collected(seen, [first, *after])
     else:
-        records = np.concatenate([np.array([first], after.dtype), after])
-        observations, taken = _split(seen, records), _split(acted, actions)
+        observations = _split(seen, np.concatenate([np.array([first], after.dtype), after]))
+    taken = _collected(done, actions) if isinstance(actions, list) else _split(done, actions)
     return Episode(observations, taken, seed=seed, **_outcomes(steps))
 
 
-def _outcomes(steps: Steps) -> dict[str, Any]:
-    names = steps[0] if isinstance(steps, list) else steps.dtype.names or ()
+def _outcomes(steps: Records) -> dict[str, Any]:
     fields = ("rewards", "terminated", "truncated", "acted")
-    return {name: np.array(_column(steps, name)) for name in fields if name in names}
-
-
-def _column(steps: Steps, name: str) -> Value:
-    return [step[name] for step in steps] if isinstance(steps, list) else steps[name]
+    return {name: steps[name].copy() for name in fields if name in (steps.dtype.names or ())}
 
 
 def _split(description: Description, values: NDArray[Any]) -> Value:

@@ -34,7 +34,7 @@ from runner.export.painting import (
     paint_scene,
     paint_values,
 )
-from runner.export.values import Values, action_in_words, observations_of, observed
+from runner.export.values import Values, acted, action_in_words, observations_of, observed
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value
 from runner.replay.makers import why_not_redone
@@ -252,7 +252,7 @@ def describer(recording: Recording, phase: str) -> Callable[[Step], tuple[str, s
     texts, agents = Values(recording.spaces["observation"], "observation"), recording.agents
 
     def describe_values(row: Step) -> tuple[str, str]:
-        action = row["action"]
+        action = acted(recording, row)
         if len(agents) > 1:
             action = {agent: action[agent] for i, agent in enumerate(agents) if int(row["acted"]) >> i & 1}
         words = in_words(action)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,9 @@ from runner.environments.naming import spoken
 from runner.export.contents import Step
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.recording.spaces import Leaf, Value, leaves_of
+from runner.recording.spaces import Leaf, Value, decode, leaves_of
 from runner.replay.steps import check_steps, reset_of, transitions_of
+from runner.util.arrays import Records
 
 MAX_NUMBERS: Final = 64
 """Leaves of more numbers are not shown number by number."""
@@ -62,13 +63,30 @@ class Values:
         return np.ascontiguousarray(np.stack([pixels] * 3, axis=-1) if pixels.ndim == 2 else pixels)
 
 
-def observed(recording: Recording, steps: Any) -> Value:
-    """Return the observation after a step, or those after steps; numbers where the space is `Discrete`."""
+def observed(recording: Recording, steps: Step | Records) -> Value:
+    """Return the observation after a step, or those after steps; numbers where the space is `Discrete`.
+
+    Those of varying size are a list.
+    """
     if recording.has_states:
         return steps["next_state"].astype(np.int64) + recording.spaces["observation"]["start"]
-    return (
-        [each["next_observation"] for each in steps] if isinstance(steps, list) else steps["next_observation"]
-    )
+    return _decoded(recording, "observation", steps["next_observation"])
+
+
+def acted(recording: Recording, steps: Step | Records) -> Value:
+    """Return the action of a step, or those of steps, as `observed` returns observations."""
+    if recording.has_states:
+        return steps["action"].astype(np.int64) + recording.spaces["action"]["start"]
+    return _decoded(recording, "action", steps["action"])
+
+
+def _decoded(recording: Recording, space: str, values: Value) -> Value:
+    """Return values of a space; those of varying size are recorded as bytes."""
+    if isinstance(values, bytes):
+        return decode(recording.spaces[space], values, str(recording.path))
+    if isinstance(values, np.ndarray) and values.dtype.hasobject:
+        return [decode(recording.spaces[space], value, str(recording.path)) for value in values]
+    return values
 
 
 def observations_of(
@@ -114,7 +132,7 @@ def value_in_words(value: object, limit: int = FEW) -> str:
 
 
 def action_in_words(recording: Recording, phase: str, agent: str = "") -> Callable[[Value], str]:
-    """Return how to put an action of a step's record in words: `left`, or its value where it has no name.
+    """Return how to put an action, as `acted` returns it, in words: `left`, or its value without a name.
 
     Actions of a game are mappings by agent, unless an agent is given.
     """
@@ -126,14 +144,13 @@ def action_in_words(recording: Recording, phase: str, agent: str = "") -> Callab
     space = recording.spaces["action"]
     start = (space["spaces"][agent] if agent else space).get("start")
     least = start if isinstance(start, int) else 0
-    recorded_from = 0 if recording.has_states else least
     names = [spoken(name) for name in recording.action_names(phase, agent)]
 
     def in_words(action: Value) -> str:
         if not names and not recording.has_states:
             return value_in_words(action)
-        index = int(action) - recorded_from
-        return names[index] if 0 <= index < len(names) else str(index + least)
+        index = int(action) - least
+        return names[index] if 0 <= index < len(names) else str(int(action))
 
     return in_words
 

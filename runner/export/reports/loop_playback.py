@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from runner.environments.naming import spoken
 from runner.errors import RecordingError, shortened
-from runner.export.contents import ENDINGS, Step, Steps, ending_of
+from runner.export.contents import ENDINGS, ending_of
 from runner.export.episodes import EpisodePlace, no_step
 from runner.export.reports.player_data import (
     Playback,
@@ -29,13 +29,13 @@ from runner.export.reports.player_data import (
     short_rows,
     words,
 )
-from runner.export.values import action_in_words, is_image, names_in, number_names, observed
+from runner.export.values import acted, action_in_words, is_image, names_in, number_names, observed
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, leaves_of
 from runner.replay.steps import reset_of
 from runner.replay.whole_steps import whole_steps
-from runner.util.arrays import Array
+from runner.util.arrays import Array, Records
 
 MAX_SERIES: Final = 32
 _LEAST_SERIES: Final = 20
@@ -87,13 +87,13 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
     actions: dict[str, list[str]] = {agent: [] for agent in in_words}
     observations = [_observations_before(recording, place, span, first, parts)]
     for steps in _steps(recording, place, range(span.start, part[-1] + 1, span.step)):
-        paid = np.array([step["rewards"] for step in steps], np.float64)
-        earlier = int(np.searchsorted([step["step"] for step in steps], part.start))
+        paid = steps["rewards"].astype(np.float64)
+        earlier = int(np.searchsorted(steps["step"], part.start))
         before += paid[:earlier].sum(axis=0)
         if earlier < len(steps):
             shown = steps[earlier:]
             rewards.append(paid[earlier:])
-            log_times.append(np.array([step["log_time"] for step in shown], np.int64))
+            log_times.append(shown["log_time"].astype(np.int64))
             for agent, text_of in in_words.items():
                 actions[agent] += [shortened(text_of(step), _MAX_LETTERS) for step in shown]
             observations.append(_observations(recording, shown, parts))
@@ -127,33 +127,35 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
     )
 
 
-def _steps(recording: Recording, place: EpisodePlace, numbers: range) -> Iterator[Steps]:
+def _steps(recording: Recording, place: EpisodePlace, numbers: range) -> Iterator[Records]:
     """Yield the steps of an episode with these numbers, some at a time."""
     phase = place.phase
     if recording.has_actions_alone(phase):
         steps = whole_steps(recording, phase, place.number)
         yield steps[(steps["step"] >= numbers.start) & (steps["step"] < numbers.stop)]
-    elif recording.kind != "variable":
-        for block in recording.blocks(recording.topic(f"/{phase}/step"), numbers.start, numbers.stop):
-            yield block[(numbers.start - int(block["step"][0])) % numbers.step :: numbers.step]
-    else:
-        for step in recording.transitions(phase):
-            if step["step"] >= numbers.stop:
-                return
-            if step["step"] >= numbers.start:
-                yield [step]
+        return
+    name = f"/{phase}/step"
+    topic = recording.topic(name)
+    is_fixed = topic in recording.dtypes
+    for block in recording.blocks(topic, numbers.start, numbers.stop) if is_fixed else recording.rows(name):
+        if (first := int(block["step"][0])) >= numbers.stop:
+            return
+        chosen = block[(numbers.start - first) % numbers.step :: numbers.step]
+        chosen = chosen[(chosen["step"] >= numbers.start) & (chosen["step"] < numbers.stop)]
+        if len(chosen):
+            yield chosen
 
 
-def _actions_in_words(recording: Recording, phase: str) -> dict[str, Callable[[Step], str]]:
+def _actions_in_words(recording: Recording, phase: str) -> dict[str, Callable[[np.void], str]]:
     """Return by agent how to put its action of a step in words: a dash where it took no part."""
     agents = recording.agents
     if len(agents) == 1:
         in_words = action_in_words(recording, phase)
-        return {"": lambda step: in_words(step["action"])}
+        return {"": lambda step: in_words(acted(recording, step))}
 
-    def text_of(number: int, agent: str) -> Callable[[Step], str]:
+    def text_of(number: int, agent: str) -> Callable[[np.void], str]:
         own = action_in_words(recording, phase, agent)
-        return lambda step: own(step["action"][agent]) if int(step["acted"]) >> number & 1 else "–"
+        return lambda step: own(acted(recording, step)[agent]) if int(step["acted"]) >> number & 1 else "–"
 
     return {agent: text_of(number, agent) for number, agent in enumerate(agents)}
 
@@ -164,8 +166,8 @@ def _observations_before(
     """Return the observation before a step of an episode, as columns of one value; empty if unknown."""
     if first:
         number = span[first - 1]
-        steps = next(_steps(recording, place, range(number, number + 1, span.step)), [])
-        return _observations(recording, steps, parts) if len(steps) else []
+        steps = next(_steps(recording, place, range(number, number + 1, span.step)), None)
+        return [] if steps is None else _observations(recording, steps, parts)
     reset = reset_of(recording, place.phase, place.number)
     if reset is None:
         return []
@@ -173,7 +175,7 @@ def _observations_before(
     return [part.column([value] if recording.kind == "variable" else np.array([value])) for part in parts]
 
 
-def _observations(recording: Recording, steps: Steps, parts: Sequence[_ShownPart]) -> list[Column]:
+def _observations(recording: Recording, steps: Records, parts: Sequence[_ShownPart]) -> list[Column]:
     """Return what is shown of the observations after steps, as columns."""
     after = observed(recording, steps)
     return [part.column(after) for part in parts]
