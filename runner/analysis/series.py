@@ -26,6 +26,7 @@ from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.metrics import LARGEST, METRIC_OF, METRICS, SHARES, finite_mean, is_usable
 from runner.recording.reader import Recording, open_recording
+from runner.util.humanize import counted
 from runner.util.values import JsonView
 
 Readings = dict[str, dict[str, float]]
@@ -93,7 +94,7 @@ def values_left_out(runs: Collection[RunSeries]) -> list[str]:
     return [
         f"Run {run.run_id}: left out, as they are infinite, not a number or beyond {LARGEST:g}: "
         + ", ".join(
-            f"{count:,} value{'s' if count > 1 else ''} of “{title_of(metric)[0]}”"
+            f"{counted(count, 'value')} of “{title_of(metric)[0]}”"
             for metric, count in run.not_finite.items()
             if metric != FURTHER_NAMES
         )

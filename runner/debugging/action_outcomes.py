@@ -14,7 +14,7 @@ from runner.drawing import svg, svg_maps
 from runner.drawing.palette import ink_on, ramp_colour
 from runner.environments.mdp import Mdp
 from runner.environments.naming import numbered_actions, spoken
-from runner.util.humanize import number
+from runner.util.humanize import number, sentence
 from runner.util.values import Json, finite
 
 ENDS: Final = {
@@ -200,7 +200,7 @@ class WhatIf:
     def _repr_html_(self) -> str:
         """Return the result as a notebook shows it."""
         facts = [f"{name}: {text}" for name, text in self.facts.items()]
-        notes = [f"{note[0].upper()}{note[1:]}." for note in self.notes]
+        notes = list(map(sentence, self.notes))
         return (
             f"{html([Section('What if?', facts)])}"
             f'<div style="display:flex;gap:1rem;max-width:60rem"><div style="flex:1">{self.picture()}</div>'

@@ -25,10 +25,10 @@ from runner.drawing.raster import image_bytes
 from runner.errors import CannotRedo, RunnerError
 from runner.export.painting import decoded
 from runner.export.pictures import Source, paint, source_of
-from runner.export.reports.rendering import sentence
 from runner.recording.reader import Recording, open_recording
 from runner.replay.steps import recorded_frames
 from runner.util.extras import require
+from runner.util.humanize import sentence
 
 _SMALL: Final = 256 * 256
 """Pictures of at most this number of pixels are encoded as PNG, which is exact; larger ones as JPEG."""

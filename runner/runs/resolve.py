@@ -123,7 +123,7 @@ def choose(name: str, candidates: Sequence[Candidate]) -> Candidate:
         if len(found) == 1:
             return found[0]
     listed = [
-        f"  {run.run_id}  {run_title(run.name, run.seed)}  {run.created:%Y-%m-%d %H:%M}"
+        f"  {run.run_id}  {run_title(run.name, run.seed)}  {run.created:%Y-%m-%d %H:%M} UTC"
         for run in candidates[:_MAX_LISTED]
     ]
     if len(candidates) > _MAX_LISTED:

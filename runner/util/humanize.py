@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from typing import Final
 
 UNKNOWN: Final = "–"
@@ -23,6 +24,17 @@ def size(count: float) -> str:
         if count < 999.5:
             return f"{_two_digits(count)} {unit}"
     return f"{_two_digits(count / 1000)} TB"
+
+
+def capitalised(text: str) -> str:
+    """Return a text with a capital at its start."""
+    return text[:1].upper() + text[1:]
+
+
+def sentence(text: str) -> str:
+    """Return a text with a capital at its start, unless that is a name, and a full stop at its end."""
+    start = capitalised(text) if text.partition(" ")[0].isalpha() else text
+    return f"{start}{'' if text[-1:] in '.:?' else '.'}"
 
 
 def counted(count: int, noun: str) -> str:
@@ -63,6 +75,11 @@ def age(seconds: float) -> str:
         if whole < bound:
             return f"{whole // divisor} {unit}"
     return f"{whole // 86400} d"
+
+
+def ago(moment: datetime) -> str:
+    """Return the time since a moment in one unit, as `age` does."""
+    return age((datetime.now(UTC) - moment).total_seconds())
 
 
 def number(value: float | None, digits: int = 1) -> str:

@@ -11,6 +11,7 @@ from runner.analysis.compare.sections import interval, number, profile_grid, spr
 from runner.analysis.compare.statistics import Estimate
 from runner.analysis.compare.tasks import AlgorithmResult, TaskComparison
 from runner.analysis.sections import Grid, Section
+from runner.util.humanize import counted
 
 AGGREGATES: Final[tuple[tuple[str, Callable[[AlgorithmResult], Estimate]], ...]] = (
     ("IQM", lambda result: result.iqm),
@@ -44,8 +45,7 @@ def summary(comparison: TaskComparison) -> list[str]:
     """Return a sentence for each pair of algorithms, and the notes."""
     pairs = [
         f"{pair.a} scores higher than {pair.b} with a probability of {number(pair.probability.value)}, 95 % "
-        f"{interval(pair.probability)}, over {len(comparison.tasks)} "
-        f"environment{'s' if len(comparison.tasks) != 1 else ''}."
+        f"{interval(pair.probability)}, over {counted(len(comparison.tasks), 'environment')}."
         for pair in comparison.improvements
     ]
     return [*pairs, *(f"Note: {note}." for note in comparison.notes)]

@@ -11,6 +11,7 @@ from typing import Final
 from runner.analysis.diff.settings import Change
 from runner.recording.code import Code, patch_parts, unified_diff
 from runner.recording.reader import Recording
+from runner.util.humanize import counted
 
 MAX_LINES: Final = 200
 """The most lines of a file's diff that are shown."""
@@ -40,8 +41,7 @@ class FileChange:
     @property
     def words(self) -> str:
         """Return what differs: `14 lines of ppo.py`."""
-        count = self.added + self.removed
-        return f"{count:,} line{'s' if count != 1 else ''} of `{self.path}`"
+        return f"{counted(self.added + self.removed, 'line')} of `{self.path}`"
 
 
 def code_changes(a: Recording, b: Recording) -> list[FileChange]:

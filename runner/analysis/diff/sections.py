@@ -88,7 +88,7 @@ def summary(difference: RunDiff) -> str:
         sentences.append(f"{cause.text}.")
     elif divergence is not None and divergence.step:
         what = "Training takes the same actions" if divergence.actions_alone else "Training is the same"
-        sentences.append(f"{what} for {divergence.step:,} step{'s' if divergence.step > 1 else ''}.")
+        sentences.append(f"{what} for {counted(divergence.step, 'step')}.")
     elif divergence is not None:
         sentences.append("Training differs from the first step on.")
     elif difference.overlap is not None:

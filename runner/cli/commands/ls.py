@@ -27,6 +27,7 @@ from runner.runs.catalogue.columns import (
     needed_for,
     with_same_as,
 )
+from runner.util.humanize import capitalised
 from runner.util.values import Json
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ def ls_command(
         if rows:
             _print_table(rows, shown or _fitting(rows, _informative(rows, len(recordings))))
     for problem in problems[:MAX_PROBLEMS]:
-        say(f"{problem[:1].upper()}{problem[1:]}")
+        say(capitalised(problem))
     if len(problems) > MAX_PROBLEMS:
         say(f"{len(problems) - MAX_PROBLEMS:,} more runs are damaged: `dualtaxi ls status:damaged`.")
     _print_remainder(listed, total, offset, chosen, recordings)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -21,7 +20,7 @@ from runner.errors import RunnerError
 from runner.runs.catalogue.columns import STATUSES
 from runner.runs.listing import run_in
 from runner.runs.run import Run, recordings_folder
-from runner.util.humanize import UNKNOWN, age, counted, number, size
+from runner.util.humanize import UNKNOWN, ago, counted, number, size
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.removal import Removal
@@ -244,7 +243,7 @@ def _cells(removal: Removal) -> tuple[str, ...]:
         UNKNOWN if removal.seed is None else str(removal.seed),
         removal.status,
         UNKNOWN if removal.success_percent is None else number(removal.success_percent),
-        age((datetime.now(UTC) - removal.created).total_seconds()),
+        ago(removal.created),
         size(removal.freed),
     )
 

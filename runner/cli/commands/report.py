@@ -24,7 +24,7 @@ from runner.cli.runs import find_all_recorded
 from runner.export.places import write_new, write_text_new
 from runner.runs.run import recordings_folder
 from runner.sweep import is_sweep
-from runner.util.humanize import counted, size
+from runner.util.humanize import counted, sentence, size
 
 if TYPE_CHECKING:
     from runner.analysis.axes import Axis
@@ -94,9 +94,9 @@ def plot_command(
         return
     groups = groups_of(series)
     for note in duplicates(groups):
-        say(f"{note[0].upper()}{note[1:]}.")
-    for sentence in values_left_out(series):
-        say(sentence)
+        say(sentence(note))
+    for left_out in values_left_out(series):
+        say(left_out)
     panels = panels_of(groups)
     with stage_line("drawing"):
         write_new(output, to.force, lambda path: save(curves_sheet(groups, panels, style), path))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -17,7 +16,7 @@ from runner.cli.progress import stage_line
 from runner.cli.runs import command_for, find, restored
 from runner.runs.branches import Origin, origin_in
 from runner.runs.run import Run
-from runner.util.humanize import UNKNOWN, age, counted, duration, number, size
+from runner.util.humanize import UNKNOWN, ago, counted, duration, number, size
 from runner.util.values import JsonView
 
 if TYPE_CHECKING:
@@ -159,7 +158,6 @@ def _parts(details: RunDetails, branches: Mapping[str, Origin]) -> list[Renderab
 def _head(details: RunDetails) -> dict[str, str]:
 
     run, summary, origin = details.run, details.run.summary, origin_in(details.config)
-    ago = age((datetime.now(UTC) - run.created).total_seconds())
     took = "" if summary.seconds is None else f", took {duration(summary.seconds)}"
     steps = ""
     if not (details.train_steps is None or details.episodes is None or details.eval_steps is None):
@@ -172,7 +170,7 @@ def _head(details: RunDetails) -> dict[str, str]:
             time += f", {clock.steps_a_second:,.0f} steps a second"
     return {
         "run": f"{run.run_id}  {run.title}",
-        "status": f"{run.status}, begun {ago} ago{took}",
+        "status": f"{run.status}, begun {ago(run.created)} ago{took}",
         "damage": run.problem,
         "error": summary.error or "",
         "branch": "" if origin is None else f"of run {origin.run} {origin}",

@@ -36,6 +36,7 @@ from runner.export.reports.maps import situation, situation_in_words
 from runner.export.reports.rendering import Figure, LegendEntry, Link, View, render
 from runner.recording.reader import Recording
 from runner.recording.run_file import run_title
+from runner.util.humanize import capitalised
 
 _MAX_VALUES: Final = 6
 """Q-values shown of each run: the highest."""
@@ -137,8 +138,8 @@ def _divergence(
         step=divergence.reference,
         frame=divergence.frame,
         title="Where training diverges" if is_training else "Where an evaluation diverges",
-        where=where[0].upper() + where[1:],
-        cause=why[0].upper() + why[1:],
+        where=capitalised(where),
+        cause=capitalised(why),
         updates=updates_in_words(cause) if is_training else evaluation_updates(difference, cause),
         pictures=list(_pictures(divergence, a, b)),
         rows=[_values(row) for row in (() if cause is None else cause.rows)],

@@ -36,6 +36,7 @@ from runner.recording.spaces import Value, leaves_of
 from runner.replay.steps import reset_of
 from runner.replay.whole_steps import whole_steps
 from runner.util.arrays import Array, Records
+from runner.util.humanize import capitalised
 
 MAX_SERIES: Final = 32
 _LEAST_SERIES: Final = 20
@@ -108,7 +109,7 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
     elif first + limit >= len(span):
         total = float(before.sum() + reward.sum())
     texts, series = _frames(parts, observations)
-    title = place.title[0].upper() + place.title[1:]
+    title = capitalised(place.title)
     return Playback(
         title=title if span.step == 1 else f"{title}, in environment {span.start % span.step}",
         description=outcome_in_words(len(span), ended, total),

@@ -43,6 +43,7 @@ from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.steps import check_steps, steps_of
 from runner.replay.tables import TableReplay, tables_at
+from runner.util.humanize import capitalised
 
 MAX_STEPS: Final = 1000
 """Steps of an episode that a page shows; the page says so where an episode has more."""
@@ -85,7 +86,7 @@ def titled(playback: Playback, names: Sequence[str]) -> Playback:
     part = "" if shown == playback.length else f" Shown are the first {shown:,} steps."
     return replace(
         playback,
-        title=f"{names_text[0].upper()}{names_text[1:]}: {title[0].lower()}{title[1:]}",
+        title=f"{capitalised(names_text)}: {title[0].lower()}{title[1:]}",
         description=playback.description + part,
     )
 
@@ -118,7 +119,7 @@ def tabular_playback(
     time = frame_times((shown["log_time"] // schema.STEP_NANOSECONDS).astype(np.int64))
     before = steps["rewards"][:first].sum(axis=0).tolist() if first else []
     return Playback(
-        title=place.title[0].upper() + place.title[1:],
+        title=capitalised(place.title),
         description=outcome_in_words(len(steps), ended, float(steps["rewards"].sum())),
         length=len(steps),
         first=first,

@@ -18,6 +18,7 @@ from runner.export.contents import ENDINGS
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.util.arrays import Array
+from runner.util.humanize import counted
 from runner.util.values import Json
 
 MAX_LOGGED: Final = 5000
@@ -128,7 +129,7 @@ def words(agent: str, name: str, texts: Iterable[str]) -> Words:
 def outcome_in_words(length: int, ended: str, total: float | None) -> str:
     """Return length, end and return of an episode as text; a return of None is unknown."""
     rewards = "" if total is None else f" Rewards sum to {total:g}."
-    return f"{length:,} step{'s' if length != 1 else ''}, {ENDINGS[ended]}.{rewards}"
+    return f"{counted(length, 'step')}, {ENDINGS[ended]}.{rewards}"
 
 
 def frame_times(after: NDArray[np.int64]) -> list[int]:

@@ -99,7 +99,7 @@ def environment_of(folders: Sequence[Traversable]) -> Environment:
         "number": humanize.number,
         "count": lambda value: humanize.number(value, 0),
         "code": code,
-        "sentence": sentence,
+        "sentence": humanize.sentence,
     }
     environment.filters |= filters
     environment.globals["metrics"] = METRICS
@@ -128,13 +128,6 @@ def code(text: str) -> Markup:
     from markupsafe import escape as marked
 
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(marked(text))))
-
-
-def sentence(text: str) -> str:
-    """Return a text with a capital at its start, unless that is a name, and a full stop at its end."""
-    first, space, rest = text.partition(" ")
-    start = first[:1].upper() + first[1:] if first.isalpha() else first
-    return f"{start}{space}{rest}{'' if text[-1:] in '.:?' else '.'}"
 
 
 def embedded(data: object) -> str:

@@ -16,6 +16,7 @@ from runner.service.dependencies import EPISODES, RecordedRun
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import page
 from runner.service.pages.replay import Panel, T, panel_of
+from runner.util.humanize import capitalised
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
 
@@ -78,7 +79,7 @@ def _environments(run: Run, at: StepRef) -> _EnvironmentsView:
         return _EnvironmentsView(
             run=head_of(run),
             here="replay",
-            title=place.title[0].upper() + place.title[1:],
+            title=capitalised(place.title),
             alone=f"{base}/{at.episode_path}",
             shown=panels,
             length=len(span),

@@ -6,7 +6,7 @@ import functools
 import json
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from http import HTTPStatus
 from importlib.resources import files
 from typing import Annotated, Any, ClassVar, Final
@@ -18,7 +18,7 @@ from markupsafe import Markup
 
 from runner.errors import RunnerError
 from runner.export.reports.rendering import TEMPLATES as REPORT_TEMPLATES
-from runner.export.reports.rendering import View, code, environment_of, fill, sentence
+from runner.export.reports.rendering import View, code, environment_of, fill
 from runner.service import problems
 from runner.service.addresses import link
 from runner.service.pages import static
@@ -89,14 +89,13 @@ def _problem(message: str) -> Markup:
     """Return an error as HTML; lines with a caret have a fixed width, so that it points at its place."""
     text, _, marked = message.partition("\n")
     if not marked.rstrip().endswith("^"):
-        return Markup("<p>{}</p>").format(code(sentence(message)))
-    return Markup("<p>{}</p><pre>{}</pre>").format(code(sentence(text)), marked)
+        return Markup("<p>{}</p>").format(code(humanize.sentence(message)))
+    return Markup("<p>{}</p><pre>{}</pre>").format(code(humanize.sentence(text)), marked)
 
 
 def _age(moment: datetime | str) -> str:
     """Return the time since a moment as text."""
-    then = datetime.fromisoformat(moment) if isinstance(moment, str) else moment
-    return humanize.age((datetime.now(UTC) - then).total_seconds())
+    return humanize.ago(datetime.fromisoformat(moment) if isinstance(moment, str) else moment)
 
 
 async def form_of(request: Request) -> dict[str, str]:

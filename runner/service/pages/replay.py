@@ -31,6 +31,7 @@ from runner.service.catalogue import Catalogue
 from runner.service.dependencies import EPISODES, CatalogueOf, ComputationOf, PicturesOf, RecordedRun
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import message_of, page
+from runner.util.humanize import capitalised
 from runner.util.values import JsonView
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
@@ -293,8 +294,7 @@ def _facts(episode: JsonView, i: int) -> list[tuple[str, str]]:
     """Return what is known of frame i of a part of an episode, by name, for readers without scripts."""
 
     def named(one: Mapping[str, object]) -> str:
-        name = f"{one['agent']} {one['name']}".strip().replace("_", " ")
-        return name[0].upper() + name[1:]
+        return capitalised(f"{one['agent']} {one['name']}".strip().replace("_", " "))
 
     facts = [(named(text), text["values"][text["at"][i]]) for text in episode["texts"]]
     if i == 0:
