@@ -129,23 +129,12 @@ class Rows:
         if not (n or self._reset_rows):
             return
         resets, transitions = np.array(self._reset_rows, np.int64), self._transitions(n)
+        numbers = np.empty(0, np.int64)
         if n:
-            rows, is_over = self._outcomes(n)
-            was_reset, rewards = self._begins(n), rows["rewards"].reshape(n, 1, -1)
-            was_reset[resets[resets < n]] = True
-            counts = None
-            if self._mdp is not None:
-                counts, excluded = step_counts(self._mdp, rewards[:, 0, 0], *transitions)
-                self.off_table += int(np.count_nonzero(excluded))
-                counts = counts[:, np.newaxis]
-            ends = rows["terminated"][:, np.newaxis], rows["truncated"][:, np.newaxis]
-            steps = Steps(first, rewards, *ends, was_reset[:, np.newaxis], is_over=is_over, counts=counts)
-            found = self._log.take(steps)
-            self._finish_steps(n, found.number[:, 0], found.t[:, 0], before)
-            self._put_ends(found.ended, first, before)
+            found = self._log.take(self._as_steps(n, first, resets, transitions))
             numbers = found.number[:, 0]
-        else:
-            numbers = np.empty(0, np.int64)
+            self._finish_steps(n, numbers, found.t[:, 0], before)
+            self._put_ends(found.ended, first, before)
         if len(resets):
             if resets[-1] == n:
                 self._put_ends(self._log.interrupt(first + n, np.zeros(1, np.int64)), first, before)
@@ -156,6 +145,19 @@ class Rows:
             self._last_position = before + n
         self.filled = 0
         self._reset_rows, self._seeds = [], []
+
+    def _as_steps(self, n: int, first: int, resets: Ints, transitions: tuple[Ints, Ints, Ints]) -> Steps:
+        """Return the first n rows as steps of one environment; `resets` are the rows after resets."""
+        rows, is_over = self._outcomes(n)
+        rewards, was_reset = rows["rewards"].reshape(n, 1, -1), self._begins(n)
+        was_reset[resets[resets < n]] = True
+        counts = None
+        if self._mdp is not None:
+            counts, excluded = step_counts(self._mdp, rewards[:, 0, 0], *transitions)
+            self.off_table += int(np.count_nonzero(excluded))
+            counts = counts[:, np.newaxis]
+        ends = rows["terminated"][:, np.newaxis], rows["truncated"][:, np.newaxis]
+        return Steps(first, rewards, *ends, was_reset[:, np.newaxis], is_over=is_over, counts=counts)
 
     def _put_ends(self, ended: Columns, first: int, before: int) -> None:
         """Record the ends of episodes, each at the time of its last step, which may be committed already."""
