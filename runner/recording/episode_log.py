@@ -65,8 +65,10 @@ class EpisodeLog:
         """The number of the episode in progress, or of the next one, in each environment."""
         self.length = np.zeros(n, np.int64)
         """Its steps so far."""
-        self._sums = np.full((n, agents + (1 + len(mdp.event_names) if mdp else 0)), zero)
+        self._sums = np.zeros((n, agents + (1 + len(mdp.event_names) if mdp else 0)))
         """Its rewards by agent, and its events and penalties, so far."""
+        if np.signbit(zero):  # zeros take no memory, however many environments a file declares
+            self._sums[:] = zero
         self.ended = 0
         """Episodes of all environments that have ended."""
 
