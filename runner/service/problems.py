@@ -73,6 +73,12 @@ def error_docs(*statuses: HTTPStatus) -> dict[int | str, dict[str, object]]:
     return {int(status): {"model": ErrorResponse, "description": status.phrase} for status in statuses}
 
 
+RUN_ERRORS: Final = error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT)
+"""The errors of every route of a run."""
+BUSY_ERRORS: Final = error_docs(HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.NOT_IMPLEMENTED)
+"""Further errors of work in a child process."""
+
+
 def media_docs(*media: str) -> dict[int | str, dict[str, object]]:
     """Return the OpenAPI documentation of the media types of a route's response."""
     return {200: {"content": {kind: {} for kind in media}}}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from http import HTTPStatus
 from typing import Annotated, Final
 
 from fastapi import APIRouter, Query, Response
@@ -19,19 +18,13 @@ from runner.service.api.reading import AxisName, FirstPosition, LastPosition, Me
 from runner.service.catalogue import Catalogue
 from runner.service.computed import Curves
 from runner.service.dependencies import CatalogueOf, ComputationOf, SettingsOf, recorded_run
-from runner.service.problems import error_docs
+from runner.service.problems import BUSY_ERRORS, RUN_ERRORS
 from runner.service.settings import Settings
 from runner.util.values import finite
 
 router = APIRouter(
     tags=["comparing"],
-    responses=error_docs(
-        HTTPStatus.BAD_REQUEST,
-        HTTPStatus.NOT_FOUND,
-        HTTPStatus.CONFLICT,
-        HTTPStatus.SERVICE_UNAVAILABLE,
-        HTTPStatus.NOT_IMPLEMENTED,
-    ),
+    responses=RUN_ERRORS | BUSY_ERRORS,
 )
 MAX_RUNS: Final = 1000
 MAX_SCORES: Final = 10_000

@@ -17,14 +17,12 @@ from runner.debugging.why import LIMIT, MAX_LIMIT, why_in
 from runner.service import computed, fragments
 from runner.service.api.replay import STEPS, Part, Start, Steps
 from runner.service.dependencies import ComputationOf, RecordedRun
-from runner.service.problems import error_docs
+from runner.service.problems import RUN_ERRORS, error_docs
 
 router = APIRouter(
     prefix="/runs/{run}",
     tags=["reading"],
-    responses=error_docs(
-        HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT, HTTPStatus.SERVICE_UNAVAILABLE
-    ),
+    responses=RUN_ERRORS | error_docs(HTTPStatus.SERVICE_UNAVAILABLE),
 )
 MAX_ACTIONS = 1000
 At = Annotated[str, Path(max_length=60, description=EXPECTED, examples=["eval:3000:17:5"])]

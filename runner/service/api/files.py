@@ -18,12 +18,12 @@ from runner.runs.run import Run
 from runner.service import computed
 from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
 from runner.service.errors import Refused
-from runner.service.problems import error_docs
+from runner.service.problems import BUSY_ERRORS, RUN_ERRORS
 
 router = APIRouter(
     prefix="/runs/{run}",
     tags=["files"],
-    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
+    responses=RUN_ERRORS,
 )
 MEDIA: Final = "application/octet-stream"
 BLOCK: Final = 1 << 20
@@ -98,7 +98,7 @@ def checkpoint(
 @router.get(
     "/replay.rrd",
     response_class=Response,
-    responses=FILE | error_docs(HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.NOT_IMPLEMENTED),
+    responses=FILE | BUSY_ERRORS,
     summary="The run for the Rerun viewer, made on demand.",
 )
 async def replay(

@@ -17,11 +17,9 @@ from runner.service.jobs.checking import BranchQuestion, CheckedJob, check_branc
 from runner.service.jobs.explanations import ExplainQuestion, check_explanation
 from runner.service.jobs.queue import JobQueue
 from runner.service.jobs.store import Job
-from runner.service.problems import error_docs
+from runner.service.problems import RUN_ERRORS
 
-router = APIRouter(
-    tags=["jobs"], responses=error_docs(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT, HTTPStatus.BAD_REQUEST)
-)
+router = APIRouter(tags=["jobs"], responses=RUN_ERRORS)
 
 
 @router.post(

@@ -24,16 +24,14 @@ from runner.service.dependencies import (
     json_response,
 )
 from runner.service.errors import Refused
-from runner.service.problems import error_docs, media_docs
+from runner.service.problems import BUSY_ERRORS, RUN_ERRORS, media_docs
 from runner.util.arrays import Array
 
 router = APIRouter(
     prefix="/runs/{run}",
     tags=["reading"],
-    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
+    responses=RUN_ERRORS,
 )
-BUSY: Final = error_docs(HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.NOT_IMPLEMENTED)
-"""Further errors of work in a child process."""
 ARROW: Final = "application/vnd.apache.arrow.stream"
 OCTETS: Final = "application/octet-stream"
 MEDIA: Final = {"svg": "image/svg+xml", "png": "image/png", "pdf": "application/pdf"}
@@ -95,7 +93,9 @@ class Columns(BaseModel):
     columns: dict[str, list[object]]
 
 
-@router.get("/metrics", response_model=Curves, responses=BUSY, summary="The curves of a run's metrics.")
+@router.get(
+    "/metrics", response_model=Curves, responses=BUSY_ERRORS, summary="The curves of a run's metrics."
+)
 async def metrics(
     run: RecordedRun,
     compute: ComputationOf,
@@ -118,7 +118,7 @@ async def metrics(
 @router.get(
     "/histograms",
     response_model=Histograms,
-    responses=BUSY,
+    responses=BUSY_ERRORS,
     summary="Histograms over training, as heat maps.",
 )
 async def histograms(run: RecordedRun, compute: ComputationOf, axis: AxisName = EPISODES.name) -> Response:
@@ -131,7 +131,7 @@ def _add_records_route(kind: computed.RecordKind, summary: str, description: str
         f"/{kind}",
         name=kind,
         response_model=Records,
-        responses=BUSY,
+        responses=BUSY_ERRORS,
         summary=summary,
         description=description,
     )
@@ -164,7 +164,7 @@ _add_records_route(
 @router.get(
     "/{table}/{phase}.arrow",
     response_class=Response,
-    responses=media_docs(ARROW) | BUSY,
+    responses=media_docs(ARROW) | BUSY_ERRORS,
     summary="Steps or episodes by range, as Arrow.",
 )
 async def arrow(
@@ -218,7 +218,7 @@ def steps(
 @router.get(
     "/qtable",
     response_model=dict[str, object],
-    responses=BUSY,
+    responses=BUSY_ERRORS,
     summary="A summary of the Q-table at any step.",
 )
 async def q_table(
@@ -238,7 +238,7 @@ async def q_table(
 @router.get(
     "/qtable.npy",
     response_class=Response,
-    responses=media_docs(OCTETS) | BUSY,
+    responses=media_docs(OCTETS) | BUSY_ERRORS,
     summary="The whole Q-table at any step.",
 )
 async def whole_q_table(
@@ -253,7 +253,7 @@ async def whole_q_table(
 @router.get(
     "/plot.{form}",
     response_class=Response,
-    responses=media_docs(*MEDIA.values()) | BUSY,
+    responses=media_docs(*MEDIA.values()) | BUSY_ERRORS,
     summary="Every metric in one figure.",
 )
 async def plot(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Hashable
 from functools import partial
-from http import HTTPStatus
 from typing import Annotated, Final, NamedTuple
 
 from fastapi import APIRouter, Depends, Query, Response
@@ -23,18 +22,12 @@ from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.dependencies import EPISODES, ComputationOf, PicturesOf, RecordedRun, recording_state
 from runner.service.pictures import Make, PictureStreams
-from runner.service.problems import error_docs, media_docs
+from runner.service.problems import BUSY_ERRORS, RUN_ERRORS, media_docs
 
 router = APIRouter(
     prefix="/runs/{run}/replay",
     tags=["reading"],
-    responses=error_docs(
-        HTTPStatus.BAD_REQUEST,
-        HTTPStatus.NOT_FOUND,
-        HTTPStatus.CONFLICT,
-        HTTPStatus.SERVICE_UNAVAILABLE,
-        HTTPStatus.NOT_IMPLEMENTED,
-    ),
+    responses=RUN_ERRORS | BUSY_ERRORS,
 )
 
 STEPS: Final = 500
