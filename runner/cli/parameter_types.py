@@ -72,6 +72,10 @@ class RunName(Completed):
             return [CompletionItem(incomplete, type="file")]
         return super().shell_complete(ctx, param, incomplete)
 
+    def get_missing_message(self, param: click.Parameter, ctx: click.Context | None) -> str:  # noqa: ARG002
+        """Return where names of runs are found."""
+        return "`dualtaxi ls` lists the runs; @latest is the newest."
+
 
 def _runs(ctx: click.Context, incomplete: str) -> Mapping[str, str]:
     try:
@@ -96,6 +100,10 @@ class ConfigName(click.Path):
         names = {each.name for each in shipped().values() if each.kind == self.kind}
         own = [item for item in SHIPPED.shell_complete(ctx, param, incomplete) if item.value in names]
         return [*own, *super().shell_complete(ctx, param, incomplete)]
+
+    def get_missing_message(self, param: click.Parameter, ctx: click.Context | None) -> str:  # noqa: ARG002
+        """Return where names of configurations are found."""
+        return f"`dualtaxi config ls` lists the shipped {self.kind}s."
 
 
 def _shipped(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
