@@ -21,18 +21,18 @@ from runner.cli import cli
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), *ROOT.glob("README.md")])
-_EXAMPLE = re.compile(r"^```python[ \t]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-"""A block marked python; one marked `python no-test` is not run."""
+_EXAMPLE = re.compile(r"^```(python|sh example)[ \t]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+"""A block marked python, or `sh example`, of commands; one marked `python no-test` is not run."""
 
 
 _COMMANDS = re.compile(r"^```sh run[ \t]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 """A block of commands that are run, one per line; a backslash continues a line."""
 
 
-def examples(page: Path) -> list[tuple[int, str]]:
-    """Return the line and the text of each example of a page."""
+def examples(page: Path) -> list[tuple[int, str, str]]:
+    """Return the line, the language and the text of each example of a page."""
     text = page.read_text(encoding="utf-8")
-    return [(text[: found.start(1)].count("\n"), found.group(1)) for found in _EXAMPLE.finditer(text)]
+    return [(text[: found.start(2)].count("\n"), *found.groups()) for found in _EXAMPLE.finditer(text)]
 
 
 WITH_EXAMPLES = [page for page in PAGES if examples(page)]
@@ -70,19 +70,25 @@ def test_examples_run(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch)
     (recording,) = folder.glob("recordings/*/recording.mcap")
     monkeypatch.setattr(sys, "argv", ["example.py", str(recording)])
     names: dict[str, object] = {"__name__": "example"}
-    for line, text in examples(page):
+    for line, language, text in examples(page):
+        if language == "sh example":
+            run_commands(text)
+            continue
         code = compile("\n" * line + text, str(page), "exec")
         with contextlib.redirect_stdout(io.StringIO()):
             exec(code, names)
 
 
-def commands(page: Path) -> list[list[str]]:
-    """Return the words of each command of a page that is to be run."""
-    blocks = [block.replace("\\\n", "") for block in _COMMANDS.findall(page.read_text(encoding="utf-8"))]
-    return [shlex.split(line, comments=True) for block in blocks for line in block.splitlines() if line]
+def run_commands(text: str) -> None:
+    """Run the commands of a block."""
+    for line in filter(None, text.replace("\\\n", "").splitlines()):
+        program, *words = shlex.split(line, comments=True)
+        assert program == "dualtaxi"
+        done = CliRunner().invoke(cli, words)
+        assert done.exit_code == (words[0] == "diff"), f"{words}: {done.output}"
 
 
-WITH_COMMANDS = [page for page in PAGES if commands(page)]
+WITH_COMMANDS = [page for page in PAGES if _COMMANDS.search(page.read_text(encoding="utf-8"))]
 
 
 @pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda page: page.relative_to(ROOT).as_posix())
@@ -90,10 +96,8 @@ def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     (tmp_path / "configs").symlink_to(ROOT / "configs", target_is_directory=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("DUALTAXI_RECORDINGS", raising=False)
-    for program, *words in commands(page):
-        assert program == "dualtaxi"
-        done = CliRunner().invoke(cli, words)
-        assert done.exit_code == (words[0] == "diff"), f"{words}: {done.output}"
+    for block in _COMMANDS.findall(page.read_text(encoding="utf-8")):
+        run_commands(block)
 
 
 def test_every_picture_is_shown_and_every_shown_one_is_there() -> None:
