@@ -103,7 +103,7 @@ def _download(client: Connection, path: str, tag: str, size: int, part: Path, re
     """
     backoff = client.backoff()
     with part.open("ab") as stream:
-        require_room(part.parent, size - stream.tell())
+        require_room(part.parent.parent, size - stream.tell())
         while stream.tell() < size:
             try:
                 for piece in client.download(path, tag, stream.tell(), size):

@@ -305,7 +305,7 @@ def _staging_folder(recordings: Path, recording: Path) -> Iterator[Path]:
     hidden = recordings / f".importing-{secrets.token_hex(4)}"
     try:
         (hidden / "run").mkdir(parents=True)
-        require_room(hidden, recording.stat().st_size)
+        require_room(recordings, recording.stat().st_size)
         yield hidden / "run"
     except OSError as error:
         raise StorageError(

@@ -240,7 +240,7 @@ class Uploads:
         limit = limit if upload.size is None else min(limit, upload.size)
         if end > limit:
             raise UploadTooLarge(f"found {end:,} bytes, expected at most {limit:,}.")
-        require_room(self._folder, more, self._limits.spare_bytes)
+        require_room(self._recordings, more, self._limits.spare_bytes)
 
     def _store(self, upload: Upload) -> None:
         """Write an upload to disk; remove what is not needed any more when it is over."""
