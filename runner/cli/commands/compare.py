@@ -115,11 +115,7 @@ def compare_command(
     with stage_line("reading runs") as stage:
         series = series_of((run.recording for run in runs), axis)
         stage("computing intervals")
-        made = (
-            _compare_groups(series, by, chosen, read_at, html is not None)
-            if normalise is None
-            else _compare_tasks(series, by, chosen, read_at, normalise, html is not None)
-        )
+        made = _compare(series, by, chosen, read_at, normalise, html is not None)
         if html is not None:
             write_text_new(html, force, made.page)
     if html is not None:
@@ -141,46 +137,33 @@ class _Made(NamedTuple):
     page: str = ""
 
 
-def _compare_groups(
-    series: list[RunSeries], by: str | None, chosen: Sequence[str], moment: Moment, with_page: bool
-) -> _Made:
-    from runner.analysis.compare import compare
-    from runner.analysis.compare.sections import sections
-    from runner.analysis.groups import grouped, metrics_of, require_two
-
-    groups, notes = grouped(series, by)
-    require_two(groups, by)
-    comparison = compare(groups, metrics_of(groups, chosen), moment, notes)
-    page = ""
-    if with_page:
-        from runner.export.reports.compare import render_comparison
-
-        page = render_comparison(comparison, groups)
-    count = sum(len(group.runs) for group in groups)
-    named = counted(len(comparison.metrics), "metric")
-    return _Made(comparison, sections(comparison), f"{named} of {count} runs in {len(groups)} groups", page)
-
-
-def _compare_tasks(
+def _compare(
     series: list[RunSeries],
     by: str | None,
     chosen: Sequence[str],
     moment: Moment,
-    normalise: str,
+    normalise: str | None,
     with_page: bool,
 ) -> _Made:
+    """Return the comparison of groups of runs, or of algorithms over environments."""
+    from runner.analysis.compare import compare
     from runner.analysis.compare.score_table import scores_of
+    from runner.analysis.compare.sections import sections
     from runner.analysis.compare.task_sections import task_sections
     from runner.analysis.compare.tasks import compare_algorithms
+    from runner.analysis.groups import grouped, metrics_of, require_two
+    from runner.export.reports.compare import render_comparison, render_tasks
 
-    comparison = compare_algorithms(series, scores_of(normalise), by, chosen, moment)
-    page = ""
-    if with_page:
-        from runner.export.reports.compare import render_tasks
-
-        page = render_tasks(comparison)
-    contents = f"{len(comparison.algorithms)} groups in {len(comparison.tasks)} environments"
-    return _Made(comparison, task_sections(comparison), contents, page)
+    if normalise is not None:
+        tasks = compare_algorithms(series, scores_of(normalise), by, chosen, moment)
+        contents = f"{len(tasks.algorithms)} groups in {len(tasks.tasks)} environments"
+        return _Made(tasks, task_sections(tasks), contents, render_tasks(tasks) if with_page else "")
+    groups, notes = grouped(series, by)
+    require_two(groups, by)
+    found = compare(groups, metrics_of(groups, chosen), moment, notes)
+    runs = sum(len(group.runs) for group in groups)
+    contents = f"{counted(len(found.metrics), 'metric')} of {runs} runs in {len(groups)} groups"
+    return _Made(found, sections(found), contents, render_comparison(found, groups) if with_page else "")
 
 
 @click.command("diff", cls=Command)

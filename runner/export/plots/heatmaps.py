@@ -61,7 +61,6 @@ def heatmap_chart(histogram: Histogram) -> Chart:
             [columns[k], lines[j + 1], columns[k + 1] - columns[k], lines[j] - lines[j + 1]]
         )
         chart.cells(cells, palette.ramp_colour(level))
-    chart.shape([(x.start, y.end), (x.start, y.start), (x.end, y.start)], stroke=palette.INK)
     ticks = x.ticks if not axis.whole else [tick for tick in x.ticks if tick == int(tick)]
     for tick, text in labelled(ticks, short=histogram.edges[-1] >= 10_000):
         chart.shape([(x.at(tick), y.start), (x.at(tick), y.start + 3)], stroke=palette.INK)
@@ -69,7 +68,6 @@ def heatmap_chart(histogram: Histogram) -> Chart:
     named = [(k + 0.5, name) for k, name in enumerate(names)]
     for at, name in named[:: -(-rows // 10)] or [(tick, number_on_axis(tick)) for tick in y.ticks]:
         chart.text(x.start - 5, y.at(at) + 3, name, "end", size=8)
-    chart.text(x.start, 14.0, title, size=9.5, bold=True)
+    chart.frame(title, 14.0, axis.label)
     chart.text(x.start, 26.0, f"{histogram.unit}; lightest: {100 * shares.max():.0f} %", size=SMALL)
-    chart.text((x.start + x.end) / 2, HEIGHT - 5, axis.label, "middle")
     return chart

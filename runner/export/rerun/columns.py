@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from runner.drawing import palette
 from runner.export.rerun.step_values import StepValues
+from runner.recording.schema import STEP_NANOSECONDS
 from runner.util.arrays import Array
 
 APPLICATION: Final = "dualtaxi"
@@ -37,6 +38,29 @@ class Batch:
     """None where they are unknown, or not exported."""
     trials: int = 0
     """Trials of an evaluation; 0 for training."""
+
+    @classmethod
+    def of(
+        cls,
+        records: NDArray[np.void],
+        episode: NDArray[np.int64],
+        values: StepValues | None = None,
+        trials: int = 0,
+    ) -> Batch:
+        """Return recorded steps, whose times are known."""
+        return cls(records, episode, records["log_time"].astype(np.int64) // STEP_NANOSECONDS, values, trials)
+
+    @classmethod
+    def concatenated(cls, parts: Sequence[Batch]) -> Batch:
+        """Return successive batches as one; the values of all are known, or of none."""
+        if len(parts) == 1:
+            return parts[0]
+        records, episode, time = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("records", "episode", "time")
+        )
+        values = [part.values for part in parts if part.values is not None]
+        whole = StepValues.concatenated(values) if values else None
+        return cls(records, episode, time, whole, parts[0].trials)
 
     def number(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the number of the episode at these rows, or of the trial within its evaluation."""

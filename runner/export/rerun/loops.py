@@ -205,8 +205,7 @@ class LoopExporter:
                 episode = steps["episode"].astype(np.int64)
                 if training_ends is not None:  # evaluation is shown by the training episodes before it
                     episode = np.searchsorted(training_ends, steps["log_time"])
-                time = steps["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS
-                grid.write(Batch(steps, episode, time))
+                grid.write(Batch.of(steps, episode))
         if grid is not None:
             grid.clear_gaps(["grid"], grid.covered[-1][1])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 import rerun as rr
@@ -19,7 +19,7 @@ from runner.export.rerun.metrics import MetricWriter
 from runner.export.rerun.q_values import MapWriter, TableWriter
 from runner.export.rerun.scene import scene_of
 from runner.export.rerun.selection import Selection
-from runner.export.rerun.step_values import StepValueReader, StepValues
+from runner.export.rerun.step_values import StepValueReader
 from runner.export.rerun.steps import StepWriter
 from runner.recording import schema
 from runner.recording.reader import Recording
@@ -28,16 +28,6 @@ from runner.replay.steps import check_steps
 MAX_QUEUED: Final = 8
 """Batches that may wait to be compressed, which takes longer than making them."""
 T = TypeVar("T")
-
-
-class Piece(NamedTuple):
-    """Successive steps of one phase, with what is sent about them."""
-
-    steps: NDArray[np.void]
-    values: StepValues | None
-    """Their Q-values; None if they are unknown."""
-    episode: NDArray[np.int64]
-    """[n]: the training episode of each step; of evaluation the episodes before it."""
 
 
 @dataclass(frozen=True)
@@ -105,14 +95,12 @@ class RunExporter:
         ]
         self._send_notice(sorted(covered))
 
-    def _send_phase(self, phase: str, pieces: Iterator[Piece], labels: Labels) -> list[tuple[int, int]]:
+    def _send_phase(self, phase: str, pieces: Iterator[Batch], labels: Labels) -> list[tuple[int, int]]:
         """Send the steps of a phase; return the stretches of time that they cover."""
         view, stream = self.view, self._stream
-        evaluation = self._recording.config.get("evaluation") if phase == "eval" else None
-        trials = int(evaluation["trials"]) if evaluation else 0
         writer: StepWriter | None = None
         are_values_shown = False
-        for batch in _prefetched(_batches(pieces, trials)):
+        for batch in _prefetched(_batches(pieces)):
             if writer is None:
                 writer = StepWriter(stream, view, phase, labels, with_rewards=True)
                 table = TableWriter(stream, writer.path, view, labels)
@@ -136,17 +124,18 @@ class RunExporter:
         writer.clear_gaps(("grid", "q", "map"), view.last)  # the run's last step stays in view
         return writer.covered
 
-    def _training(self, reader: StepValueReader) -> Iterator[Piece]:
+    def _training(self, reader: StepValueReader) -> Iterator[Batch]:
         for span in self._selection.train:
             for block in self._blocks("train", span):
                 for part in reader.split(block):
-                    yield Piece(part, reader.training(part), part["episode"].astype(np.int64))
+                    yield Batch.of(part, part["episode"].astype(np.int64), reader.training(part))
 
-    def _evaluations(self, reader: StepValueReader) -> Iterator[Piece]:
+    def _evaluations(self, reader: StepValueReader) -> Iterator[Batch]:
+        trials = int(self._recording.config["evaluation"]["trials"]) if self._selection.evaluations else 0
         for evaluation, span in self._selection.evaluations:
             for block in self._blocks("eval", span):
                 after = np.full(len(block), evaluation.after, np.int64)
-                yield Piece(block, reader.evaluation(block, evaluation.train_step), after)
+                yield Batch.of(block, after, reader.evaluation(block, evaluation.train_step), trials)
 
     def _blocks(self, phase: str, span: range) -> Iterator[NDArray[np.void]]:
         """Yield the steps of a span, at most a batch at a time, after checking them."""
@@ -186,23 +175,14 @@ def _prefetched(items: Iterable[T]) -> Iterator[T]:
             yield item
 
 
-def _batches(pieces: Iterable[Piece], trials: int) -> Iterator[Batch]:
+def _batches(pieces: Iterable[Batch]) -> Iterator[Batch]:
     """Yield the pieces combined to larger batches, in each of which all values are known or none are."""
-    waiting: list[Piece] = []
+    waiting: list[Batch] = []
     for piece in pieces:
-        is_full = sum(len(each.steps) for each in waiting) + len(piece.steps) > MAX_ROWS
+        is_full = sum(len(each.records) for each in waiting) + len(piece.records) > MAX_ROWS
         if waiting and (is_full or (waiting[-1].values is None) != (piece.values is None)):
-            yield _combined(waiting, trials)
+            yield Batch.concatenated(waiting)
             waiting = []
         waiting.append(piece)
     if waiting:
-        yield _combined(waiting, trials)
-
-
-def _combined(pieces: list[Piece], trials: int) -> Batch:
-    records = np.concatenate([piece.steps for piece in pieces]) if len(pieces) > 1 else pieces[0].steps
-    episode = np.concatenate([piece.episode for piece in pieces])
-    time = records["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS
-    parts = [piece.values for piece in pieces if piece.values is not None]
-    values = StepValues.concatenated(parts) if len(parts) > 1 else parts[0] if parts else None
-    return Batch(records, episode, time, values, trials)
+        yield Batch.concatenated(waiting)
