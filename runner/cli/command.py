@@ -85,7 +85,8 @@ class Command(click.Command):
         try:
             return super().parse_args(ctx, args)
         except click.NoSuchOption as error:
-            if not any("--set" in parameter.opts for parameter in self.params):
+            is_near = error.possibilities or not error.option_name.startswith("--")
+            if is_near or not any("--set" in parameter.opts for parameter in self.params):
                 raise
             name = error.option_name.lstrip("-").replace("-", "_")
             message = f"{error.message} A setting is changed by --set {name}=VALUE."

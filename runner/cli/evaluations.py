@@ -48,7 +48,7 @@ def evaluation_table(
     the terminal are left out, and named in the caption.
     """
     measures = metric_columns(records, is_narrow=True)
-    if records[0].training is not None:  # the returns of a job take more room than they say
+    if records[0].training is not None:  # the returns of a job would leave no room for its events
         measures = {heading: own for heading, own in measures.items() if heading != "mean return"}
     events = _events(records[0].events, success_events)
     unbounded = console.options.update(width=UNBOUNDED)

@@ -56,11 +56,8 @@ def pull(client: Connection, name: str, recordings: Path, report: Report = lambd
                 _download(client, path, tag, size, part, report)
                 summary = {key: facts.get(key) for key in ("seconds", "error", "bytes")}
                 labels = {key: facts.get(key) for key in ("name", "tags", "note")}
-                details = {
-                    "status": status,
-                    "summary": summary,
-                    "labels": labels,
-                }  # the name is the recording's
+                # The name of the run itself is that in its recording.
+                details = {"status": status, "summary": summary, "labels": labels}
                 imported = import_recording(part, recordings, details)
                 part.unlink()
                 _pull_contents(client, imported.run, report)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import io
 import json
 import math
@@ -151,15 +150,14 @@ def curves(
         [CurveGroup(group.label, [run.run_id for run in group.runs], group.left_out) for group in groups],
         shown,
     )
-    return as_json(dataclasses.asdict(found))
+    return as_json(found)
 
 
 def run_histograms(path: Path, axis: str) -> bytes:
     """Return the histograms of a run's training over an axis, as JSON."""
     with open_recording(path) as recording:
         found, notes = histograms(recording, axis_of(axis))
-        shown = list(map(dataclasses.asdict, found))
-        return as_json({"run_id": recording.run_id, "histograms": shown, "notes": notes})
+        return as_json({"run_id": recording.run_id, "histograms": found, "notes": notes})
 
 
 def _shown_curve(
@@ -302,10 +300,10 @@ def comparison(
     series = series_of(paths, over)
     if normalise is not None:
         table = None if normalise == MIN_MAX else parse_table(normalise, TABLE_NAME)
-        return as_json(dataclasses.asdict(compare_algorithms(series, table, by, names, chosen)))
+        return as_json(compare_algorithms(series, table, by, names, chosen))
     groups, notes = grouped(series, by)
     require_two(groups, by)
-    return as_json(dataclasses.asdict(compare(groups, metrics_of(groups, names), chosen, notes)))
+    return as_json(compare(groups, metrics_of(groups, names), chosen, notes))
 
 
 def replay(runs: Sequence[Run], request: Request) -> bytes:

@@ -158,7 +158,7 @@ def what_if_page(run: Run, at: StepRef, action: str | None, start: int, steps: i
             addresses=[address(row.action) for row in found.actions],
             part=_branch_part(recording, at, str(number), start, steps),
         )
-        return as_json(asdict(shown))
+        return as_json(shown)
 
 
 def when(
@@ -168,7 +168,7 @@ def when(
     with open_recording(path) as recording:
         found = when_in(recording, expression, every, first, last, limit=intervals)
     replays = [each.start.at.replay_address(found.run_id) for each in found.intervals]
-    return as_json(asdict(ShownWhen(section_of(found), replays)))
+    return as_json(ShownWhen(section_of(found), replays))
 
 
 def why(
@@ -301,7 +301,7 @@ def console(path: Path, sought: str, stream: str) -> bytes:
         line for line in every if sought.casefold() in line.text.casefold() and stream in ("", line.stream)
     ]
     lines = [(line.seconds, line.position, line.stream, line.text) for line in found[-MAX_OUTPUT_LINES:]]
-    return as_json(asdict(Output(lines, len(found), len(every))))
+    return as_json(Output(lines, len(found), len(every)))
 
 
 def difference(a: Run, b: Run) -> bytes:
@@ -328,7 +328,7 @@ def difference(a: Run, b: Run) -> bytes:
         body="".join(body),
         tables=shown.tables(view.tables, view.table_figures),
     )
-    return as_json(asdict(found))
+    return as_json(found)
 
 
 def timeline_step(run: Run, at: StepRef | None) -> bytes:

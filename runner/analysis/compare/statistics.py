@@ -105,9 +105,12 @@ def _weights(n: int, resamples: int, cut: int = 0) -> Values:
     The mean is that without the `cut` lowest and highest values of the resample.
     """
     drawn = np.random.default_rng(_SEED).integers(n, size=(resamples, n))
-    kept = np.sort(drawn, axis=1)[:, cut : n - cut]
-    counts = np.array([np.bincount(row, minlength=n) for row in kept], np.float64)
-    return np.asarray(counts / kept.shape[1])
+    kept = np.sort(drawn, axis=1)[:, cut : n - cut] if cut else drawn
+    weights = np.empty((resamples, n))
+    for row, numbers in zip(weights, kept, strict=True):
+        row[:] = np.bincount(numbers, minlength=n)
+    weights /= kept.shape[1]
+    return weights
 
 
 def stratified(

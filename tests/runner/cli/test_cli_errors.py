@@ -53,6 +53,13 @@ def test_an_error_is_text_or_json(command, words, message):
     assert (error["exit_code"], error["problems"]) == (2, [])
 
 
+@pytest.mark.parametrize("option", ["--jsno", "-x"])
+def test_an_option_that_is_no_setting_is_not_taken_for_one(command, option):
+    error = command("run", "quick", option).stderr
+    assert f"No such option '{option}'" in error
+    assert "--set" not in error
+
+
 def test_problems_of_a_configuration_are_listed_as_json(command, bad):
     done = command("config", "check", bad, "--json")
     (line,) = done.stderr.splitlines()

@@ -26,7 +26,7 @@ def test_the_api_returns_what_python_does(client, recordings):
     run, expression = expression_of(recordings)
     for query, options in (
         ({}, {}),
-        ({"all": "true", "from": "3:0", "to": "4000"}, {"first": "3:0", "last": 4000}),
+        ({"all": "true", "from": "3:0", "to": "step:4000"}, {"first": "3:0", "last": 4000}),
     ):
         found = client.get(f"/api/v1{RUN}/when", params={"expression": expression, **query})
         expected = runner.when(run, expression, every="all" in query, **options).as_json()
