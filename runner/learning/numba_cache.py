@@ -7,18 +7,15 @@ be taken from the cache as it was before those were edited.
 from __future__ import annotations
 
 import hashlib
-import sys
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Final
 
 from numba.core import caching, event
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import cpu_target
 
 from runner.util.compilation import announce
-
-BLAS: Final = "scipy.linalg.cython_blas"
-"""What Numba imports of SciPy."""
 
 
 def watch(module: str) -> None:
@@ -56,8 +53,8 @@ def stamp(folder: Path) -> str:
 def leave_out_scipy() -> None:
     """Let Numba load what it needs before its first function without SciPy, whose import takes longer.
 
-    Numba looks for the BLAS of an installed SciPy, which no kernel here uses. Afterwards SciPy can be
-    imported, and Numba finds it for functions that need it, such as those of a user's environment.
+    Numba imports SciPy's BLAS only to see whether it is there. A function that needs it, which no kernel here
+    does, imports it when it is compiled.
     """
     context = cpu_target.target_context
     if "refresh" in vars(context):
@@ -65,15 +62,17 @@ def leave_out_scipy() -> None:
     refresh = context.refresh
 
     def refresh_without_scipy() -> None:
-        del context.refresh
-        if BLAS in sys.modules:
+        with global_compiler_lock:
+            vars(context).pop("refresh", None)
+            if find_spec("scipy") is not None:
+                from numba.np import linalg
+
+                ensure_blas, linalg.ensure_blas = linalg.ensure_blas, lambda: None
+                try:
+                    import numba.np.arraymath  # noqa: F401 - it looks for BLAS, once
+                finally:
+                    linalg.ensure_blas = ensure_blas
             refresh()
-            return
-        sys.modules[BLAS] = None  # type: ignore[assignment]  # makes its import fail, as Python documents it
-        try:
-            refresh()
-        finally:
-            del sys.modules[BLAS]
 
     context.refresh = refresh_without_scipy
 

@@ -24,6 +24,11 @@ def test_the_kernel_is_cached_by_it():
         assert function._cache._impl.locator.get_source_stamp() == expected
 
 
+def _printed(program: str) -> list[str]:
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    return done.stdout.split()
+
+
 def test_scipy_is_left_to_functions_that_need_it():
     program = (
         "import sys, numba, numpy as np\n"
@@ -32,5 +37,30 @@ def test_scipy_is_left_to_functions_that_need_it():
         "print('scipy.linalg' in sys.modules)\n"
         "print(numba.njit(lambda a: np.linalg.det(a @ a))(np.eye(2)))\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["False", "1.0"]
+    assert _printed(program) == ["False", "1.0"]
+
+
+def test_a_function_of_the_user_gives_the_same_with_and_without_kernels():
+    program = (
+        "import numba, numpy as np\n"
+        "a = np.random.default_rng(1).normal(size=500)\n"
+        "print(*numba.njit(lambda a: np.convolve(a, a))(a).tolist())\n"
+    )
+    assert _printed("from runner.learning import kernel\n" + program) == _printed(program)
+
+
+def test_another_thread_can_import_scipy_while_numba_begins():
+    program = (
+        "import threading, numba\n"
+        "from numba.core.cpu import CPUContext\n"
+        "from runner.learning import kernel\n"
+        "load = CPUContext.load_additional_registries\n"
+        "def load_while_importing(context):\n"
+        "    other = threading.Thread(target=exec, args=('import scipy.linalg; print(True)', {}))\n"
+        "    other.start()\n"
+        "    other.join(20)\n"
+        "    load(context)\n"
+        "CPUContext.load_additional_registries = load_while_importing\n"
+        "print(numba.njit(lambda a: a + 1)(1))\n"
+    )
+    assert "True" in _printed(program)
