@@ -104,7 +104,6 @@ class CopiedMessages(_Copies, VariableRows):
 
     def put_reset(self, reset: Message, environment: int) -> None:
         """Copy a reset."""
-        self._fresh = True
         self._put_reset_message(_payload(reset) | {"environment": environment})
         self.reset(None, int(reset["seed"]) if reset["seeded"] else None)
 

@@ -89,10 +89,10 @@ class Rows:
         """Put down a reset; it ends an episode in progress, neither terminated nor truncated."""
         if not self._room:  # it is the first one
             self.open()
-        self._fresh = True
         if seed is not None and not 0 <= seed <= MAX_SEED:
             seed = None
         self._put_reset(observation, seed)
+        self._fresh = True
         self._reset_rows.append(self.filled)
         self._seeds.append(seed)
         if len(self._reset_rows) >= self._reset_room:

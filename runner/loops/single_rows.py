@@ -251,11 +251,6 @@ class VariableRows(Rows):
         self._scratch = np.zeros(_VARIABLE_ROWS, _ENDING_DTYPE)
         return _VARIABLE_ROWS, _VARIABLE_ROWS
 
-    @property
-    def _episode(self) -> int:
-        """The number of the episode of the next step."""
-        return self._begun - (not self._fresh)
-
     def take(
         self,
         action: object,
@@ -285,7 +280,7 @@ class VariableRows(Rows):
 
     def _put_message(self, fields: Json) -> None:
         """Record a step, given by its fields but its number and that of its episode."""
-        fields |= {"step": self.place[0], "episode": self._episode}
+        fields |= {"step": self.place[0], "episode": self._begun - (not self._fresh)}
         position = sum(self._recorder.steps.values()) + self.filled + 1
         self._recorder.append(self._steps, encode(schema.TRANSITION, fields), position)
         self._t, ends = fields["t"], (fields["terminated"], fields["truncated"])
@@ -298,7 +293,7 @@ class VariableRows(Rows):
 
     def _put_reset_message(self, fields: Json) -> None:
         """Record a reset, given by its fields but the numbers of reset, episode and step."""
-        fields |= {"reset": self.resets, "episode": self._episode, "step": self.place[0]}
+        fields |= {"reset": self.resets, "episode": self._begun, "step": self.place[0]}
         position = sum(self._recorder.steps.values()) + self.filled
         self._recorder.append(self._resets, encode(schema.RESET, fields), position)
 

@@ -294,3 +294,33 @@ def test_an_episode_that_ends_in_another_phase_leaves_a_sound_recording(tmp_path
         for _ in range(3):
             rec.step(action)
     assert verify(rec.run.recording).sound
+
+
+class Losing(gymnasium.Env[Any, Any]):
+    """Its second reset returns what is no observation."""
+
+    def __init__(self, space: spaces.Space[Any]) -> None:
+        self.observation_space, self.action_space = space, spaces.Discrete(2)
+        self._resets = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        self._resets += 1
+        return None if self._resets == 2 else self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> Any:
+        return self.observation_space.sample(), 1.0, False, False, {}
+
+
+@pytest.mark.parametrize("space", [spaces.Discrete(4), spaces.Box(0, 1, (2,)), spaces.Text(5)])
+def test_what_follows_a_reset_that_failed_is_recorded_consistently(space, tmp_path):
+    env = runner.record(Losing(space), tmp_path)
+    env.reset(seed=1)
+    env.step(0)
+    with pytest.raises(RunnerError, match="found"):
+        env.reset()
+    env.step(1)
+    env.reset()
+    env.step(0)
+    env.close()
+    assert verify(env.run.recording).finding == ""
