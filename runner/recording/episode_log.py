@@ -81,12 +81,13 @@ class EpisodeLog:
         before = count - taken
         after_end = np.vstack([np.zeros(n, np.bool_), ends[:-1]])
         # What `before` was when the episode began; its steps before the block count as taken before it.
-        began = np.maximum.accumulate(np.where(after_end | was_reset, before, -self.length), axis=0)
+        began = np.where(after_end | was_reset, before, -self.length)
+        np.maximum.accumulate(began, axis=0, out=began)
         length = count - began
-        left = np.where(after_end, 0, np.vstack([self.length, length[:-1]]))
-        cut = was_reset & (left > 0)  # the reset ends an episode in progress
-        number = np.cumsum(cut, axis=0) + np.cumsum(after_end, axis=0)
-        sums, place = self._summed(steps, taken, number, ends[-1])
+        left = np.vstack([self.length, length[:-1]])
+        cut = was_reset & (left > 0) & ~after_end  # the reset ends an episode in progress
+        number = np.cumsum(cut | after_end, axis=0, dtype=np.int64)
+        sums, place = self._summed(steps, number, ends[-1])
         episode, total = self.episode + number, number[-1] + ends[-1]
 
         at, own = (np.concatenate(pair) for pair in zip(np.nonzero(ends), np.nonzero(cut), strict=True))
@@ -118,7 +119,7 @@ class EpisodeLog:
         self.length[which], self._sums[which] = 0, self._zero
         return ended
 
-    def _summed(self, steps: Steps, taken: Flags, number: Ints, ends: Flags) -> tuple[Floats, Ints]:
+    def _summed(self, steps: Steps, number: Ints, ends: Flags) -> tuple[Floats, Ints]:
         """Return the sums of each episode, and in which row of them that of each step is, [rows, N].
 
         The episodes of an environment follow one another, and one is left to follow the last.
@@ -126,14 +127,16 @@ class EpisodeLog:
         values = steps.rewards
         if steps.counts is not None:
             values = np.concatenate([values, steps.counts], axis=-1)
+        if steps.only_reset is not False:
+            values = np.where(np.asarray(steps.only_reset)[..., np.newaxis], -0.0, values)  # adds nothing
         sizes = number[-1] + ends + 1
         first = np.cumsum(sizes) - sizes
         place = first + number
         sums = np.full((values.shape[-1], int(sizes.sum())), self._zero)
-        at = np.concatenate([first, place[taken]])
+        at = np.append(first, place)
         with np.errstate(invalid="ignore", over="ignore"):
             for k, own in enumerate(sums):  # added one after the other: other orders round otherwise
-                np.add.at(own, at, np.concatenate([self._sums[:, k], values[..., k][taken]]))
+                np.add.at(own, at, np.append(self._sums[:, k], values[..., k]))
         return sums.T, place
 
     def _end(self, last: Ints, length: Ints, sums: Floats, terminated: Flags, truncated: Flags) -> Columns:
