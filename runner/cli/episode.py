@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from runner.environments.naming import actions_in_words, states_in_words
 from runner.export.contents import Step
 from runner.export.pictures import Moment, moments_of
 from runner.export.values import acted, action_in_words, plain_value, value_in_words
+from runner.recording.spaces import least_number
 from runner.replay.steps import check_steps, transitions_of
 from runner.util.humanize import number
 from runner.util.jsonable import as_json
@@ -26,9 +27,6 @@ if TYPE_CHECKING:
     from runner.export.pictures import Pictures
     from runner.recording.reader import Recording
     from runner.recording.spaces import Value
-
-_MAX_NUMBERS: Final = 32
-"""Larger arrays of an observation are not written out."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +103,7 @@ def _state_drawer(recording: Recording) -> Callable[[Value | None], Text]:
         return lambda value: Text(
             "the first observation was lost\n" if value is None else f"{what}{value_in_words(value)}\n"
         )
-    mdp, first = recording.mdp, recording.spaces["observation"]["start"]
+    mdp, first = recording.mdp, least_number(recording.spaces["observation"])
     names, drawing = states_in_words(mdp), Drawing(mdp.scene) if mdp.scene is not None else None
 
     def drawn(value: Value) -> Text:

@@ -17,7 +17,7 @@ from runner.export.contents import Ranges
 from runner.export.values import acted, observed
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.recording.spaces import Description, Value
+from runner.recording.spaces import Description, Value, least_number
 from runner.util.arrays import Records
 
 MAX_EPISODE_BYTES: Final = 1 << 30
@@ -89,7 +89,7 @@ class _Resets:
         key = environment, int(steps[0]["episode"])
         seed, first = self._read.pop(key, (None, self._last.get(environment)))
         if self._recording.has_states:
-            first = steps[0]["state"].astype(np.int64) + self._recording.spaces["observation"]["start"]
+            first = steps[0]["state"].astype(np.int64) + least_number(self._recording.spaces["observation"])
         return seed, first
 
     def keep_last(self, environment: int, step: np.void) -> None:

@@ -21,6 +21,7 @@ from runner.errors import CannotRedo, RecordingError
 from runner.export.values import Values, observations_of
 from runner.recording.messages import Message
 from runner.recording.reader import Recording
+from runner.recording.spaces import least_number
 from runner.replay.steps import recorded_frames
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def paint_scene(recording: Recording, phase: str, episode: int) -> Painted:
     assert drawing is not None
     raster = SceneRaster(drawing, SCENE_SIZE, SCENE_SIZE)
     places: deque[NDArray[np.int16]] = deque(maxlen=svg.TRAIL)
-    first = recording.spaces["observation"]["start"]
+    first = least_number(recording.spaces["observation"])
     for observation, _ in observations_of(recording, phase, episode):
         places.append(drawing.places(mdp, np.array([observation]) - first)[0])
         yield raster.draw(np.stack(places))

@@ -14,7 +14,7 @@ from runner.environments.naming import spoken
 from runner.export.contents import Step
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.recording.spaces import Leaf, Value, decode, leaves_of
+from runner.recording.spaces import Leaf, Value, decode, least_number, leaves_of
 from runner.replay.steps import check_steps, reset_of, transitions_of
 from runner.util.arrays import Records
 
@@ -69,14 +69,14 @@ def observed(recording: Recording, steps: Step | Records) -> Value:
     Those of varying size are a list.
     """
     if recording.has_states:
-        return steps["next_state"].astype(np.int64) + recording.spaces["observation"]["start"]
+        return steps["next_state"].astype(np.int64) + least_number(recording.spaces["observation"])
     return _decoded(recording, "observation", steps["next_observation"])
 
 
 def acted(recording: Recording, steps: Step | Records) -> Value:
     """Return the action of a step, or those of steps, as `observed` returns observations."""
     if recording.has_states:
-        return steps["action"].astype(np.int64) + recording.spaces["action"]["start"]
+        return steps["action"].astype(np.int64) + least_number(recording.spaces["action"])
     return _decoded(recording, "action", steps["action"])
 
 
@@ -104,7 +104,7 @@ def observations_of(
             where, name = str(recording.path), schema.PHASE_NAMES[phase]
             check_steps(np.asarray(step).reshape(1), recording.mdp, where, name)
         if t == 0 and recording.has_states:
-            yield step["state"].astype(np.int64) + recording.spaces["observation"]["start"], None
+            yield step["state"].astype(np.int64) + least_number(recording.spaces["observation"]), None
         elif t == 0:
             reset = reset_of(recording, phase, episode)
             yield None if reset is None else reset["observation"], None
@@ -142,8 +142,7 @@ def action_in_words(recording: Recording, phase: str, agent: str = "") -> Callab
             f"{spoken(each)} {by_agent[each](own)}" for each, own in actions.items()
         )
     space = recording.spaces["action"]
-    start = (space["spaces"][agent] if agent else space).get("start")
-    least = start if isinstance(start, int) else 0
+    least = least_number(space["spaces"][agent] if agent else space)
     names = [spoken(name) for name in recording.action_names(phase, agent)]
 
     def in_words(action: Value) -> str:

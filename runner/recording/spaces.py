@@ -74,6 +74,12 @@ def dtype_of(description: Any, where: str) -> np.dtype[np.generic] | None:
     return _dtype(description)
 
 
+def least_number(description: Mapping[str, object]) -> int:
+    """Return the least number of a `Discrete` space; 0 where its description has none that is possible."""
+    start = description.get("start")
+    return start if is_whole(start, -(2**62), 2**62) else 0
+
+
 def decode(description: Description, data: bytes, where: str) -> Value:
     """Return the value that stands in these bytes: dictionaries, tuples, texts and arrays.
 

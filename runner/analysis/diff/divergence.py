@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from runner.analysis.evaluations import evaluations_of
 from runner.analysis.step_reference import StepRef
+from runner.errors import shortened
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES
 from runner.recording.reader import Recording
@@ -38,6 +39,8 @@ _TRANSITION_FIELDS: Final = (
 )
 """The same of a step in spaces that are not both `Discrete`."""
 _EVALUATION_FIELDS: Final = FIELDS[1:]  # trials are numbered over all evaluations of a run
+_MAX_LETTERS: Final = 300
+"""Of a value of varying size as text."""
 _MAX_NUMBERS: Final = 16
 """Where a value has more numbers, the first that differs is reported."""
 
@@ -280,7 +283,7 @@ def _legible(recording: Recording, field: str, value: bytes) -> str:
     if field == "digest":
         return value.hex()
     space = "action" if field == "action" else "observation"
-    return str(decode(recording.spaces[space], value, str(recording.path)))
+    return shortened(str(decode(recording.spaces[space], value, str(recording.path))), _MAX_LETTERS)
 
 
 def branch_divergence(a: Recording, b: Recording, origin: BranchOrigin) -> Divergence | None:

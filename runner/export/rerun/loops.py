@@ -26,6 +26,7 @@ from runner.export.rerun.selection import MAX_MEMBERS, Selection
 from runner.export.rerun.steps import StepWriter
 from runner.export.values import FEW
 from runner.recording import schema
+from runner.recording.spaces import least_number
 from runner.replay.steps import check_steps
 from runner.util.arrays import Array, MaskedArray
 
@@ -305,7 +306,7 @@ class LoopExporter:
             actions = self._recording.action_names(phase, agent)
             if quantity == "action" and 0 < len(actions) <= FEW:
                 space = self._recording.spaces["action"]
-                least = (space["spaces"][agent] if agent else space)["start"]
+                least = least_number(space["spaces"][agent] if agent else space)
                 title = f"action: {', '.join(f'{i} {name}' for i, name in enumerate(actions, least))}"
             if member.name and len(names) > 1:
                 tab, title = title.capitalize(), _spaced(member.name, title)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from runner.export.values import number_names
 from runner.recording.reader import Recording
-from runner.recording.spaces import leaves_of
+from runner.recording.spaces import least_number, leaves_of
 
 MAX_LINES: Final = 24
 """Observations or actions of more numbers are not drawn as lines."""
@@ -46,11 +46,7 @@ def _parts(recording: Recording, agent: str = "") -> dict[str, list[Part]]:
     spaces = recording.spaces
     if recording.kind == "step":
         fields = {"observation": "state", "action": "action"}
-        starts = {part: spaces[part].get("start") for part in fields}
-        return {
-            part: [((field,), start if isinstance(start := starts[part], int) else 0, [field])]
-            for part, field in fields.items()
-        }
+        return {part: [((field,), least_number(spaces[part]), [field])] for part, field in fields.items()}
     found: dict[str, list[Part]] = {}
     for part, field in (("observation", "next_observation"), ("action", "action")):
         leaves = [

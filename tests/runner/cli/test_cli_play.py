@@ -4,10 +4,15 @@ import json
 import shutil
 import sys
 
+import gymnasium
 import pytest
+from click.testing import CliRunner
 
 import runner
+from runner.cli import cli
 from runner.export.episodes import typical_trial
+from tests.runner.altering import altered
+from tests.runner.loops.making import play
 
 
 def _frames(text):
@@ -124,3 +129,18 @@ def test_the_environment_need_not_be_installed(recorded_run, command, tmp_path, 
     monkeypatch.setitem(sys.modules, "dualtaxi", None)
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     assert "taxi 1 (" in command("play", alone).stdout
+
+
+@pytest.mark.parametrize("start", [None, "x", 10**30])
+def test_a_forged_space_without_a_least_number_counts_from_0(start, tmp_path):
+    def forged(entries):
+        described = json.loads(entries["spaces"])
+        described["observation"]["start"] = start
+        return entries | {"spaces": json.dumps(described)}
+
+    with runner.record(gymnasium.make("CliffWalking-v1"), tmp_path, name="loop") as rec:
+        list(play(rec, 5))
+    path = altered(rec.run.recording, tmp_path / "x.mcap", None, lambda messages: messages, run=forged)
+    shown = [CliRunner().invoke(cli, ["play", str(each)]).output for each in (rec.run.recording, path)]
+    assert shown[0] == shown[1]
+    assert "step 5 of 5" in shown[0]
