@@ -47,7 +47,7 @@ def training(folder: str, repetitions: int) -> list[Figure]:
     The command trains and records all steps before it, so that its whole time is that until it goes on.
     """
     parent = next(Path(folder).glob("*/recording.mcap")).parent
-    words = ("branch", str(parent), "--at", "4000000", "--set", "epsilon=0.3")
+    words = ("branch", str(parent), "--at", "step:4000000", "--set", "epsilon=0.3")
     end = ("--episodes", "46258")  # the step is in episode 46,257
     with tempfile.TemporaryDirectory() as other:
         dualtaxi(other, *words, *end)  # compiles
