@@ -22,7 +22,7 @@ from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.scene import Landmark, SceneDescription
 from runner.util.arrays import Array
-from runner.util.humanize import sentence
+from runner.util.humanize import capitalised
 
 CELL: Final = 100
 MARGIN: Final = 14
@@ -132,7 +132,7 @@ class Drawing:
         entries += dict.fromkeys(f"{mark['name']}: {mark['label']}" for mark in labelled)
         entries += ["thick lines: walls"] if self._scene["walls"] else []
         text = "; ".join([*entries, "faint line: the way so far"])
-        return sentence(text)
+        return f"{capitalised(text)}."
 
     def still(self) -> str:
         """Return what never moves: the cells, the landmarks and the walls."""

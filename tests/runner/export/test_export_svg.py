@@ -63,6 +63,8 @@ def test_no_two_movers_are_drawn_on_top_of_each_other(pictured):
 
 def test_the_key_names_everything(scene):
     key = Drawing(scene.scene).key()
+    assert key[0].isupper()
+    assert key.endswith(".")
     assert all(thing["label"] in key for thing in scene.scene["things"])
     assert ("walls" in key) == bool(scene.scene["walls"])
 
