@@ -18,7 +18,7 @@ from runner.sweep.local import Workers
 from runner.sweep.model import Sweep
 from runner.sweep.objective import Curve
 from runner.sweep.task import Result, Task
-from runner.sweep.trials import JobResults, Trial, Trials
+from runner.sweep.trials import JobResults, Trial, Trials, best_of
 
 INTERRUPTED: Final = "interrupted"
 _WAIT_SECONDS: Final = 0.2
@@ -76,7 +76,6 @@ def run_sweep(
         if status.stopped:
             break
         trials.tell(batch)
-        status.best = trials.best()
     report(status)
     return trials, status
 
@@ -194,3 +193,4 @@ class _Runner:
         status.done += result.status in ("finished", "pruned")
         status.pruned += result.status == "pruned"
         status.failed += result.status == "failed"
+        status.best = best_of(filter(None, (status.best, trial)), self.sweep)

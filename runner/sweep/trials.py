@@ -115,10 +115,6 @@ class Trials:
         bounds = pruning_bounds(self.sweep.objective, curves, pruning.percentile)
         return {episode: bound for episode, bound in bounds.items() if episode >= pruning.after}
 
-    def best(self) -> Trial | None:
-        """Return the finished trial with the best value, the first of several."""
-        return best_of(self.done, self.sweep)
-
 
 def best_of(trials: Iterable[Trial], sweep: Sweep) -> Trial | None:
     """Return the finished trial with the best value, the first of several; None if none is finished."""

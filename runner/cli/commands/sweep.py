@@ -274,7 +274,7 @@ def _print_results(sweep: Sweep, trials: Trials, status: SweepStatus, as_json: b
     from runner.analysis.compare.statistics import bounded
     from runner.sweep.results import objective_text, values_text
 
-    best = trials.best()
+    best = status.best
     if as_json:
         value = None if best is None or best.value is None else bounded(best.value)
         keys = ("runs", "done", "pruned", "failed", "excluded")

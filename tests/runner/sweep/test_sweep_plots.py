@@ -35,7 +35,7 @@ def typed(*words):
 def test_each_trial_is_drawn_at_its_values(results, done):
     picture = picture_of(results)
     by_number = {trial.number: trial for trial in done[1].done}
-    assert picture.trials[0].number == done[1].best().number
+    assert picture.trials[0].number == done[2].best.number
     step_size, discount = picture.axes
     for place, choice, value, trial in zip(
         step_size.values, discount.values, picture.values, picture.trials, strict=True
@@ -101,7 +101,7 @@ def test_the_best_configuration_is_that_of_the_best_trial_with_steps_and_fresh_s
     config = from_mapping(yaml.safe_load(results.best_yaml))
     assert (config.name, config.recording.steps) == ("small_best", "all")
     assert (
-        from_mapping(done[1].best().config).to_mapping()
+        from_mapping(done[2].best.config).to_mapping()
         | {
             "name": "small_best",
             "seeds": list(range(2, 12)),
@@ -143,12 +143,12 @@ def test_a_level_never_reached_is_not_drawn(tmp_path):
 def test_a_sweep_of_archived_runs_is_complete(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     sweep, folder = from_values(described(strategy="random", trials=2, seeds=[0])), tmp_path / "runs"
-    before, _ = swept(folder, sweep)
+    before, ended = swept(folder, sweep)
     for run in list_runs(folder):
         archive_run(run, str(tmp_path / "archive"), remove=True)
     assert {run.status for run in list_runs(folder)} == {"archived"}
     results = results_of(sweep, folder)
-    assert results.best.value == before.best().value
+    assert results.best.value == ended.best.value
     assert len(learning(results, folder)[0]) == 2
     nobody = Here()
     again, _ = swept(folder, sweep, nobody)
