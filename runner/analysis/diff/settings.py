@@ -98,7 +98,7 @@ def environment_diff(a: Mdp, b: Mdp) -> EnvironmentDiff:
 
 def loop_environment_diff(a: Recording, b: Recording) -> EnvironmentDiff:
     """Return how the descriptions of two environments and their spaces differ."""
-    described = [{"spaces": one.spaces if one.has_spaces else {}, **one.environment} for one in (a, b)]
+    described = [{"spaces": one.spaces, **one.environment} for one in (a, b)]
     return EnvironmentDiff(changes_in(*described))
 
 
