@@ -27,6 +27,7 @@ from runner.recording.metadata import write_result
 from runner.recording.reader import Recording, open_recording
 from runner.recording.recorder import Recorder
 from runner.recording.rewriting import rewrite
+from runner.recording.spaces import least_number
 from runner.recording.writer import RecordingFile
 from runner.replay.engine import Replay
 from runner.replay.environment import stream_from_child
@@ -309,7 +310,7 @@ def _whole_records(
         for steps in replay.steps(piece, environment, draws=False):
             fill_in(records, steps.step - piece.first, steps)
     after = after_step(records.dtype)
-    start = int(recording.spaces["observation"]["start"]) if recording.kind == "step" else 0
+    start = least_number(recording.spaces["observation"]) if recording.kind == "step" else 0
     for reset in piece.resets:
         row = reset.step - piece.first + reset.environment
         if row < len(rows) and rows["t"][row] == schema.RESET_ONLY:

@@ -19,6 +19,7 @@ from runner.recording.episode_log import Columns, EpisodeLog, Flags, Steps
 from runner.recording.loop_blocks import Block, Blocks, Inconsistent, OnBlock
 from runner.recording.reader import Recording
 from runner.recording.schema import RESET_ONLY
+from runner.recording.spaces import least_number
 from runner.util.arrays import Array, Ints
 
 _MAX_STEPS: Final = 2**62
@@ -103,7 +104,7 @@ class _Phase:
         """The state after that step, -1 before any."""
         self._findings = Findings()
         self._has_states = recording.kind == "step"
-        self._start = int(recording.spaces["observation"]["start"]) if self._has_states else 0
+        self._start = least_number(recording.spaces["observation"]) if self._has_states else 0
         self._blocks = Blocks(recording, phase, complete, on_block)
 
     def check(self) -> Findings:

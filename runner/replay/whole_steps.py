@@ -15,6 +15,7 @@ from runner.recording.actions import after_step
 from runner.recording.blocks import blank_records
 from runner.recording.reader import MAX_EPISODE_BYTES, Recording, open_recording
 from runner.recording.schema import PHASE_NAMES
+from runner.recording.spaces import least_number
 from runner.replay.redone import RedoneSteps
 
 
@@ -58,9 +59,7 @@ def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> NDArray[np
         if not own or not np.array_equal(np.concatenate([part["step"] for part in own]), span):
             raise RecordingError(f"{path}: steps of {PHASE_NAMES[phase]} episode {episode:,} were lost.")
         records = blank_steps(recording, phase, np.concatenate(own))
-        is_state, start = recording.kind == "step", 0
-        if is_state:
-            start = int(recording.spaces["observation"]["start"])
+        is_state, start = recording.kind == "step", least_number(recording.spaces["observation"])
     for steps in _done_again(path, phase, episode):
         fill_in(records, (steps.step - span.start) // span.step, steps)
         for first in steps.starts if is_state else ():

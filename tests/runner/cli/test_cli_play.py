@@ -10,6 +10,7 @@ from click.testing import CliRunner
 
 import runner
 from runner.cli import cli
+from runner.execution.verify import verify
 from runner.export.episodes import typical_trial
 from tests.runner.altering import altered
 from tests.runner.loops.making import play
@@ -144,3 +145,4 @@ def test_a_forged_space_without_a_least_number_counts_from_0(start, tmp_path):
     shown = [CliRunner().invoke(cli, ["play", str(each)]).output for each in (rec.run.recording, path)]
     assert shown[0] == shown[1]
     assert "step 5 of 5" in shown[0]
+    assert verify(path).finding == ""
