@@ -12,7 +12,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-import signal
 import threading
 import time
 from collections.abc import Callable
@@ -54,17 +53,6 @@ def lower_priority() -> None:
     """Let this process, which trains or verifies, yield to the server, whose users are waiting."""
     with contextlib.suppress(OSError, AttributeError):  # not on Windows
         os.nice(5)
-
-
-def _call_unstopped(function: Callable[Args, Result], *args: Args.args, **keywords: Args.kwargs) -> Result:
-    """Call a function in a child process that ignores signals to stop.
-
-    They may go to all processes of the service, which kills this one itself when running requests are over.
-    """
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    with contextlib.suppress(AttributeError):  # not on Windows
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    return function(*args, **keywords)
 
 
 class ProcessPool:
@@ -141,7 +129,7 @@ class ProcessPool:
             raise Busy
         try:
             future = self._threads.submit(
-                self._call, lambda child: child.call(_call_unstopped, seconds, function, *args, **keywords)
+                self._call, lambda child: child.call(function, seconds, *args, **keywords)
             )
         except BaseException:
             self._places.release()

@@ -14,6 +14,7 @@ import contextlib
 import os
 import secrets
 import shutil
+import signal
 import threading
 import time
 from collections.abc import Callable
@@ -314,6 +315,11 @@ def verify(upload: Upload, body: Path, recordings: Path) -> Upload:
         RunnerError: it can never be a run.
     """
     lower_priority()
+    with contextlib.suppress(AttributeError):  # not on Windows
+        # A signal to stop may go to all processes of the service, which then kills this one itself: its end
+        # must not look like that of a recording that is too large.
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
     source, lock = upload.source, FileLock(body.with_name("verifying.lock"))
     with storage_errors(body), lock:  # the process of a server that was killed may still have it
         if hash_of(body)[1] != source.digest:
