@@ -32,6 +32,7 @@ from runner.service.pages.frame import RunHead, has_tables, head_of, last_evalua
 from runner.service.pages.rendering import page
 from runner.service.pages.replay import Panel, panel_of
 from runner.util import humanize
+from runner.util.humanize import counted
 
 router = APIRouter(prefix="/compare", include_in_schema=False)
 
@@ -280,14 +281,16 @@ async def _chosen(catalogue: CatalogueOf, names: list[str] | None) -> list[Run]:
     names = list(dict.fromkeys(names or []))
     if not 2 <= len(names) <= MAX_RUNS:
         raise RunnerError(
-            f"found {len(names)} runs, expected 2 to {MAX_RUNS}: select them in the table of runs."
+            f"found {counted(len(names), 'run')}, expected 2 to {MAX_RUNS}: select them in the table of runs."
         )
     return await found_runs(catalogue, names)
 
 
 def _two(runs: list[Run]) -> list[Run]:
     if len(runs) != 2:
-        raise RunnerError(f"found {len(runs)} runs, expected two: only two are compared step by step.")
+        raise RunnerError(
+            f"found {counted(len(runs), 'run')}, expected two: only two are compared step by step."
+        )
     return runs
 
 
