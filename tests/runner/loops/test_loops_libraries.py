@@ -255,7 +255,7 @@ def test_tensors_and_dictionaries_of_them_are_recorded(tmp_path):
         rec.step(0)
         rec.snapshot("net", {"w": Tensor([1, 2]), "inner": {"b": Tensor([0.5], "torch.bfloat16")}})
         rec.log({"loss": Tensor(2.0), "eval": {"return": 3}})
-        with pytest.raises(ConfigError, match="found object for 'opt/groups'"):
+        with pytest.raises(ConfigError, match="found list of object for 'opt/groups'"):
             rec.snapshot("opt", {"w": [1.0], "groups": [{"lr": 1}]})
     with open_recording(rec.run.recording) as recording:
         arrays = {array.name: array.values.tolist() for array in recording.arrays()}
