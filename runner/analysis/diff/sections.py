@@ -222,7 +222,7 @@ def why_in_words(divergence: Divergence, cause: Cause | None) -> str:
     if divergence.field == "digest":
         return "the actions are the same, but observations or rewards differ"
     if divergence.field == "step":
-        has, lacks = ("A", "B") if divergence.b == "none" else ("B", "A")
+        has, lacks = ("B", "A") if _is_beyond_a(divergence) else ("A", "B")
         return f"{has} has that step, {lacks} ended before it"
     name = spoken(divergence.field.removeprefix("reset."))
     return f"{name} is {_text(divergence.a)} in A, {_text(divergence.b)} in B"
@@ -239,12 +239,17 @@ def evaluation_updates(difference: RunDiff, cause: Cause | None) -> list[str]:
     return updates_in_words(cause)
 
 
+def _is_beyond_a(divergence: Divergence) -> bool:
+    """Return whether only B has the step."""
+    return divergence.field == "step" and divergence.a == "none"
+
+
 def where_in_words(divergence: Divergence) -> str:
     """Return where two runs diverge: `in training episode 70, at t = 360 (training step 46,202)`."""
     step, episode = f"training step {divergence.step:,}", f"training episode {divergence.episode:,}"
     if divergence.phase == "eval":
         after = 0 if divergence.after is None else divergence.after
-        step = f"evaluation step {divergence.step:,} of A"
+        step = f"evaluation step {divergence.step:,} of {'B' if _is_beyond_a(divergence) else 'A'}"
         episode = f"the evaluation after {after:,} training episodes, in trial {divergence.episode:,}"
     if divergence.field == "digest":
         return f"in {episode}, at {step} at the latest"
