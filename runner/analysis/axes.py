@@ -111,14 +111,14 @@ def positions(recording: Recording, axis: Axis) -> Positions:
 
 def axes_of(recording: Recording) -> list[Axis]:
     """Return the axes that a recording has."""
-    found = []
+    axes = []
     for axis in AXES.values():
         try:
             positions(recording, axis)
         except RecordingError:
             continue
-        found.append(axis)
-    return found
+        axes.append(axis)
+    return axes
 
 
 def edges_of(axis: Axis, last: float, parts: int) -> Values:
@@ -152,9 +152,9 @@ def _times(recording: Recording) -> tuple[Values, Values]:
     stride = max(1, math.ceil(done["episodes"] / _MAX_KNOWN))
     steps, values = [np.zeros(1)], [np.zeros(1)]
     for block in recording.blocks(TRAIN_EPISODE):
-        known = block[block["episode"] % stride == 0]
-        steps.append(known["last_step"] + 1.0)
-        values.append(clock.seconds_at((known["log_time"] // STEP_NANOSECONDS).astype(np.int64)))
+        sampled = block[block["episode"] % stride == 0]
+        steps.append(sampled["last_step"] + 1.0)
+        values.append(clock.seconds_at((sampled["log_time"] // STEP_NANOSECONDS).astype(np.int64)))
     if len(steps) == 1:
         return clock.positions.astype(np.float64), clock.seconds
     return np.concatenate(steps), np.concatenate(values)

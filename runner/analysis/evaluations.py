@@ -75,8 +75,8 @@ class EvaluationRecord:
     def value(self, metric: str) -> float | None:
         """Return the value of a metric, summed over agents; None if any is unknown."""
         values = self.values[metric].values()
-        known = [value for value in values if value is not None]
-        return sum(known) if len(known) == len(values) else None
+        numbers = [value for value in values if value is not None]
+        return sum(numbers) if len(numbers) == len(values) else None
 
     def summary(self) -> EvaluationMetrics:
         """Return the figures that people quote."""
@@ -153,23 +153,25 @@ def evaluations_of(recording: Recording) -> list[Evaluation]:
     ends = [block["last_step"].astype(np.int64) + 1 for block in recording.blocks(schema.TRAIN_EPISODE)]
     steps = np.concatenate([np.zeros(1, np.int64), *ends])
     episodes = np.searchsorted(trained, tested)
-    found = np.unique(episodes, return_index=True, return_counts=True)
+    distinct = np.unique(episodes, return_index=True, return_counts=True)
     return [
         Evaluation(after, int(steps[after]), start, start + trials, number)
-        for number, (after, start, trials) in enumerate(zip(*(each.tolist() for each in found), strict=True))
+        for number, (after, start, trials) in enumerate(
+            zip(*(each.tolist() for each in distinct), strict=True)
+        )
     ]
 
 
 def evaluation_after(evaluations: Sequence[Evaluation], episodes: int, where: str) -> Evaluation:
     """Return the evaluation after a number of training episodes."""
-    found = {one.after: one for one in evaluations}
-    if episodes in found:
-        return found[episodes]
-    known = "it has none at all."
-    if found:
-        nearest = min(found, key=lambda after: abs(after - episodes))
-        known = f"it has {len(found):,}, the nearest after {nearest:,}."
-    raise NotInRecording(f"{where}: found no evaluation after {episodes:,} episodes; {known}")
+    by_episodes = {one.after: one for one in evaluations}
+    if episodes in by_episodes:
+        return by_episodes[episodes]
+    available = "it has none at all."
+    if by_episodes:
+        nearest = min(by_episodes, key=lambda after: abs(after - episodes))
+        available = f"it has {len(by_episodes):,}, the nearest after {nearest:,}."
+    raise NotInRecording(f"{where}: found no evaluation after {episodes:,} episodes; {available}")
 
 
 def evaluation_records(recording: Recording) -> list[EvaluationRecord]:

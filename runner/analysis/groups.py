@@ -55,10 +55,10 @@ def groups_of(series: Sequence[RunSeries]) -> list[Group]:
     seed the finished and then the last given counts; of loops, which a seed need not distinguish, the last of
     those of one content.
     """
-    found: dict[Hashable, list[RunSeries]] = {}
+    by_content: dict[Hashable, list[RunSeries]] = {}
     for run in series:
-        found.setdefault((run.name, _content(run)), []).append(run)
-    runs_of = list(found.values())
+        by_content.setdefault((run.name, _content(run)), []).append(run)
+    runs_of = list(by_content.values())
     return _labelled(runs_of, [runs[0].name for runs in runs_of])
 
 
@@ -80,16 +80,16 @@ def grouped(
     Raises:
         RunnerError: no run has a value of that path.
     """
-    found: dict[str, list[RunSeries]] = {}
+    by_value: dict[str, list[RunSeries]] = {}
     content = _content_without_task if across_tasks else _content
     key = content if by is None else _value_at(by, series)
     for run in series:
-        found.setdefault(key(run), []).append(run)
+        by_value.setdefault(key(run), []).append(run)
     if by is None:
-        names = [" / ".join(dict.fromkeys(run.name for run in runs)) for runs in found.values()]
-        groups = _labelled(list(found.values()), names)
+        names = [" / ".join(dict.fromkeys(run.name for run in runs)) for runs in by_value.values()]
+        groups = _labelled(list(by_value.values()), names)
     else:
-        groups = [_group(f"{by} = {value}", runs) for value, runs in found.items()]
+        groups = [_group(f"{by} = {value}", runs) for value, runs in by_value.items()]
     notes = duplicates(groups)
     for group in groups:
         if (count := len({content(run) for run in group.runs})) > 1:
@@ -136,7 +136,7 @@ def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tupl
     Raises:
         RunnerError: no run has one of them, or any at all.
     """
-    known: dict[str, list[tuple[str, str]]] = {}
+    by_name: dict[str, list[tuple[str, str]]] = {}
     pairs = {
         (metric, line): None
         for group in groups
@@ -147,22 +147,22 @@ def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tupl
     }
     for metric, line in pairs:
         for name in {metric, f"{metric}.{line}" if line else metric}:
-            known.setdefault(name, []).append((metric, line))
-    if not known:
+            by_name.setdefault(name, []).append((metric, line))
+    if not by_name:
         raise RunnerError(
             "found neither an evaluation nor a report of training in any run, so there is nothing to compare."
         )
     usual = [metric.name for metric in METRICS]
-    if not any(metric.name in known for metric in METRICS if metric.requires == "success_events"):
+    if not any(metric.name in by_name for metric in METRICS if metric.requires == "success_events"):
         usual.sort(key=lambda name: name != "mean_return")  # without a goal the return says most
     names = list(chosen)
     for some in (usual, _TRAINING_METRICS):
-        names = names or [name for name in some if name in known]
+        names = names or [name for name in some if name in by_name]
     for name in names:
-        if name not in known:
-            expected = ", ".join(sorted(known))
-            raise RunnerError(f"metric: found {name!r}, expected one of {expected}.{nearest(name, known)}")
-    return list(dict.fromkeys(pair for name in names for pair in known[name]))
+        if name not in by_name:
+            expected = ", ".join(sorted(by_name))
+            raise RunnerError(f"metric: found {name!r}, expected one of {expected}.{nearest(name, by_name)}")
+    return list(dict.fromkeys(pair for name in names for pair in by_name[name]))
 
 
 def flat_config(config: Mapping[str, object]) -> dict[str, object]:
@@ -201,8 +201,8 @@ def _group(label: str, runs: Sequence[RunSeries]) -> Group:
         key = (_content(run), identity)
         if key not in best or run.finished >= best[key].finished:
             best[key] = run
-    kept = tuple(best.values())
-    return Group(label, kept, tuple(run.run_id for run in runs if run not in kept))
+    unique = tuple(best.values())
+    return Group(label, unique, tuple(run.run_id for run in runs if run not in unique))
 
 
 def _labelled(runs_of: Sequence[Sequence[RunSeries]], names: Sequence[str]) -> list[Group]:
@@ -236,17 +236,17 @@ def _value_at(path: str, series: Sequence[RunSeries]) -> Callable[[RunSeries], s
     """Return a function that returns a run's value at a path of the configuration, as JSON."""
 
     def paths(values: Mapping[str, object], prefix: str = "") -> dict[str, object]:
-        found: dict[str, object] = {}
+        by_path: dict[str, object] = {}
         for key, value in values.items():
-            found[f"{prefix}{key}"] = value
+            by_path[f"{prefix}{key}"] = value
             if isinstance(value, Mapping):
-                found |= paths(value, f"{prefix}{key}.")
-        return found
+                by_path |= paths(value, f"{prefix}{key}.")
+        return by_path
 
-    known = {name for run in series for name in paths(run.config)}
-    if path not in known:
+    all_paths = {name for run in series for name in paths(run.config)}
+    if path not in all_paths:
         raise RunnerError(
             f"by: found {path!r}, expected a path of the configuration such as discount or "
-            f"evaluation.trials; `dualtaxi config check` prints all.{nearest(path, sorted(known))}"
+            f"evaluation.trials; `dualtaxi config check` prints all.{nearest(path, sorted(all_paths))}"
         )
     return lambda run: json.dumps(paths(run.config).get(path), sort_keys=True)

@@ -129,7 +129,7 @@ def histograms(recording: Recording, axis: Axis = EPISODES) -> tuple[list[Histog
     places = positions(recording, axis)
     done = recording.done()
     last = float(places.at(done["episodes"], done["train_steps"]))
-    found: list[Histogram] = []
+    result: list[Histogram] = []
     notes: list[str] = []
     for read in (_episodes, _steps):
         few = min(STRETCHES, max(_FEWEST, done["episodes"] // _EPISODES_EACH))
@@ -138,23 +138,23 @@ def histograms(recording: Recording, axis: Axis = EPISODES) -> tuple[list[Histog
         for _, block in read(recording, places, columns, notes):
             for key, values in block.items():
                 columns[key].scan(values)
-        known = {key: column for key, column in columns.items() if column.distinct}
-        for column in known.values():
+        in_use = {key: column for key, column in columns.items() if column.distinct}
+        for column in in_use.values():
             column.begin(len(edges) - 1)
         for at, block in read(recording, places, columns, []):
             stretch = (np.searchsorted(edges, at) - 1).clip(0, len(edges) - 2)
             for key, values in block.items():
-                if key in known:
-                    known[key].count(stretch, values)
-        found += [column.histogram(axis, edges) for column in known.values()]
-    for each in found:
+                if key in in_use:
+                    in_use[key].count(stretch, values)
+        result += [column.histogram(axis, edges) for column in in_use.values()]
+    for each in result:
         if each.left_out:
             whose = f" of {spoken(each.line)}" if each.line else ""
             notes.append(
                 f"{each.left_out:,} values of {each.quantity}{whose} are left out, as they are infinite, not "
                 "a number or too large."
             )
-    return found, list(dict.fromkeys(notes))
+    return result, list(dict.fromkeys(notes))
 
 
 Block = tuple[Values, Mapping[tuple[str, str], Values]]
@@ -245,8 +245,8 @@ def _action_name(recording: Recording, part: str) -> Callable[[float], str]:
         names = recording.action_names("train", agent) if agent or not part else ()
         space = recording.spaces["action"]
         start = int(space.get("start", 0)) if recording.kind != "step" else 0
-    known = {float(start + i): spoken(name) for i, name in enumerate(names)}
-    return lambda value: known.get(value, _number(value))
+    names_by_number = {float(start + i): spoken(name) for i, name in enumerate(names)}
+    return lambda value: names_by_number.get(value, _number(value))
 
 
 def _number(value: float) -> str:

@@ -230,8 +230,8 @@ def evaluation_readings(record: EvaluationRecord) -> Readings:
     """Return the readings of an evaluation."""
     readings: Readings = {}
     for name, lines in record.values.items():
-        if known := {line: value for line, value in lines.items() if value is not None}:
-            readings[name] = known
+        if numbers := {line: value for line, value in lines.items() if value is not None}:
+            readings[name] = numbers
     for name, count in record.events.items():
         agent, _, kind = name.rpartition(".")
         readings.setdefault(f"event.{kind}", {})[agent] = count / record.trials
@@ -319,9 +319,9 @@ def _mean_episodes(
             own = usable[:, i]
             usable_returns[:, i] += np.bincount(at[own], minlength=bins)
             returns[:, i] += np.bincount(at[own], block["returns"][own, i], minlength=bins)
-    found: dict[int, Readings] = {}
+    by_stretch: dict[int, Readings] = {}
     for k in np.flatnonzero(count).tolist():
-        readings = found.setdefault(k, {})
+        readings = by_stretch.setdefault(k, {})
         readings["training.mean_length"] = {"": float(length[k] / count[k])}
         means = {
             agent if len(agents) > 1 else "": float(returns[k, i] / usable_returns[k, i])
@@ -330,7 +330,7 @@ def _mean_episodes(
         }
         if means:
             readings["training.mean_return"] = means
-    return found
+    return by_stretch
 
 
 def _recent_training(recording: Recording) -> tuple[Readings, int]:
@@ -341,11 +341,11 @@ def _recent_training(recording: Recording) -> tuple[Readings, int]:
     lines = agents if len(agents) > 1 else [""]
     means = {"training.mean_length": {"": finite_mean(episodes["length"])}}
     means["training.mean_return"] = dict(zip(lines, map(finite_mean, episodes["returns"].T), strict=True))
-    known = {
+    recent = {
         metric: {line: value for line, value in own.items() if value is not None}
         for metric, own in means.items()
     }
-    return known, len(episodes)
+    return recent, len(episodes)
 
 
 def _mean_scalars(

@@ -261,9 +261,9 @@ def shape_of(
         learners = json.loads(run["agents"])
     except (ValueError, RecursionError):
         learners = None
-    known = isinstance(learners, list) and all(isinstance(name, str) for name in learners)
+    are_names = isinstance(learners, list) and all(isinstance(name, str) for name in learners)
     events = mdp.event_names if mdp else ()
-    if not known or (len(learners), len(events)) != (int(run["learners"]), int(run["events"])):
+    if not are_names or (len(learners), len(events)) != (int(run["learners"]), int(run["events"])):
         raise RecordingError(
             f"{where}: found learners {learners!r} and {len(events)} events, "
             f"expected {run['learners']} and {run['events']}."

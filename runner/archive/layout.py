@@ -177,9 +177,9 @@ def encodings_of(columns: pa.Schema) -> dict[str, str]:
     values = {"value"} | {name for name in columns.names if name.startswith(VALUES)}
     split = {one.name for one in columns if one.name in values and pa.types.is_floating(one.type)}
     numbers = (one.name for one in columns if not pa.types.is_string(one.type))
-    known = {name: ENCODINGS[name] for name in numbers if name in ENCODINGS}
+    special = {name: ENCODINGS[name] for name in numbers if name in ENCODINGS}
     plain = {one.name for one in columns if pa.types.is_fixed_size_binary(one.type)}
-    return known | dict.fromkeys(split, "BYTE_STREAM_SPLIT") | dict.fromkeys(plain, "PLAIN")
+    return special | dict.fromkeys(split, "BYTE_STREAM_SPLIT") | dict.fromkeys(plain, "PLAIN")
 
 
 def row_bytes(columns: pa.Schema) -> int:

@@ -119,12 +119,14 @@ def restore_to(folder: Path, path: Path | None, digest: str, report: Report) -> 
         path.unlink(missing_ok=True)
     try:
         if multiprocessing.current_process().daemon:  # it has limits of its own, and must not start another
-            found = _restore(folder, path, report)
+            restored_digest = _restore(folder, path, report)
         else:
             with ChildProcess(MEMORY_BYTES, on_progress=report) as child:
-                found = child.call(_restore, _RESTORE_SECONDS, folder, path)
-        if found != digest:
-            raise RecordingError(f"{folder}: found an archive of digest {found}, expected {digest}.")
+                restored_digest = child.call(_restore, _RESTORE_SECONDS, folder, path)
+        if restored_digest != digest:
+            raise RecordingError(
+                f"{folder}: found an archive of digest {restored_digest}, expected {digest}."
+            )
     except BaseException as error:
         if path is not None:
             path.unlink(missing_ok=True)

@@ -174,9 +174,9 @@ def restore_place(place: str, recordings: Path, report: Report = lambda _: None)
         raise no_archive(place)
     if manifest.run_id != run_id:
         raise RecordingError(f"{place}: found an archive of run {manifest.run_id}, expected {run_id}.")
-    known = run_of_id(run_id, recordings)
-    if known is not None and known.status == "archived":
-        return restore_run(known, report)
+    run = run_of_id(run_id, recordings)
+    if run is not None and run.status == "archived":
+        return restore_run(run, report)
     folder = recordings / run_id
     try:
         recordings.mkdir(parents=True, exist_ok=True)

@@ -110,15 +110,15 @@ class Group(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find a command, or suggest one."""
-        known = self.list_commands(ctx)
-        if args[0] not in known and not args[0].startswith("-") and not ctx.resilient_parsing:
-            commands = {name: self.get_command(ctx, name) for name in known}
+        names = self.list_commands(ctx)
+        if args[0] not in names and not args[0].startswith("-") and not ctx.resilient_parsing:
+            commands = {name: self.get_command(ctx, name) for name in names}
             inside = [
                 f" Did you mean '{name} {args[0]}'?"
                 for name, command in commands.items()
                 if isinstance(command, click.Group) and args[0] in command.list_commands(ctx)
             ]
-            near = inside[0] if inside else nearest(args[0], known)
+            near = inside[0] if inside else nearest(args[0], names)
             ctx.fail(f"there is no command {args[0]!r}.{near}")
         return super().resolve_command(ctx, args)
 

@@ -128,10 +128,10 @@ def _named(recording: Recording) -> Callable[[Step], dict[str, object]]:
         step = np.asarray(row).reshape(1)
         check_steps(step, mdp, str(recording.path), "recorded")
         events, explored = int(events_of(mdp, step)[0]), int(row["explored"])
-        found: dict[str, object] = {}
+        description: dict[str, object] = {}
         for name, names in words.items():
-            found |= {name: int(row[name]), f"{name}_in_words": names[int(row[name])]}
-        return found | {
+            description |= {name: int(row[name]), f"{name}_in_words": names[int(row[name])]}
+        return description | {
             "events": [name for bit, name in enumerate(mdp.event_names) if events >> bit & 1],
             "explored": [agent for i, agent in enumerate(agents) if explored >> i & 1],
         }
@@ -150,14 +150,16 @@ def _valued(recording: Recording, phase: str) -> Callable[[Step], dict[str, obje
 
     def describe(row: Step) -> dict[str, object]:
         if recording.has_states:
-            found: Json = {name: int(row[name]) for name in ("state", "action", "next_state")}
+            description: Json = {name: int(row[name]) for name in ("state", "action", "next_state")}
         else:
-            found = {name: as_json(plain_value(row[name])) for name in ("action", "next_observation")}
+            description = {name: as_json(plain_value(row[name])) for name in ("action", "next_observation")}
         if agents != ("",):
-            found["acted"] = [agent for i, agent in enumerate(agents) if int(row["acted"]) >> i & 1]
-            own = {agent: words[agent](row["action"][agent]) for agent in found["acted"] if agent in words}
-            return found | ({"action_in_words": own} if own else {})
-        return found | ({"action_in_words": words[""](acted(recording, row))} if words else {})
+            description["acted"] = [agent for i, agent in enumerate(agents) if int(row["acted"]) >> i & 1]
+            own = {
+                agent: words[agent](row["action"][agent]) for agent in description["acted"] if agent in words
+            }
+            return description | ({"action_in_words": own} if own else {})
+        return description | ({"action_in_words": words[""](acted(recording, row))} if words else {})
 
     return describe
 

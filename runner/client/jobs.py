@@ -137,13 +137,15 @@ class JobEvent:
             RunnerError: it is none.
         """
         try:
-            found: type[EventData] = SweepProgress if "done" in values else RunProgress
+            data_type: type[EventData] = SweepProgress if "done" in values else RunProgress
             if kind != "progress":
-                found = next(each for each, name in _KINDS.items() if name == kind)
-            known = {field.name: values[field.name] for field in fields(found) if field.name in values}
-            if known.get("best") is not None:
-                known["best"] = BestTrial(**known["best"])
-            return cls(found(**known), event_id)
+                data_type = next(each for each, name in _KINDS.items() if name == kind)
+            arguments = {
+                field.name: values[field.name] for field in fields(data_type) if field.name in values
+            }
+            if arguments.get("best") is not None:
+                arguments["best"] = BestTrial(**arguments["best"])
+            return cls(data_type(**arguments), event_id)
         except (StopIteration, TypeError) as error:
             raise RunnerError(f"found an event {kind[:20]!r} of a job that is not as expected.") from error
 

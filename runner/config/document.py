@@ -156,14 +156,14 @@ class _Builder:
             )
             raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
         self.places.setdefault(tuple(map(str, path)), self._place(node))
-        known = node.tag.removeprefix(_TAG)
-        if isinstance(node, yaml.MappingNode) and known == "map":
+        tag_name = node.tag.removeprefix(_TAG)
+        if isinstance(node, yaml.MappingNode) and tag_name == "map":
             return self._mapping(node, path)
-        if isinstance(node, yaml.SequenceNode) and known == "seq":
+        if isinstance(node, yaml.SequenceNode) and tag_name == "seq":
             return [self.value(item, (*path, position)) for position, item in enumerate(node.value)]
-        if isinstance(node, yaml.ScalarNode) and known in _KINDS:
-            return self._scalar(node, known, path)
-        tag = _shown("!!" + known if known != node.tag else node.tag)
+        if isinstance(node, yaml.ScalarNode) and tag_name in _KINDS:
+            return self._scalar(node, tag_name, path)
+        tag = _shown("!!" + tag_name if tag_name != node.tag else node.tag)
         self.problems.append(Problem(path, f"found the tag {tag}, expected a plain value without a tag"))
         return None
 

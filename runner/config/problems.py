@@ -105,8 +105,8 @@ def _problem(path: Path, detail: ErrorDetails, value: object, schema: Schema | N
         return Problem(path, detail["msg"])
     around = schema_at(detail["loc"][:-1], schema)
     if detail["type"] == _UNKNOWN:
-        known = keys_of(around)
-        return Problem(path, "unknown key." + (_hint(str(path[-1]), known) or f" Known: {', '.join(known)}"))
+        keys = keys_of(around)
+        return Problem(path, "unknown key." + (_hint(str(path[-1]), keys) or f" Known: {', '.join(keys)}"))
     if detail["type"] == "invalid_key":
         return Problem((*path[:-1], str(path[-1])), "unknown key, which is not even text")
     here = schema_at(detail["loc"], schema)

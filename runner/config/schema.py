@@ -53,8 +53,8 @@ def without_references(schema: JsonView) -> Schema:
             return {"ref": name, **followed(schema["$defs"][name])}
         return {key: followed(value) for key, value in node.items() if key != "$defs"}
 
-    found: Schema = followed(schema)
-    return found
+    result: Schema = followed(schema)
+    return result
 
 
 def schema_at(location: tuple[str | int, ...], schema: Schema | None = None) -> Schema:
@@ -65,7 +65,7 @@ def schema_at(location: tuple[str | int, ...], schema: Schema | None = None) -> 
     """
     node: Schema = _schema() if schema is None else schema
     for part in location:
-        node = next((found for branch in branches(node) for found in _inside(branch, part)), {})
+        node = next((inner for branch in branches(node) for inner in _inside(branch, part)), {})
     return node
 
 

@@ -70,21 +70,22 @@ def find_shipped(name: str) -> Shipped:
     Raises:
         RunnerError: there is none; the message names the nearest.
     """
-    known = shipped()
-    if name not in known:
+    experiments = shipped()
+    if name not in experiments:
         raise RunnerError(
-            f"there is no shipped experiment {name!r}.{nearest(name, known)} `dualtaxi config ls` lists them."
+            f"there is no shipped experiment {name!r}.{nearest(name, experiments)} `dualtaxi config ls` "
+            "lists them."
         )
-    return known[name]
+    return experiments[name]
 
 
 def config_path(path: str | os.PathLike[str]) -> Path:
     """Return the file of a path; of the name of a shipped experiment, unless a file has this name."""
     file = Path(path)
     if file.name == os.fspath(path) and not file.suffix and not file.is_file():
-        known = shipped()
-        if file.name in known:
-            return known[file.name].path
+        experiments = shipped()
+        if file.name in experiments:
+            return experiments[file.name].path
     return file
 
 
@@ -94,12 +95,12 @@ def suggestion(path: Path) -> str:
         files = [file.name for file in path.parent.glob("*.y*ml")]
     except OSError:
         files = []
-    known = shipped()
-    if path.stem in known:
-        return f" A shipped experiment has this name: `{known[path.stem].command}`."
+    experiments = shipped()
+    if path.stem in experiments:
+        return f" A shipped experiment has this name: `{experiments[path.stem].command}`."
     if near := nearest(path.name, files):
         return near
-    return f"{nearest(path.stem, known)} `dualtaxi config ls` lists the shipped experiments."
+    return f"{nearest(path.stem, experiments)} `dualtaxi config ls` lists the shipped experiments."
 
 
 def copy_shipped(experiment: Shipped, target: Path) -> None:

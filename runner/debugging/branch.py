@@ -179,11 +179,11 @@ def branch(
         folder.mkdir(parents=True, exist_ok=True)
         staging = tempfile.TemporaryDirectory(prefix=".branch-", dir=folder)  # hidden: no run is listed there
     with staging:
-        for found in stream_from_child(_record_branch, run.recording.absolute(), Path(staging.name), task):
-            if isinstance(found, int):
-                report(found)
+        for message in stream_from_child(_record_branch, run.recording.absolute(), Path(staging.name), task):
+            if isinstance(message, int):
+                report(message)
             else:
-                run_id, origin, stopped = found
+                run_id, origin, stopped = message
         with storage_errors(folder / run_id):
             (Path(staging.name) / run_id).rename(folder / run_id)
     own = run_at(folder / run_id)

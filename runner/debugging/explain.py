@@ -213,14 +213,19 @@ def _resolved(source: Source, recordings: Path) -> tuple[Side, ExperimentConfig,
     if isinstance(source, Mapping):
         source = from_mapping(source)
     if isinstance(source, str | os.PathLike):
-        path, known = Path(source), [name for name, each in shipped().items() if each.kind == "experiment"]
-        if path.suffix in (".yaml", ".yml") or os.fspath(source) in known:
+        path, experiments = (
+            Path(source),
+            [name for name, each in shipped().items() if each.kind == "experiment"],
+        )
+        if path.suffix in (".yaml", ".yml") or os.fspath(source) in experiments:
             source = load(path)
         else:
             try:
                 source = find_run(os.fspath(source), recordings)
             except RunNotFound as error:
-                hint = nearest(path.name, known) or " `dualtaxi config ls` lists those that are shipped."
+                hint = (
+                    nearest(path.name, experiments) or " `dualtaxi config ls` lists those that are shipped."
+                )
                 raise RunNotFound(f"{error} There is no configuration of this name either.{hint}") from error
     if isinstance(source, ExperimentConfig):
         return Side(source.name), resolve_initial_q(source, recordings), source.seeds[0]
@@ -260,11 +265,11 @@ def _metric_of(sides: Sequence[Readings], metric: str | None) -> str:
     """
     shared = {name for name in sides[0] if all(side.get(name) is not None for side in sides)}
     candidates = [metric] if metric is not None else ["success_percent", "mean_return"]
-    found = next((name for name in candidates if name in shared), None)
-    if found is None:
+    default = next((name for name in candidates if name in shared), None)
+    if default is None:
         names = ", ".join(sorted(name for name in shared if not name.startswith("training.reward.")))
         raise RunnerError(
             f"metric: found {metric or 'none'!r}, expected one that evaluations of both have: {names}."
             f"{nearest(metric or '', shared)}"
         )
-    return found
+    return default

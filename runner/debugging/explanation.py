@@ -283,11 +283,11 @@ def signed(estimate: Estimate) -> str:
 
 def plots(explanation: Explanation) -> list[Plot]:
     """Return the pictures of an explanation: shares, clear interactions, and mixtures by their value."""
-    names, found = [setting.name for setting in explanation.settings], []
+    names, result = [setting.name for setting in explanation.settings], []
     shares = [(each.name, each.share) for each in explanation.settings if each.share is not None]
     if shares:
         title = f"Share of each setting in the difference of {explanation.metric}"
-        found.append(Plot("Shares", bars_chart(title, shares).svg(), True))
+        result.append(Plot("Shares", bars_chart(title, shares).svg(), True))
     pairs = [
         (" x ".join(pair.settings), pair.beyond)
         for pair in explanation.interactions
@@ -295,11 +295,11 @@ def plots(explanation: Explanation) -> list[Plot]:
     ]
     if pairs:
         title = f"{explanation.metric}: what two settings do together beyond what each does"
-        found.append(Plot("Which need each other", bars_chart(title, pairs).svg(), True))
+        result.append(Plot("Which need each other", bars_chart(title, pairs).svg(), True))
     columns = [
         Column(one.settings, one.values, one == explanation.smallest)
         for one in sorted(shown_mixtures(explanation), key=lambda one: one.mean.value)
     ]
     title = f"{explanation.metric} of mixtures: a filled dot is the value of B, a hollow one that of A"
-    found.append(Plot("Mixtures", mixtures_chart(title, names, columns).svg(), True))
-    return found
+    result.append(Plot("Mixtures", mixtures_chart(title, names, columns).svg(), True))
+    return result

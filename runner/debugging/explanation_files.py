@@ -103,9 +103,9 @@ def read_explanation(name: str, recordings: Path) -> Explanation:
     """
     from pydantic import TypeAdapter, ValidationError
 
-    known = explanations_in(recordings)
-    if name not in known:
-        raise RunnerError(f"no explanation {name!r} in {recordings}.{nearest(name, known)}")
+    explanations = explanations_in(recordings)
+    if name not in explanations:
+        raise RunnerError(f"no explanation {name!r} in {recordings}.{nearest(name, explanations)}")
     path = recordings / FOLDER / f"{name}.json"
     try:
         with open_regular(path) as file:

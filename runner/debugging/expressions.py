@@ -160,8 +160,8 @@ class Parser:
     def _condition(self, node: ast.expr) -> Term:
         term = self._term(node)
         if term.kind != "condition":
-            found = "an action" if term.kind == "action" else "a number"
-            raise self.error(node, f"found {found}, expected a condition, such as a comparison with > or ==.")
+            kind = "an action" if term.kind == "action" else "a number"
+            raise self.error(node, f"found {kind}, expected a condition, such as a comparison with > or ==.")
         return term
 
     def _number(self, node: ast.expr) -> Term:
@@ -248,8 +248,8 @@ class Parser:
             compare.append(_COMPARISONS[type(operator)])
 
         def evaluate(columns: Columns) -> Array:
-            found = [value(columns) for value in values]
-            pairs = zip(compare, found, found[1:], strict=False)
+            numbers = [value(columns) for value in values]
+            pairs = zip(compare, numbers, numbers[1:], strict=False)
             return functools.reduce(np.logical_and, [each(a, b) for each, a, b in pairs])
 
         text = self.text_of(node)
@@ -305,8 +305,10 @@ class Parser:
             return value
         if constant is not node or not isinstance(value, str):
             article = "an" if what == "action" else "a"
-            found = self.text_of(node)
-            raise self.error(node, f"found {found}, expected a whole number or a name of {article} {what}.")
+            given_text = self.text_of(node)
+            raise self.error(
+                node, f"found {given_text}, expected a whole number or a name of {article} {what}."
+            )
         wanted = _plain(value)
         named = [k for k, name in enumerate(names) if _plain(name) == wanted]
         if len(named) == 1:

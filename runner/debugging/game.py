@@ -71,8 +71,8 @@ class Game:
         """Return what will be trained."""
         count, mixtures, seeds = self._count, self._mixtures, len(self._mixtures.seeds)
         least, most = mixture_bounds(count)
-        known = mixtures.known(range(least)) if least == most else mixtures.in_file
-        return Plan(count, least, most, seeds, known, mixtures.seconds, max(1, self._pool.idle))
+        available = mixtures.known(range(least)) if least == most else mixtures.in_file
+        return Plan(count, least, most, seeds, available, mixtures.seconds, max(1, self._pool.idle))
 
     def players(self) -> list[int]:
         """Return the numbers of the settings among which the difference is shared; measure their mixtures.
@@ -165,8 +165,8 @@ def interactions_of(game: Game, players: Sequence[int]) -> tuple[Interaction, ..
     names = [game.mixing.factors[i].name for i in players]
     beyond = shapley_interactions(game.values(coalitions(players)))
     estimates = bootstrap_means(np.array(list(beyond.values())))
-    found = [
+    pairs = [
         Interaction((names[i], names[j]), estimate)
         for (i, j), estimate in zip(beyond, estimates, strict=True)
     ]
-    return tuple(sorted(found, key=lambda pair: -abs(pair.beyond.value)))
+    return tuple(sorted(pairs, key=lambda pair: -abs(pair.beyond.value)))

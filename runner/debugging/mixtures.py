@@ -78,7 +78,7 @@ class Measurement:
 
     def run(self, stop: Callable[[], bool]) -> Measured:
         """Return what was measured; errors that a user can fix become a result."""
-        found: dict[int, Readings] = {}
+        by_seed: dict[int, Readings] = {}
         seconds = 0.0
         try:
             config = from_mapping(self.config)
@@ -87,11 +87,11 @@ class Measurement:
                 measured = measure(config, seed, Path(self.recordings), stop)
                 if measured is None:
                     break
-                found[seed] = measured
+                by_seed[seed] = measured
                 seconds = time.perf_counter() - began
         except RunnerError as error:
-            return Measured(found, seconds, str(error))
-        return Measured(found, seconds)
+            return Measured(by_seed, seconds, str(error))
+        return Measured(by_seed, seconds)
 
 
 def measure(
@@ -158,7 +158,7 @@ class Mixtures:
         self.mixing, self.seeds, self._recordings = mixing, tuple(seeds), recordings
         self._path, self._report = folder / VALUES, report
         self._kept = dict(_kept(self._path))
-        self.in_file = sum(known.seed in self.seeds for known in self._kept.values())
+        self.in_file = sum(earlier.seed in self.seeds for earlier in self._kept.values())
         """Runs in the file that have one of the seeds, of whatever mixtures."""
         self._found: dict[tuple[int, int], Readings] = {}
         self._batch = 1
@@ -241,10 +241,10 @@ class Mixtures:
             config = self.mixing.config(mixture)
             missing = []
             for seed in seeds:
-                known = self._kept.get(self._identity(config, seed))
-                if known is not None:
-                    self._found[mixture, seed] = known.readings
-                    self._seconds.setdefault(mixture, known.seconds)
+                earlier = self._kept.get(self._identity(config, seed))
+                if earlier is not None:
+                    self._found[mixture, seed] = earlier.readings
+                    self._seconds.setdefault(mixture, earlier.seconds)
                 elif (mixture, seed) not in self._found:
                     missing.append(seed)
             for start in range(0, len(missing), batch):
@@ -287,10 +287,10 @@ def _kept(path: Path) -> Iterator[tuple[str, _Known]]:
             while file.tell() < MAX_BYTES and (line := file.readline(MAX_LINE)):
                 try:
                     values = json.loads(line)
-                    known = _Known(
+                    earlier = _Known(
                         _checked(values["readings"]), _finite(values["seconds"]), values.get("seed")
                     )
-                    yield str(values["job"]), known
+                    yield str(values["job"]), earlier
                 except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
                     continue
     except OSError:

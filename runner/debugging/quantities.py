@@ -79,9 +79,9 @@ class JobVocabulary:
         head = node.value if isinstance(node, ast.Subscript) else node
         base = head.value if isinstance(head, ast.Attribute) else head
         if not isinstance(base, ast.Name) or base.id not in NAMES:
-            found = parser.text_of(base)
-            hint = nearest(found, NAMES)
-            raise parser.error(base, f"found {found[:60]}, expected one of {', '.join(NAMES)}.{hint}")
+            base_text = parser.text_of(base)
+            hint = nearest(base_text, NAMES)
+            raise parser.error(base, f"found {base_text[:60]}, expected one of {', '.join(NAMES)}.{hint}")
         name, agent = base.id, head.attr if isinstance(head, ast.Attribute) else None
         self._check_algorithm(parser, base, name)
         learner = self._learner(parser, head, name, agent)

@@ -45,13 +45,13 @@ def shapley_interactions(values: Values) -> dict[tuple[int, int], Values]:
     count = len(values).bit_length() - 1
     masks = np.arange(len(values))
     sizes = np.bitwise_count(masks)
-    found = {}
+    interactions = {}
     for i, j in itertools.combinations(range(count), 2):
         without = masks[(masks >> i | masks >> j) & 1 == 0]
         both = values[without | 1 << i | 1 << j] + values[without]
         beyond = both - values[without | 1 << i] - values[without | 1 << j]
-        found[i, j] = _weights(count - 1)[sizes[without]] @ beyond
-    return found
+        interactions[i, j] = _weights(count - 1)[sizes[without]] @ beyond
+    return interactions
 
 
 def _weights(count: int) -> Values:

@@ -105,12 +105,12 @@ def weights_of(
             while end > start:  # from branch to branch: each changes the rules
                 segment = learner.segment_at(end - 1)
                 first = max(segment.start, start)
-                found = spread(
+                filled = spread(
                     *(model, segment.rules, cell.learner, first, updates[first - start : end - start]),
                     *(ledger, stretch, shares),
                 )
-                counted += found
-                largest = _largest(largest, shares[:found], limit)
+                counted += filled
+                largest = _largest(largest, shares[:filled], limit)
                 end = first
     return Weights(
         value=float(replay.tables[cell.learner][cell.state, cell.action]),

@@ -109,12 +109,12 @@ def branch_playback(
 
     They begin with step `first`; errors as for `what_if`.
     """
-    found = branched(recording, at, action)
-    shown = found.steps[first : first + limit]
+    branch = branched(recording, at, action)
+    shown = branch.steps[first : first + limit]
     if not len(shown):
-        raise no_step(recording, f"this branch of {found.place.title}", len(found.steps), first)
-    values = tuple(table[shown["state"]] for table in found.tables)
-    return tabular_playback(recording, found.place, found.steps, found.outcome.end, values, first, limit)
+        raise no_step(recording, f"this branch of {branch.place.title}", len(branch.steps), first)
+    values = tuple(table[shown["state"]] for table in branch.tables)
+    return tabular_playback(recording, branch.place, branch.steps, branch.outcome.end, values, first, limit)
 
 
 class _Branches:

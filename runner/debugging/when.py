@@ -105,12 +105,12 @@ class When:
 
     def as_json(self) -> Json:
         """Return the result as JSON can hold it; each moment with its step reference as `at`."""
-        found = asdict(self)
-        for moment in (found["last"], *(each[k] for each in found["intervals"] for k in ("start", "end"))):
+        result = asdict(self)
+        for moment in (result["last"], *(each[k] for each in result["intervals"] for k in ("start", "end"))):
             if moment is not None:
                 at = StepRef(moment["episode"], moment["t"])
                 moment |= {"at": str(at), "replay": at.replay_address(self.run_id)}
-        return found
+        return result
 
     def _repr_html_(self) -> str:
         return html([section_of(self)])
@@ -172,18 +172,18 @@ def when_in(
     with np.errstate(all="ignore"):
         held_before = bool(_values(parsed.condition, columns.last)[0])
         knows = not any(np.isnan(_values(term, columns.last)).any() for term in terms)
-        found = _search(recording, parsed, columns, every, limit, start, stop, report)
-    starts, ends = found.moments[::2], found.moments[1::2]
+        search = _search(recording, parsed, columns, every, limit, start, stop, report)
+    starts, ends = search.moments[::2], search.moments[1::2]
     return When(
         run_id=recording.run_id,
         expression=parsed.text,
         every=every,
-        searched=(start, found.last.step),
+        searched=(start, search.last.step),
         held_before=held_before if knows else None,
         intervals=tuple(map(Interval, starts, [*ends, None])),
-        count=found.count,
-        steps=found.steps if every else None,
-        last=found.last,
+        count=search.count,
+        steps=search.steps if every else None,
+        last=search.last,
         states=vocabulary.states,
     )
 
@@ -245,9 +245,13 @@ def _values(term: Term, columns: Columns) -> Array:
 
 
 def _moment(step: np.void, parts: Sequence[tuple[Term, Array]], before: int, after: int) -> Moment:
-    known = [not any(np.isnan(column[row]) for _, column in parts) for row in (before, after)]
+    have_values = [not any(np.isnan(column[row]) for _, column in parts) for row in (before, after)]
     values = [
-        Value(term.text, _scalar(term, column[before], known[0]), _scalar(term, column[after], known[1]))
+        Value(
+            term.text,
+            _scalar(term, column[before], have_values[0]),
+            _scalar(term, column[after], have_values[1]),
+        )
         for term, column in parts
     ]
     return Moment(int(step["step"]), int(step["episode"]), int(step["t"]), tuple(values))

@@ -165,9 +165,9 @@ def _learner(recording: Recording, agent: str | None) -> int:
         return 0
     names = [name for name in learners if agent in (name, spoken(name))]
     if not names:
-        found = "no agent" if agent is None else f"the agent {agent[:60]!r}"
+        given_agent = "no agent" if agent is None else f"the agent {agent[:60]!r}"
         raise ConfigError(
-            f"agent: found {found}, expected {' or '.join(learners)}, whose Q-table has the value."
+            f"agent: found {given_agent}, expected {' or '.join(learners)}, whose Q-table has the value."
             f"{nearest(agent or '', learners)}"
         )
     return learners.index(names[0])
@@ -208,12 +208,12 @@ def _by_reward(mdp: Mdp, weights: Weights, learner: int, learners: int) -> Itera
     """Yield the parts of a Q-value by kind of reward."""
     at = np.unravel_index(np.flatnonzero(weights.outcomes), mdp.next_state.shape)
     kinds = np.stack([mdp.rewards_of(learners)[(*at, learner)], mdp.events[at]], axis=1)
-    found, kind_of = np.unique(kinds, axis=0, return_inverse=True)
-    sums = np.bincount(kind_of.reshape(-1), weights.outcomes[weights.outcomes != 0], minlength=len(found))
+    distinct, kind_of = np.unique(kinds, axis=0, return_inverse=True)
+    sums = np.bincount(kind_of.reshape(-1), weights.outcomes[weights.outcomes != 0], minlength=len(distinct))
     parts = sorted(
         (
             RewardPart(weight, weight * reward, reward, events_in_words(mdp, int(events)))
-            for weight, (reward, events) in zip(sums.tolist(), found.tolist(), strict=True)
+            for weight, (reward, events) in zip(sums.tolist(), distinct.tolist(), strict=True)
         ),
         key=lambda part: (-abs(part.contribution), -part.weight),
     )
@@ -255,14 +255,14 @@ def _moves(mdp: Mdp, outcomes: NDArray[np.float64], agent: str) -> Iterator[Move
     """Yield the weight of the moves of an agent, or of all agents if it is empty, thing by thing."""
     if mdp.scene is None or mdp.scene_cells is None:
         return
-    found = np.flatnonzero(outcomes)
-    state, action, k = np.unravel_index(found, mdp.next_state.shape)
+    seen_outcomes = np.flatnonzero(outcomes)
+    state, action, k = np.unravel_index(seen_outcomes, mdp.next_state.shape)
     next_state = mdp.next_state[state, action, k]
     for number, thing in enumerate(mdp.scene["things"]):
         if thing["kind"] == "mover" and (not agent or thing.get("agent") in (None, agent)):
             cells = np.stack([mdp.scene_cells[state, number], mdp.scene_cells[next_state, number]], axis=1)
             pairs, pair_of = np.unique(cells, axis=0, return_inverse=True)
-            sums = np.bincount(pair_of.reshape(-1), outcomes[found], minlength=len(pairs))
+            sums = np.bincount(pair_of.reshape(-1), outcomes[seen_outcomes], minlength=len(pairs))
             for (start, stop), weight in zip(pairs.tolist(), sums.tolist(), strict=True):
                 yield Move(number, start, stop, weight)
 

@@ -168,14 +168,14 @@ def shortened(text: str, width: float, size: int, bold: bool = False) -> str:
 def wrapped(text: str, width: float, size: int, lines: int, bold: bool = False) -> list[str]:
     """Return a text in at most `lines` lines that are at most `width` pixels wide."""
     words = text[: lines * int(width)].split()
-    found: list[str] = []
-    while words and len(found) < lines - 1:
+    result: list[str] = []
+    while words and len(result) < lines - 1:
         count = 1
         while count < len(words) and font(size, bold).getlength(" ".join(words[: count + 1])) <= width:
             count += 1
-        found.append(shortened(" ".join(words[:count]), width, size, bold))
+        result.append(shortened(" ".join(words[:count]), width, size, bold))
         words = words[count:]
-    return [*found, shortened(" ".join(words), width, size, bold)] if words else found
+    return [*result, shortened(" ".join(words), width, size, bold)] if words else result
 
 
 def _rendered(content: str, box: str, width: int, height: int) -> Image.Image:
@@ -186,8 +186,8 @@ def _rendered(content: str, box: str, width: int, height: int) -> Image.Image:
 
 def _fonts() -> tuple[Path, Path]:
     """Return the files of the regular and the bold font, without importing Matplotlib."""
-    found = importlib.util.find_spec("matplotlib")
-    if found is None or found.origin is None:
+    spec = importlib.util.find_spec("matplotlib")
+    if spec is None or spec.origin is None:
         raise missing("matplotlib", "plots", _PURPOSE)
-    folder = Path(found.origin).parent / "mpl-data" / "fonts" / "ttf"
+    folder = Path(spec.origin).parent / "mpl-data" / "fonts" / "ttf"
     return folder / "DejaVuSans.ttf", folder / "DejaVuSans-Bold.ttf"

@@ -81,16 +81,16 @@ class Drawing:
 
 def signs(things: Sequence[Thing]) -> list[str]:
     """Return a letter for each thing: `*` for a goal, a mover's number, else a lower-case initial."""
-    found = []
+    result = []
     for thing in things:
         last, first = spoken(thing["label"]).split()[-1], thing["label"][0]
         if thing["kind"] == "goal":
-            found.append("*")
+            result.append("*")
         elif thing["kind"] == "mover":
-            found.append(last if last.isdecimal() and len(last) == 1 else first.upper())
+            result.append(last if last.isdecimal() and len(last) == 1 else first.upper())
         else:
-            found.append(first.lower())
-    return found
+            result.append(first.lower())
+    return result
 
 
 def _styles(things: Sequence[Thing]) -> list[str]:

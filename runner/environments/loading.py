@@ -139,7 +139,9 @@ def _make(env_id: str, kwargs: JsonView) -> Any:
                 f"environment {env_id!r}: the module {module!r} cannot be imported ({_raised(error)})."
             ) from error
     if name not in gymnasium.registry:
-        stems = {known.rpartition("-v")[0]: known for known in gymnasium.registry}  # the newest comes last
+        stems = {
+            env_name.rpartition("-v")[0]: env_name for env_name in gymnasium.registry
+        }  # the newest comes last
         near = difflib.get_close_matches(name.rpartition("-v")[0], stems, n=1, cutoff=0.6)
         before = (
             f"{module}:" if module and near and stems[near[0]].startswith(name.rpartition("-v")[0]) else ""

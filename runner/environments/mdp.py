@@ -122,10 +122,10 @@ class Mdp:
 
     def outcomes_to(self, state: Indices, action: Indices, next_state: Indices) -> NDArray[np.bool_]:
         """Return which outcomes of steps, [N] each, lead to their next states: [N, K]; none if unknown."""
-        known = (state >= 0) & (state < self.states) & (action >= 0) & (action < self.joint_actions)
-        at = np.where(known, state, 0), np.where(known, action, 0)
+        exists = (state >= 0) & (state < self.states) & (action >= 0) & (action < self.joint_actions)
+        at = np.where(exists, state, 0), np.where(exists, action, 0)
         leads = (self.next_state[at] == next_state[:, np.newaxis]) & (self.probability[at] > 0)
-        return np.asarray(leads & known[:, np.newaxis])
+        return np.asarray(leads & exists[:, np.newaxis])
 
     def rewards_of(self, learners: int) -> NDArray[np.float64]:
         """Return rewards as [S, J, K, learners]: their own where there are several, else the shared one."""
@@ -165,17 +165,17 @@ def step_counts(
     reward is excluded if outcomes lead there and none of them pays it.
     """
     likely = mdp.outcomes_to(state, action, next_state)
-    found = likely.any(axis=1)
-    at = np.where(found, state, 0), np.where(found, action, 0)
+    is_possible = likely.any(axis=1)
+    at = np.where(is_possible, state, 0), np.where(is_possible, action, 0)
     paid = likely & (mdp.rewards[at].sum(axis=-1) == rewards[:, np.newaxis])
     counts = np.zeros((len(rewards), len(mdp.event_names) + 1), np.int64)
     counts[:, -1] = rewards < mdp.penalty_below
     if mdp.event_names:
         outcome = np.argmax(likely * 2 + paid, axis=1)
-        events = np.where(found, mdp.events[*at, outcome], np.uint32(0))
+        events = np.where(is_possible, mdp.events[*at, outcome], np.uint32(0))
         names = np.arange(len(mdp.event_names), dtype=np.uint32)
         counts[:, :-1] = (events[:, np.newaxis] >> names) & 1
-    return counts, found & ~paid.any(axis=1)
+    return counts, is_possible & ~paid.any(axis=1)
 
 
 def events_of(mdp: Mdp, steps: NDArray[np.void]) -> NDArray[np.uint32]:
@@ -184,13 +184,13 @@ def events_of(mdp: Mdp, steps: NDArray[np.void]) -> NDArray[np.uint32]:
     A record holds where a step led, not which outcome it took: that is one with its next state; of several
     one that ends as it did, and that pays what it did.
     """
-    found = np.zeros(len(steps), np.uint32)
+    masks = np.zeros(len(steps), np.uint32)
     if mdp.event_names:
         batch = max(1, _BATCH_OUTCOMES // mdp.next_state.shape[2])
         for start in range(0, len(steps), batch):
             some = slice(start, start + batch)
-            found[some] = _events(mdp, steps[some])
-    return found
+            masks[some] = _events(mdp, steps[some])
+    return masks
 
 
 def _events(mdp: Mdp, steps: NDArray[np.void]) -> NDArray[np.uint32]:
@@ -263,8 +263,8 @@ def _description_checks(mdp: Mdp) -> Iterator[tuple[str, bool, object]]:
     yield f"at most {MAX_EVENTS} events", len(events) <= MAX_EVENTS, len(events)
     yield "an event has a name of its own", _distinct(events), events
     successes = mdp.success_events
-    known = _distinct(successes) and set(successes) <= set(events)
-    yield f"success events must be some of the events {events}", known, successes
+    are_events = _distinct(successes) and set(successes) <= set(events)
+    yield f"success events must be some of the events {events}", are_events, successes
     penalty = mdp.penalty_below
     yield "penalty_below must be a number", isinstance(penalty, int | float), penalty
     limit = mdp.step_limit

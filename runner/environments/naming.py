@@ -78,12 +78,12 @@ def agent_of(mdp: Mdp, name: str) -> int:
     Raises:
         ConfigError: there is none.
     """
-    known = {text: i for i, agent in enumerate(mdp.agents) for text in (agent, spoken(agent))}
-    if name not in known:
+    numbers = {text: i for i, agent in enumerate(mdp.agents) for text in (agent, spoken(agent))}
+    if name not in numbers:
         raise ConfigError(
             f"found the agent {name[:60]!r}, expected {' or '.join(mdp.agents)}.{nearest(name, mdp.agents)}"
         )
-    return known[name]
+    return numbers[name]
 
 
 def state_of(mdp: Mdp, text: str) -> int:

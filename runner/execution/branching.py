@@ -182,10 +182,10 @@ def _check_beginning(parent: Recording, own: Run, episodes: int) -> None:
     with open_recording(own.recording) as recording:
         count = min(episodes, unbroken(parent)[1], recording.count(schema.TRAIN_EPISODE))
         ours, theirs = (one.blocks(schema.TRAIN_EPISODE, 0, count) for one in (recording, parent))
-        found = first_difference(ours, theirs, ("episode", "last_step", "returns"))
-    if found is not None:
+        first = first_difference(ours, theirs, ("episode", "last_step", "returns"))
+    if first is not None:
         raise RunnerError(
-            f"run {own.run_id}: training episode {found[0]:,} is not that of its parent {parent.run_id}, "
+            f"run {own.run_id}: training episode {first[0]:,} is not that of its parent {parent.run_id}, "
             "though the branch begins later: the parent was recorded with other versions of NumPy or Numba, "
             f"or on another kind of processor. `dualtaxi diff {parent.run_id} {own.run_id}` shows them."
         )

@@ -85,11 +85,11 @@ def verify_by_redoing(
                 result, versions=_other_versions(recording.maker), assumed=recording.maker.assumed
             )
     try:
-        for found in stream_from_child(_compare, path, sample, tolerance, trust):
-            if isinstance(found, int):
-                report(found)
+        for message in stream_from_child(_compare, path, sample, tolerance, trust):
+            if isinstance(message, int):
+                report(message)
             else:
-                result = replace(found, versions=result.versions, assumed=result.assumed)
+                result = replace(message, versions=result.versions, assumed=result.assumed)
     except CannotRedo as error:
         return replace(result, reason=str(error))
     return result
@@ -99,16 +99,16 @@ def _compare(path: Path, sample: int | None, tolerance: float, trust: bool) -> N
     """Report the number of steps taken, and at last the result; runs in a child process."""
     with open_recording(path) as recording:
         if sample is None:
-            found = _compare_all(recording, tolerance, trust)
+            outcome = _compare_all(recording, tolerance, trust)
         else:
-            found = _compare_sample(recording, sample, tolerance, trust)
-        if found.difference is not None and not _is_repeatable(recording, found, trust):
-            found = replace(found, verdict="impossible", reason=_OUTSIDE)
-    report_progress(found)
+            outcome = _compare_sample(recording, sample, tolerance, trust)
+        if outcome.difference is not None and not _is_repeatable(recording, outcome, trust):
+            outcome = replace(outcome, verdict="impossible", reason=_OUTSIDE)
+    report_progress(outcome)
 
 
 def _compare_all(recording: Recording, tolerance: float, trust: bool) -> Redone:
-    found = Redone("reproduced", tolerance=tolerance)
+    outcome = Redone("reproduced", tolerance=tolerance)
     total = {phase: recording.step_count(phase) for phase in schema.PHASES}
     left = total.copy()
     with closing(Replay(recording, trust, tolerance, report_progress)) as replay:
@@ -116,22 +116,22 @@ def _compare_all(recording: Recording, tolerance: float, trust: bool) -> Redone:
             if len(steps):
                 after = total[steps.phase] - 1 - int(steps.step[-1])
                 left[steps.phase] = min(left[steps.phase], after)
-            found = replace(
-                found,
-                episodes=found.episodes + int(np.count_nonzero(steps.t == 0)),
-                steps=found.steps + len(steps),
+            outcome = replace(
+                outcome,
+                episodes=outcome.episodes + int(np.count_nonzero(steps.t == 0)),
+                steps=outcome.steps + len(steps),
                 difference=steps.difference,
             )
         ended = sum(recording.count(recording.topic(f"/{phase}/episode")) for phase in schema.PHASES)
-        found = replace(found, left_out=replay.skipped, unfinished=max(0, found.episodes - ended))
-    if found.difference is None and "content_digest" not in recording.result:
-        found = replace(found, cut_off=sum(left.values()))
-    if found.difference is not None:
-        return replace(found, verdict="differs")
-    if not found.steps:
+        outcome = replace(outcome, left_out=replay.skipped, unfinished=max(0, outcome.episodes - ended))
+    if outcome.difference is None and "content_digest" not in recording.result:
+        outcome = replace(outcome, cut_off=sum(left.values()))
+    if outcome.difference is not None:
+        return replace(outcome, verdict="differs")
+    if not outcome.steps:
         reason = "No reset had a seed, and the state of the random generators was not recorded."
-        return replace(found, verdict="impossible", reason=reason)
-    return found
+        return replace(outcome, verdict="impossible", reason=reason)
+    return outcome
 
 
 def _compare_sample(recording: Recording, sample: int, tolerance: float, trust: bool) -> Redone:
@@ -142,26 +142,26 @@ def _compare_sample(recording: Recording, sample: int, tolerance: float, trust: 
         for number in range(recording.count(recording.topic(f"/{phase}/episode")))
     ]
     places = np.unique(np.linspace(0, len(ended) - 1, min(sample, len(ended))).round().astype(int))
-    found = Redone("reproduced", of_episodes=len(ended), tolerance=tolerance)
+    outcome = Redone("reproduced", of_episodes=len(ended), tolerance=tolerance)
     reason = "No episode ended."
     for phase, number in (ended[place] for place in places):
-        taken = found.steps
+        taken = outcome.steps
 
         def report(steps: int, taken: int = taken) -> None:
             report_progress(taken + steps)
 
         try:
             for steps in redo(recording, phase, [number], trust=trust, tolerance=tolerance, report=report):
-                found = replace(found, steps=found.steps + len(steps), difference=steps.difference)
+                outcome = replace(outcome, steps=outcome.steps + len(steps), difference=steps.difference)
         except CannotRedo as error:
             reason = str(error)
             span = recording.episode_span(phase, number)
-            found = replace(found, left_out=found.left_out + len(span))
+            outcome = replace(outcome, left_out=outcome.left_out + len(span))
             continue
-        found = replace(found, episodes=found.episodes + 1)
-        if found.difference is not None:
-            return replace(found, verdict="differs")
-    return found if found.episodes else replace(found, verdict="impossible", reason=reason)
+        outcome = replace(outcome, episodes=outcome.episodes + 1)
+        if outcome.difference is not None:
+            return replace(outcome, verdict="differs")
+    return outcome if outcome.episodes else replace(outcome, verdict="impossible", reason=reason)
 
 
 def _is_repeatable(recording: Recording, found: Redone, trust: bool) -> bool:

@@ -190,7 +190,7 @@ def _rerecord_job(run: Run, fresh: Path, report: Report, stop: Stop) -> None:
     with open_recording(run.recording) as recording:
         learner = Learner(job.config, mdp, job.seed, recorded_tables(recording))
         expected, made_by = recording.result["content_digest"], recording.metadata("provenance")
-        kept = {
+        metadata = {
             name: recording.metadata(name)
             for name in recording.metadata_names
             if name == CODE_RECORD or name.startswith("resume/")
@@ -201,7 +201,7 @@ def _rerecord_job(run: Run, fresh: Path, report: Report, stop: Stop) -> None:
         describe(file, job, run, learner, made_by)
         for attachment in code:
             file.add_attachment(*attachment)
-        for name, entries in kept.items():
+        for name, entries in metadata.items():
             file.add_metadata(name, entries)
         file.add_metadata("rerecord", provenance())
         recorder = recorder_for(job, learner, file, beat=run.beat, clock=False)
@@ -291,14 +291,14 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
                 report_progress(replay.taken)
         if replay.skipped:
             raise CannotRedo(f"The states of the generators before {replay.skipped:,} steps are not known.")
-        found = recorder.drain()
+        digests = recorder.drain()
     except BaseException:
         recorder.abandon()
         raise
     for name in sorted(names):
         expected = recording.result.topic_digests.get(name)
-        if found.get(name) != expected:
-            raise Diverged(name, "digest", found.get(name), expected)
+        if digests.get(name) != expected:
+            raise Diverged(name, "digest", digests.get(name), expected)
 
 
 def _whole_records(

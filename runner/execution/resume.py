@@ -265,8 +265,8 @@ def _steps(recording: Recording, phase: str) -> int:
 def _changes(run: Run) -> Differences:
     """Return the decisive differences from the provenance at the beginning of the recording."""
     with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
-        found = differing_provenance(recording.provenance)
-        return {key: values for key, values in found.items() if key in DECISIVE}
+        differences = differing_provenance(recording.provenance)
+        return {key: values for key, values in differences.items() if key in DECISIVE}
     return {}
 
 

@@ -322,15 +322,16 @@ class Session:
 
 def evaluation_metrics(learner: Learner, evaluation: int, trials: Records) -> Message:
     """Return the metrics of an evaluation from its episode records, and of training at that moment."""
-    known = bool(learner.mdp.success_events)
+    has_success = bool(learner.mdp.success_events)
     successes = int(trials["success"].sum())
     return learner.training_metrics() | {
         "evaluation": evaluation,
         "trials": len(trials),
-        "successes": successes if known else -1,
+        "successes": successes if has_success else -1,
         **{each.field: math.nan for each in METRICS},
         **{
-            each.field: each.combine(each.of_trials(trials)).tolist() for each in defined_metrics(known, True)
+            each.field: each.combine(each.of_trials(trials)).tolist()
+            for each in defined_metrics(has_success, True)
         },
         "terminations": int(trials["terminated"].sum()),
         "events": trials["events"].sum(axis=0, dtype=np.int64).tolist(),

@@ -73,7 +73,7 @@ def verify(
     damage = damage_of(path) if damage is None else damage
     try:
         with open_recording(path) as recording:
-            found = _verify_content(recording, rerun, report)
+            verification = _verify_content(recording, rerun, report)
             damage = damage and damage + _first_unreadable(recording)
     except (RecordingError, ConfigError) as error:
         if damage and _is_empty(path):
@@ -83,12 +83,12 @@ def verify(
             finding += _first_unreadable(recording)
         return Verification(path, finding=finding)
     if not damage:
-        return found
+        return verification
     if _is_empty(path):
         return Verification(path, nothing_yet=True)
-    if found.sound:
-        return replace(found, finding=damage, content_digest="")
-    return replace(found, notes=(*found.notes, damage))
+    if verification.sound:
+        return replace(verification, finding=damage, content_digest="")
+    return replace(verification, notes=(*verification.notes, damage))
 
 
 def _is_empty(path: Path) -> bool:
@@ -118,7 +118,7 @@ def _first_unreadable(recording: Recording) -> str:
 
 
 def _verify_content(recording: Recording, rerun: bool, report: Report) -> Verification:
-    found = Verification(recording.path)
+    verification = Verification(recording.path)
     if recording.lost:
         holes = "; ".join(
             f"{topic}: found none of number {first} to {end - 1}, expected {end - first}"
@@ -126,12 +126,12 @@ def _verify_content(recording: Recording, rerun: bool, report: Report) -> Verifi
             for first, end in places
         )
         finding = f"{recording.path}: {holes}: lost in a repair. `dualtaxi resume` runs the job again."
-        return replace(found, finding=finding)
+        return replace(verification, finding=finding)
     if not recording.can_train_again:
         return verify_loop(recording)
     job = Job(from_mapping(recording.config), recording.seed or 0)
     if recording.job != job.identity:
-        return with_difference(found, Diverged("metadata run", "job", recording.job, job.identity))
+        return with_difference(verification, Diverged("metadata run", "job", recording.job, job.identity))
     return _verify_job(recording, job, rerun, report)
 
 
@@ -148,13 +148,13 @@ def _verify_job(recording: Recording, job: Job, rerun: bool, report: Report) -> 
         return reference.exhausted and all(recorder.counts[name] >= n for name, n in recorded.items())
 
     session = Session(job, learner, recorder, report, stop=lambda: not complete and all_compared())
-    found = Verification(recording.path, notes=() if complete else (NOT_COMPLETE,))
+    verification = Verification(recording.path, notes=() if complete else (NOT_COMPLETE,))
     if rerun:  # what may explain a difference
         changes = differing_provenance(recording.provenance) | differing_environment(recording, mdp)
         changes = {key: values for key, values in changes.items() if key not in CIRCUMSTANCES}
-        found = replace(found, provenance=changes)
+        verification = replace(verification, provenance=changes)
     else:
-        found = replace(found, not_compared=NAMES_NOT_COMPARED)
+        verification = replace(verification, not_compared=NAMES_NOT_COMPARED)
     try:
         compare_names(recording, list(session.learners))
         ended = session.run()
@@ -166,7 +166,7 @@ def _verify_job(recording: Recording, job: Job, rerun: bool, report: Report) -> 
             for key in sorted(description):
                 compare_values(key, recording.environment.get(key), description[key])
     except Diverged as error:
-        return with_difference(found, error)
+        return with_difference(verification, error)
     finally:
         recorder.abandon()
     result = recording.result
@@ -175,8 +175,8 @@ def _verify_job(recording: Recording, job: Job, rerun: bool, report: Report) -> 
     steps = {"train": recording.count(schema.TRAIN_STEP), "eval": recording.count(schema.EVAL_STEP)}
     if whole:  # else the job was run a little further than it is recorded
         steps = recorder.steps
-    found = replace(found, train_steps=steps["train"], eval_steps=steps["eval"])
-    return compare_result(found, recording, session.summary(topics)) if whole else found
+    verification = replace(verification, train_steps=steps["train"], eval_steps=steps["eval"])
+    return compare_result(verification, recording, session.summary(topics)) if whole else verification
 
 
 def differing_environment(recording: Recording, mdp: Mdp) -> Differences:

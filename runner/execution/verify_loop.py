@@ -36,7 +36,7 @@ def verify_loop(recording: Recording) -> Verification:
     notes = [] if finished else [NOT_COMPLETE]
     if recording.leaves_out_steps:
         notes.append("whole steps were left out: digests represent their observations and rewards")
-    found = Verification(
+    verification = Verification(
         recording.path,
         train_steps=recording.step_count("train"),
         eval_steps=recording.step_count("eval"),
@@ -56,17 +56,20 @@ def verify_loop(recording: Recording) -> Verification:
             notes.append(f"{strange} are no outcome of the environment's table: it has other rules too")
         for phase, findings in phases.items():
             notes += _unusual(recording, phase, findings)
-        steps, last = found.train_steps + found.eval_steps, max(each.last_time for each in phases.values())
+        steps, last = (
+            verification.train_steps + verification.eval_steps,
+            max(each.last_time for each in phases.values()),
+        )
         if finished and steps and last != steps * schema.STEP_NANOSECONDS:
             taken = last // schema.STEP_NANOSECONDS
             raise Inconsistent(f"found {steps:,} steps, expected {taken:,} by the time of the last")
     except Inconsistent as error:
-        return replace(found, notes=tuple(notes), finding=f"{recording.path}: {error}")
+        return replace(verification, notes=tuple(notes), finding=f"{recording.path}: {error}")
     except Diverged as error:
-        return with_difference(replace(found, notes=tuple(notes)), error)
-    found = replace(found, notes=tuple(notes))
+        return with_difference(replace(verification, notes=tuple(notes)), error)
+    verification = replace(verification, notes=tuple(notes))
     if not finished:
-        return found
+        return verification
     digests, counts = content.digest.topics(), content.counts
     if recording.leaves_out_steps:
         stated = recording.result.topic_digests
@@ -83,7 +86,7 @@ def verify_loop(recording: Recording) -> Verification:
     }
     if recording.result.rewards_off_table is not None and not recording.leaves_out_steps:
         expected["rewards_off_table"] = sum(findings.rewards_off_table for findings in phases.values())
-    return compare_result(found, recording, expected)
+    return compare_result(verification, recording, expected)
 
 
 def _check_phase(recording: Recording, phase: str, finished: bool, content: _Content) -> Findings:

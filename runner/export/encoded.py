@@ -102,27 +102,27 @@ class Thumbnails:
 def thumbnails(path: Path, phase: str, episode: int, frames: int) -> Thumbnails:
     """Return pictures of the first frames of an episode."""
     require("PIL.Image", extra="plots", purpose="the pictures of a report")
-    found, every = Thumbnails(), -(-frames // MAX_PICTURES)
+    result, every = Thumbnails(), -(-frames // MAX_PICTURES)
     latest = b""
     try:
         with closing(encoded_pictures(path, phase, episode)) as pictures:
             for data in pictures:
                 if isinstance(data, str):
-                    found.picture_note = data
+                    result.picture_note = data
                     continue
-                k = len(found.picture)
+                k = len(result.picture)
                 if k == frames:
                     break
                 latest = data or latest
                 if k % every == 0 and latest:
-                    found.pictures.append(_small(latest))
+                    result.pictures.append(_small(latest))
                     latest = b""
-                found.picture.append(len(found.pictures) - 1)
+                result.picture.append(len(result.pictures) - 1)
     except RunnerError as error:
-        found.picture_note = str(error)
-    if found.pictures:
-        found.picture += [len(found.pictures) - 1] * (frames - len(found.picture))
-    return found
+        result.picture_note = str(error)
+    if result.pictures:
+        result.picture += [len(result.pictures) - 1] * (frames - len(result.picture))
+    return result
 
 
 def _small(data: bytes) -> str:

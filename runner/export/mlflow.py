@@ -88,8 +88,8 @@ def _export(
     from mlflow.tracking import MlflowClient
 
     client = MlflowClient(tracking_uri=tracking, registry_uri=tracking)
-    found = client.get_experiment_by_name(experiment)
-    experiment_id = client.create_experiment(experiment) if found is None else found.experiment_id
+    existing = client.get_experiment_by_name(experiment)
+    experiment_id = client.create_experiment(experiment) if existing is None else existing.experiment_id
     stored = client.search_runs([experiment_id], f"tags.`{RUN_TAG}` = '{recording.run_id}'")
     tags = tags_of(recording)
     if stored and not force:

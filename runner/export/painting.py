@@ -90,8 +90,8 @@ def paint_redrawn(
 ) -> Painted:
     """Draw each state by the environment, from the one after `first` steps on; see `redrawn`."""
     shown: Pixels | None = None
-    with closing(redrawn(recording, phase, [episode], trust, first)) as found:
-        for _, _, frame in found:
+    with closing(redrawn(recording, phase, [episode], trust, first)) as pictures:
+        for _, _, frame in pictures:
             shown = _like(frame, shown)
             yield shown
 

@@ -36,8 +36,8 @@ def require_tested(module: str, extra: str, tested: tuple[str, str]) -> object:
     package = metadata.packages_distributions().get(module, [module])[0]
     version = metadata.version(package)
     low, high = (_numbers(text) for text in tested)
-    found = _numbers(version)
-    if found[: len(low)] < low or found[: len(high)] > high:
+    numbers = _numbers(version)
+    if numbers[: len(low)] < low or numbers[: len(high)] > high:
         warn_user(
             f"runner.integrations.{extra}: found {package} {version}, tested are {tested[0]} to "
             f"{tested[1]}. Check the first recording."

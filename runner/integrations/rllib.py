@@ -164,12 +164,12 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
         """
         recording, config = self._recording, algorithm.config
         describe = partial(_described, recording.make)
-        found = [each for each in algorithm.env_runner_group.foreach_env_runner(describe) if each]
-        if not found:
+        descriptions = [each for each in algorithm.env_runner_group.foreach_env_runner(describe) if each]
+        if not descriptions:
             raise EnvironmentNotUsable(
                 f"found no environment in the env runners of {type(algorithm).__name__}, expected one"
             )
-        described, maker = found[0]
+        described, maker = descriptions[0]
         name = f"{type(algorithm).__name__}-{described.env_id.rpartition('/')[2]}"
         if trial := getattr(getattr(algorithm, "_storage", None), "trial_dir_name", None):
             name = re.sub(r"_[\d-]{10}_[\d-]{8}$", "", trial)  # RLlib keeps no other name of a trial
@@ -347,8 +347,8 @@ def _join(join: _Join, env_runner: Any) -> None:
 def _recorded(env_runner: object) -> list[Recorded[Any]]:
     """Return what an env runner has recorded: its vector, or each of its environments of several agents."""
     outer = getattr(env_runner, "env", None)
-    found = outer.envs if isinstance(outer, VectorMultiAgentEnv) else [getattr(outer, "env", None)]
-    return [each for each in found if isinstance(each, Recorded)]
+    inner = outer.envs if isinstance(outer, VectorMultiAgentEnv) else [getattr(outer, "env", None)]
+    return [each for each in inner if isinstance(each, Recorded)]
 
 
 def _evaluate_at(steps: int, env_runner: object) -> None:

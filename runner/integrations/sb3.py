@@ -272,14 +272,14 @@ def settings_of(model: BaseAlgorithm) -> dict[str, object]:
     for kind in type(model).__mro__:
         if "__init__" in vars(kind):
             names |= dict.fromkeys(inspect.signature(kind.__init__).parameters)  # type: ignore[misc]
-    found = {
+    settings = {
         "algorithm": type(model).__name__,
         "policy": getattr(model, "policy_class", type(model.policy)).__name__,
     }
     for name in names:
-        if name not in {*_NOT_SETTINGS, *found} and hasattr(model, name):
-            found[name] = _setting(getattr(model, name))
-    return found
+        if name not in {*_NOT_SETTINGS, *settings} and hasattr(model, name):
+            settings[name] = _setting(getattr(model, name))
+    return settings
 
 
 def _setting(value: object) -> object:

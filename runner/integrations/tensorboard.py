@@ -137,8 +137,8 @@ class SummaryWriter:
         **__: object,
     ) -> None:
         """Log a text; a table of hyperparameters, as CleanRL writes it, also becomes the settings."""
-        if self._run.is_waiting and (found := _HYPERPARAMETERS.search(str(text_string))):
-            self._run.settings = _settings(text_string[found.end() :]) | self._run.settings
+        if self._run.is_waiting and (match := _HYPERPARAMETERS.search(str(text_string))):
+            self._run.settings = _settings(text_string[match.end() :]) | self._run.settings
         self._run.log(tag, str(text_string), step_of(global_step))
 
     def add_histogram(
@@ -301,8 +301,8 @@ def _settings(table: str) -> dict[str, object]:
     """Return the rows `|name|value|` of a Markdown table; values as Python writes them, else as text."""
     settings: dict[str, object] = {}
     for line in table.splitlines():
-        if found := re.fullmatch(r"\|([^|]+)\|(.*)\|", line.strip()):
-            name, text = found.groups()
+        if match := re.fullmatch(r"\|([^|]+)\|(.*)\|", line.strip()):
+            name, text = match.groups()
             try:
                 settings[name] = ast.literal_eval(text)
             except (ValueError, SyntaxError, MemoryError, RecursionError):
@@ -323,17 +323,17 @@ def forward() -> bool:
     Returns whether such a writer is loaded.
     """
     global _forwarded
-    _forwarded, found = SummaryWriter(), False
+    _forwarded, has_writers = SummaryWriter(), False
     for module in _WRITERS:
         writer = getattr(sys.modules.get(module), "SummaryWriter", None)
         if writer is None:
             continue
-        found = True
+        has_writers = True
         for name in [name for name in vars(SummaryWriter) if name.startswith("add_")]:
             method = getattr(writer, name, None)
             if method is not None and not hasattr(method, "forwards"):
                 setattr(writer, name, _forwarding(name, method))
-    return found
+    return has_writers
 
 
 def _forwarding(name: str, method: Callable[..., object]) -> Callable[..., object]:

@@ -35,10 +35,10 @@ def watch(module: str) -> None:
             if Path(file).resolve().parent != folder:
                 return None
             others = (other for other in caching.CacheImpl._locator_classes if other is not cls)
-            found = next(filter(None, (other.from_function(function, file) for other in others)), None)
-            if found is not None:
-                found.get_source_stamp = lambda: stamp(folder)
-            return found
+            locator = next(filter(None, (other.from_function(function, file) for other in others)), None)
+            if locator is not None:
+                locator.get_source_stamp = lambda: stamp(folder)
+            return locator
 
     caching.CacheImpl._locator_classes.insert(0, Locator)
 

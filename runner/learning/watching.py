@@ -168,7 +168,7 @@ def replay_watched(
 @numba.njit(cache=True, nogil=True)
 def explorations(rules: Rules, episodes: NDArray[np.int64], steps: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the probability of exploring at training steps of these episodes, [n]."""
-    found = np.empty(len(steps))
+    probabilities = np.empty(len(steps))
     for k in range(len(steps)):
-        found[k] = exploring(rules, episodes[k], steps[k])
-    return found
+        probabilities[k] = exploring(rules, episodes[k], steps[k])
+    return probabilities

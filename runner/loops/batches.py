@@ -302,13 +302,13 @@ def _flags(what: str, values: object, shape: tuple[int, ...]) -> Flags:
     Raises:
         ConfigError: it holds something else, or has another shape.
     """
-    found: Array = as_array(values)
-    if found.shape != shape or (found.dtype.kind != "b" and not np.isin(found, (0, 1)).all()):
+    flags: Array = as_array(values)
+    if flags.shape != shape or (flags.dtype.kind != "b" and not np.isin(flags, (0, 1)).all()):
         raise ConfigError(
-            f"{what}: found {found.dtype} of shape {found.shape}, expected booleans of the shape {shape}, as "
+            f"{what}: found {flags.dtype} of shape {flags.shape}, expected booleans of the shape {shape}, as "
             "rewards"
         )
-    return found.astype(np.bool_, copy=False)
+    return flags.astype(np.bool_, copy=False)
 
 
 def _derived(batch: object) -> Space:

@@ -314,8 +314,8 @@ class _Fold:
         phase = topic.phase
         if topic.message == schema.RESET_STATE:
             for state in source.recording.reset_states(phase):
-                found = source.units[phase][source.units[phase]["reset"] == state.reset]
-                for unit in found:
+                units = source.units[phase][source.units[phase]["reset"] == state.reset]
+                for unit in units:
                     environment = source.environment + state.environment
                     moved = state._replace(reset=int(unit["new_reset"]), environment=environment)
                     yield int(unit["new_position"]), moved.to_payload()

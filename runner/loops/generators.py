@@ -148,12 +148,12 @@ class VectorWatch:
             self._async = None
             drawn = {i: seed_of(generators[i]) for i in chosen if i not in self._seeded}
             return {i: ResetState(environment=i, np_random_seed=s) for i, s in drawn.items() if s is not None}
-        found = {
+        by_environment = {
             i: self._watches[i].after(states.get(i), seed)
             for i, seed in chosen.items()
             if i < len(self._watches)
         }
-        return {i: state._replace(environment=i) for i, state in found.items() if state is not None}
+        return {i: state._replace(environment=i) for i, state in by_environment.items() if state is not None}
 
 
 def is_atari(base: object) -> bool:

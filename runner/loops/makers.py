@@ -246,14 +246,14 @@ def checked_make(make: object) -> str:
         )
     module, _, path = text.partition(":")
     try:
-        found = sys.modules["__main__"] if module == _main_name() else importlib.import_module(module)
+        target = sys.modules["__main__"] if module == _main_name() else importlib.import_module(module)
         for name in path.split("."):
-            found = getattr(found, name)
+            target = getattr(target, name)
     except Exception as error:  # importing a module runs any code
         raise ConfigError(f"make: {text!r} cannot be imported ({error}).") from error
-    if not callable(found) or not (isinstance(make, str) or found is make):
+    if not callable(target) or not (isinstance(make, str) or target is make):
         raise ConfigError(
-            f"make: found {found!r} as {text!r}, expected the function that makes environments."
+            f"make: found {target!r} as {text!r}, expected the function that makes environments."
         )
     return text
 
@@ -273,8 +273,12 @@ def _main_name() -> str | None:
     if path is None:
         return None
     name = Path(path).stem
-    found = importlib.util.find_spec(name) if name.isidentifier() else None
-    is_same = found is not None and found.origin and Path(found.origin).resolve() == Path(path).resolve()
+    module_spec = importlib.util.find_spec(name) if name.isidentifier() else None
+    is_same = (
+        module_spec is not None
+        and module_spec.origin
+        and Path(module_spec.origin).resolve() == Path(path).resolve()
+    )
     return name if is_same else None
 
 
@@ -294,8 +298,8 @@ def package_versions(tops: Sequence[str] = ()) -> dict[str, str]:
         tops: names of further modules, without dots; those that no distribution is named after have no entry.
     """
     names = {"gymnasium", "numpy", *tops, *(name for name in _SIMULATORS if name in sys.modules)}
-    found = (_installed(name) for name in sorted(names))
-    return dict(one for one in found if one is not None)
+    packages = (_installed(name) for name in sorted(names))
+    return dict(one for one in packages if one is not None)
 
 
 @cache

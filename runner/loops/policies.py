@@ -152,8 +152,8 @@ def values_along(
         RecordingError: there is no such episode, or the content of the checkpoint is not here.
     """
     recording.episode_span(phase, episode)  # with its message, if there is none
-    found = next(episodes_in(recording, phase, ((episode, episode + 1),)), None)
-    if found is None:
+    steps_of_episode = next(episodes_in(recording, phase, ((episode, episode + 1),)), None)
+    if steps_of_episode is None:
         raise RecordingError(
             f"{recording.path}: the observations of {phase} episode {episode} are not all there: it has not "
             "ended, or a part of it was lost."
@@ -163,10 +163,10 @@ def values_along(
     with from_policy(policy):
         act = make(weights, *own)
     rows: dict[str, list[Array]] = {}
-    steps = len(found.rewards)
+    steps = len(steps_of_episode.rewards)
     for t in range(steps):
         with from_policy(policy):
-            thought = act(element_of(found.observations, t))
+            thought = act(element_of(steps_of_episode.observations, t))
         for name, value in _named(thought).items():
             rows.setdefault(name, []).append(value)
     try:
@@ -175,7 +175,7 @@ def values_along(
         raise ConfigError(f"policy: {policy!r} returned arrays of different shapes ({error})") from error
     if any(len(each) != steps for each in values.values()):
         raise ConfigError(f"policy: {policy!r} returned other names at some steps, expected the same ones")
-    return ValuesAlong(found.actions, found.rewards, values)
+    return ValuesAlong(steps_of_episode.actions, steps_of_episode.rewards, values)
 
 
 def _named(value: object) -> dict[str, Array]:

@@ -71,8 +71,8 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
     @staticmethod
     def replacing(base: VecEnv) -> RecordedVecEnv | None:
         """Return what has replaced the methods of a `VecEnv`, if anything."""
-        found = getattr(vars(base).get("step_wait"), "__self__", None)
-        return found if isinstance(found, RecordedVecEnv) else None
+        owner = getattr(vars(base).get("step_wait"), "__self__", None)
+        return owner if isinstance(owner, RecordedVecEnv) else None
 
     def reset(self) -> object:
         """Reset all environments, and record it."""

@@ -131,10 +131,10 @@ class Rows:
         resets, transitions = np.array(self._reset_rows, np.int64), self._transitions(n)
         numbers = np.empty(0, np.int64)
         if n:
-            found = self._log.take(self._as_steps(n, first, resets, transitions))
-            numbers = found.number[:, 0]
-            self._finish_steps(n, numbers, found.t[:, 0], before)
-            self._put_ends(found.ended, first, before)
+            episodes = self._log.take(self._as_steps(n, first, resets, transitions))
+            numbers = episodes.number[:, 0]
+            self._finish_steps(n, numbers, episodes.t[:, 0], before)
+            self._put_ends(episodes.ended, first, before)
         if len(resets):
             if resets[-1] == n:
                 self._put_ends(self._log.interrupt(first + n, np.zeros(1, np.int64)), first, before)

@@ -93,8 +93,8 @@ class Source:
         if self.n == 1 and (maker is None or maker.kind != "vector"):
             return np.empty(0, np.int64)
         blocks = self.recording.blocks(self._topic(phase, "step"), 0, self.stops[phase])
-        found = [block["step"][block["t"] == schema.RESET_ONLY] for block in blocks]
-        return np.concatenate([np.empty(0, np.int64), *found])
+        parts = [block["step"][block["t"] == schema.RESET_ONLY] for block in blocks]
+        return np.concatenate([np.empty(0, np.int64), *parts])
 
     def _times(self, phase: str) -> NDArray[np.int64]:
         if self._is_fixed:
@@ -141,8 +141,8 @@ class Source:
         time = position * STEP_NANOSECONDS + 1
         if not self._is_fixed:
             return int(np.searchsorted(self.times[phase], time))
-        found = self.recording.first_from(self._topic(phase, "step"), "log_time", time)
-        return min(found, self.stops[phase])
+        first = self.recording.first_from(self._topic(phase, "step"), "log_time", time)
+        return min(first, self.stops[phase])
 
     # --- what a unit holds, read in the order of the run ----------------------------------------------
 
@@ -150,8 +150,8 @@ class Source:
         """Return the reset of a unit."""
         topic, number = self._topic(phase, "reset"), int(unit["reset"])
         if self._is_fixed:
-            found: np.void = next(self.recording.blocks(topic, number, number + 1))[0]
-            return found
+            record: np.void = next(self.recording.blocks(topic, number, number + 1))[0]
+            return record
         return next(self._stream(f"/{phase}/reset"))
 
     def steps(self, phase: str, unit: np.void) -> Iterator[tuple[Records | list[Message], Ints]]:

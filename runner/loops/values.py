@@ -98,11 +98,11 @@ def numbers_of(value: object, where: str, place: str, expected: str) -> Array:
     try:
         values = as_array(value)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        found = f"found no array of numbers {place} ({error})"
-        raise ConfigError(f"{where}: {found}, expected {expected}") from error
+        what = f"found no array of numbers {place} ({error})"
+        raise ConfigError(f"{where}: {what}, expected {expected}") from error
     if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8:
-        found = f"found {type(value).__name__} of {values.dtype} {place}"
-        raise ConfigError(f"{where}: {found}, expected {expected}")
+        what = f"found {type(value).__name__} of {values.dtype} {place}"
+        raise ConfigError(f"{where}: {what}, expected {expected}")
     return values
 
 

@@ -319,8 +319,8 @@ class VectorRows:
         order = np.argsort(rows, kind="stable")
         which = np.concatenate([reset.which for reset in resets])[order]
         observation = np.concatenate([reset.observation for reset in resets])[order]
-        known = [pair for reset in resets for pair in zip(reset.seeds, reset.states, strict=True)]
-        seeds, states = zip(*(known[k] for k in order.tolist()), strict=True)
+        pairs = [pair for reset in resets for pair in zip(reset.seeds, reset.states, strict=True)]
+        seeds, states = zip(*(pairs[k] for k in order.tolist()), strict=True)
         at = rows[order]
         self._put_resets(which, observation, seeds, states, episode[at, which], first + at * self._n)
 

@@ -84,8 +84,8 @@ def wrapper_fields(wrapper: object, assumed: list[str]) -> dict[str, object]:
     kwargs = getattr(wrapper, "_saved_kwargs", None) if isinstance(wrapper, RecordConstructorArgs) else None
     kwargs = None if kwargs is None else {key: value for key, value in kwargs.items() if key != "env"}
     if kind.__module__ == _SB3_ATARI:  # they keep their arguments under their names
-        kept = {key: getattr(wrapper, key, getattr(wrapper, f"_{key}", None)) for key in parameters}
-        kwargs = {key: value for key, value in kept.items() if key != "env" and value is not None}
+        fields = {key: getattr(wrapper, key, getattr(wrapper, f"_{key}", None)) for key in parameters}
+        kwargs = {key: value for key, value in fields.items() if key != "env" and value is not None}
     # A class that inherits from one that records its arguments may have others.
     if kwargs is None or not kwargs.keys() <= parameters.keys():
         kwargs = {}
@@ -121,8 +121,8 @@ def plain_kwargs(kwargs: Mapping[str, object], owner: str) -> dict[str, object]:
         except RecursionError:
             is_plain = False
         if not is_plain:
-            found = f"{type(value).__module__}:{type(value).__qualname__}"
-            raise CannotBeMade(f"{owner} has the argument {name}, of {found}, which JSON cannot hold")
+            type_name = f"{type(value).__module__}:{type(value).__qualname__}"
+            raise CannotBeMade(f"{owner} has the argument {name}, of {type_name}, which JSON cannot hold")
     return dict(kwargs)
 
 

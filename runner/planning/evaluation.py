@@ -153,17 +153,17 @@ def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> Outcome:
     starts = np.flatnonzero(mdp.start > 0)
     weights = mdp.start[starts]
     measure = _deterministic if _is_certain(chosen) else _stochastic
-    found = measure(chosen, starts, weights, mdp.step_limit, discount)
-    length, penalties, *returns = _means(found.totals, weights)
+    paths = measure(chosen, starts, weights, mdp.step_limit, discount)
+    length, penalties, *returns = _means(paths.totals, weights)
     return Outcome(
         starts=len(starts),
-        success_percent=found.success_percent if mdp.success_mask else math.nan,
-        timeout_percent=found.timeout_percent,
+        success_percent=paths.success_percent if mdp.success_mask else math.nan,
+        timeout_percent=paths.timeout_percent,
         mean_length=length,
         mean_penalties=penalties,
         mean_returns=tuple(returns),
-        values=_means(found.values, weights),
-        cycles=found.cycles,
+        values=_means(paths.values, weights),
+        cycles=paths.cycles,
     )
 
 

@@ -38,12 +38,14 @@ class ActionRecorder:
         places = np.arange(len(rows))
         for environment in range(self._n if len(rows) else 0):
             own = slice((environment - int(rows["step"][0])) % self._n, None, self._n)
-            at, found = places[own], records[own]
-            taken = found["t"] != RESET_ONLY
+            at, own_records = places[own], records[own]
+            taken = own_records["t"] != RESET_ONLY
             if not taken.all():
-                at, found = at[taken], found[taken]
-            names = "t", after_step(found.dtype), "rewards", "terminated", "truncated"
-            for row, digest in self._digests[topic.phase].add(environment, *map(found.__getitem__, names)):
+                at, own_records = at[taken], own_records[taken]
+            names = "t", after_step(own_records.dtype), "rewards", "terminated", "truncated"
+            for row, digest in self._digests[topic.phase].add(
+                environment, *map(own_records.__getitem__, names)
+            ):
                 rows["digest"][at[row]] = np.void(digest)
         self._rows.append(rows)
         is_large = sum(each.nbytes for each in self._rows) >= BLOCK_BYTES

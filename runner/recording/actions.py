@@ -44,8 +44,8 @@ def kept_dtype(step: np.dtype[np.void]) -> np.dtype[np.void]:
     Args:
         step: the dtype of whole records.
     """
-    kept = [(name, step[name]) for name in COLUMNS if name in (step.names or ())]
-    return np.dtype([("step", "<i8"), *kept, ("digest", f"V{DIGEST_BYTES}")])
+    columns = [(name, step[name]) for name in COLUMNS if name in (step.names or ())]
+    return np.dtype([("step", "<i8"), *columns, ("digest", f"V{DIGEST_BYTES}")])
 
 
 def after_step(step: np.dtype[np.void]) -> str:

@@ -124,6 +124,6 @@ def topic_dtype(
         TRANSITION: (action, observation, learners),
         RESET: (observation,),
     }
-    known = [size for size in sizes[topic.message] if size is not None]
-    assert len(known) == len(sizes[topic.message]), f"{topic.message.name} needs the dtypes of its spaces"
-    return record_dtype(topic.message, *known)
+    given = [size for size in sizes[topic.message] if size is not None]
+    assert len(given) == len(sizes[topic.message]), f"{topic.message.name} needs the dtypes of its spaces"
+    return record_dtype(topic.message, *given)

@@ -109,9 +109,9 @@ def unified_diff(a: str | None, b: str | None, path: str) -> list[str]:
     names = ["/dev/null" if text is None else f"{side}/{path}" for side, text in (("A", a), ("B", b))]
     texts = [(text or "").split("\n") for text in (a, b)]
     lines = [[f"{line}\n" for line in text[:-1]] + [last for last in text[-1:] if last] for text in texts]
-    found = []
+    result = []
     for line in difflib.unified_diff(lines[0], lines[1], names[0], names[1]):
-        found.append(line.removesuffix("\n"))
+        result.append(line.removesuffix("\n"))
         if not line.endswith("\n"):
-            found.append("\\ No newline at end of file")
-    return found
+            result.append("\\ No newline at end of file")
+    return result

@@ -84,8 +84,8 @@ def check_extras(recording: Recording, phase: str, complete: bool, on_block: OnB
                 raise Inconsistent(f"{where}: {name}: found values where none were given")
         if steps in recording.dtypes and recording.has_messages(steps.name):
             parts = recording.blocks(steps, int(numbers[0]), last + 1)
-            found = np.concatenate([part["log_time"][np.isin(part["step"], numbers)] for part in parts])
-            if len(found) != len(block) or (found != block["log_time"]).any():
+            times = np.concatenate([part["log_time"][np.isin(part["step"], numbers)] for part in parts])
+            if len(times) != len(block) or (times != block["log_time"]).any():
                 raise Inconsistent(f"{where}: found other times than those of the steps")
 
 
@@ -134,7 +134,7 @@ class _Phase:
         if (wrong := np.flatnonzero(only_reset & ~was_reset)).size:
             raise self._wrong(b.first + wrong[0], "t", "that of a reset alone", "a reset before it")
         over = rows["terminated"] | rows["truncated"]
-        found = self._episodes.take(
+        episodes = self._episodes.take(
             Steps(
                 b.first,
                 rows["rewards"],
@@ -146,13 +146,13 @@ class _Phase:
                 self._counts(b),
             )
         )
-        self._compare(b.first, "t", rows["t"], found.t)
-        self._compare(b.first, "episode", rows["episode"], found.number)
+        self._compare(b.first, "t", rows["t"], episodes.t)
+        self._compare(b.first, "episode", rows["episode"], episodes.number)
         if b.resets is not None:
-            self._check_reset_episodes(b.resets, found.number[b.reset_at])
+            self._check_reset_episodes(b.resets, episodes.number[b.reset_at])
         self._check_observations(b, was_reset, only_reset)
         self._count_beginnings(b, was_reset, only_reset, np.vstack([self._over, over[:-1]]))
-        self._compare_episodes(found.ended)
+        self._compare_episodes(episodes.ended)
         self._over = over[-1]
         if self._has_states:
             self._observed = rows["next_state"][-1].astype(np.int64)
@@ -178,8 +178,8 @@ class _Phase:
                 given = observed.astype(np.int64).reshape(rows.shape) - self._start
             before = np.vstack([self._observed, after[:-1]])
             expected = np.where(was_reset & ~only_reset, given, before)
-            known = expected >= 0 if only_reset.any() else np.ones(rows.shape, np.bool_)
-            self._compare(b.first, "state", np.where(known, rows["state"], expected), expected)
+            is_known = expected >= 0 if only_reset.any() else np.ones(rows.shape, np.bool_)
+            self._compare(b.first, "state", np.where(is_known, rows["state"], expected), expected)
             self._compare(
                 b.first, "next_state", np.where(only_reset, after, 0), np.where(only_reset, given, 0)
             )

@@ -189,9 +189,9 @@ class Extras(Mapping[str, np.dtype[np.generic]]):
         for block in self.blocks(int(steps[0]), int(steps[-1]) + 1) if n else ():
             rows = np.minimum(np.searchsorted(steps, block["step"]), n - 1)
             wanted = steps[rows] == block["step"]
-            rows, found = rows[wanted], block[wanted]
-            for name in found["values"].dtype.names:
-                values[name][rows], given[name][rows] = found["values"][name], found["given"][name]
+            rows, chosen = rows[wanted], block[wanted]
+            for name in chosen["values"].dtype.names:
+                values[name][rows], given[name][rows] = chosen["values"][name], chosen["given"][name]
         return {
             name: np.ma.MaskedArray(each, np.broadcast_to(_column(~given[name], each.ndim), each.shape))
             for name, each in values.items()

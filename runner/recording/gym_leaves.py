@@ -167,14 +167,14 @@ class _Box(Kind[SpaceT]):
 
     def widened(self, space: SpaceT, value: object) -> Space:
         try:
-            found = np.asarray(value).dtype
+            dtype = np.asarray(value).dtype
         except (TypeError, ValueError):
             return space
-        if not isinstance(space, spaces.Box) or found.kind != "f" or found.itemsize > 8:
+        if not isinstance(space, spaces.Box) or dtype.kind != "f" or dtype.itemsize > 8:
             return space
-        if np.can_cast(found, space.dtype):
+        if np.can_cast(dtype, space.dtype):
             return space
-        return spaces.Box(space.low.astype(found), space.high.astype(found), dtype=found.type)
+        return spaces.Box(space.low.astype(dtype), space.high.astype(dtype), dtype=dtype.type)
 
     def can_widen(self, space: SpaceT) -> bool:
         return isinstance(space, spaces.Box) and not np.can_cast(np.float64, space.dtype)

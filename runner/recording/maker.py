@@ -186,10 +186,10 @@ class _Check:
 
     def labels_by_name(self, key: str) -> dict[str, tuple[str, ...]]:
         """Return such texts of an object by key; none if the object is missing, as in earlier recordings."""
-        found = self.values.get(key, {})
-        self.require(key, isinstance(found, Mapping) and len(found) <= MAX_NAMES)
-        own = _Check(found, self._where)
-        return {name: own.labels(name) for name in found}
+        by_name = self.values.get(key, {})
+        self.require(key, isinstance(by_name, Mapping) and len(by_name) <= MAX_NAMES)
+        own = _Check(by_name, self._where)
+        return {name: own.labels(name) for name in by_name}
 
     def versions(self, key: str) -> dict[str, str]:
         value = self.values.get(key)

@@ -231,11 +231,11 @@ class Recorder:
         self._pipeline.raise_failure()
         log_time = sum(self.steps.values()) * STEP_NANOSECONDS
         self.counts[topic.name] += 1
-        known = self._reference.compare_message(topic, log_time, payload)
+        is_recorded = self._reference.compare_message(topic, log_time, payload)
         records = memoryview(message_record(topic, log_time, payload))
         times = np.array([log_time], dtype=np.uint64)
-        self._pipeline.send(topic, records, times, np.zeros(1, np.uint64), write=not known)
-        return not known
+        self._pipeline.send(topic, records, times, np.zeros(1, np.uint64), write=not is_recorded)
+        return not is_recorded
 
     def append(self, topic: Topic, payload: bytes, position: int) -> None:
         """Record one message of variable size; arguments and errors as for `extend`."""
@@ -330,19 +330,19 @@ class Recorder:
             Diverged: a record differs from the one that the recording already holds.
         """
         lane, block = self._lanes[topic], self._open(topic)
-        known = self._reference.remaining(topic) > 0
+        has_reference = self._reference.remaining(topic) > 0
         fresh: Records = block.records[block.filled : block.filled + len(positions)]
         times = positions * np.uint64(STEP_NANOSECONDS)
         fresh["log_time"] = times
         fresh["publish_time"] = times
-        if known:
+        if has_reference:
             self._reference.compare_block(topic, fresh)
         else:
             self._reference.check_new(topic, fresh)
         block.filled += len(positions)
         self.counts[topic.name] += len(positions)
         self._watch(topic, fresh)
-        if known:
+        if has_reference:
             self._send_block(lane, write=False)
         elif block.filled == len(block.records) or (lane.span and lane.span.stop == self.counts[topic.name]):
             self._send_block(lane)

@@ -327,11 +327,11 @@ class DamagedFile:
                 yield opcode, offset, body
                 offset += RECORD_HEAD.size + length
                 continue
-            found = self._next_chunk(offset + 1)
-            if opcode == Opcode.CHUNK and found == self.size:
+            next_chunk = self._next_chunk(offset + 1)
+            if opcode == Opcode.CHUNK and next_chunk == self.size:
                 self.torn_chunk = self._read(offset + RECORD_HEAD.size, _LIKE_BYTES)
-            self.lost_bytes += found - offset
-            offset = found
+            self.lost_bytes += next_chunk - offset
+            offset = next_chunk
         self.lost_bytes += max(self.size - offset, 0)
 
     def _good_body(self, opcode: int, length: int, offset: int) -> bytes | None:

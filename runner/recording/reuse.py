@@ -44,8 +44,8 @@ class PackedChunks:
 
     def span(self, topic: Topic, number: int) -> ChunkSpan | None:
         """Return the chunk that holds a message of a fixed-width topic; None if there is none to use."""
-        found = self.recording.chunk_holding(topic, number)
-        return None if found is None or found.entry.end_time >= self.until else found
+        span = self.recording.chunk_holding(topic, number)
+        return None if span is None or span.entry.end_time >= self.until else span
 
     def data(self, entry: ChunkEntry, compression: str, records: bytes | memoryview) -> memoryview | None:
         """Return the packed data of a chunk if they are packed so, and unpack to these records.

@@ -50,10 +50,10 @@ class Checkpoints:
         Args:
             shapes: of the tables, in the order of a snapshot.
         """
-        for found in sorted((found for found in self._steps() if found <= step), reverse=True):
-            tables = self._load(found, shapes)
+        for at in sorted((at for at in self._steps() if at <= step), reverse=True):
+            tables = self._load(at, shapes)
             if tables is not None:
-                return found, tables
+                return at, tables
         return -1, []
 
     def save(self, step: int, tables: Sequence[NDArray[np.float64]]) -> None:

@@ -116,18 +116,18 @@ class Comparison:
     def _first_row(self, part: Part, recorded: Values) -> tuple[int, str] | None:
         """Return the first row that differs, and the first field of it that does; None if none does."""
         rows, results = part.rows, part.results
-        done, found = results.done, []
+        done, places = results.done, []
         for name in ("observations", "rewards", "terminated", "truncated"):
             was, got = getattr(recorded, name)[:done], getattr(results, name)[:done]
             if (row := first_differing_row(was, got, self._tolerance)) is not None:
-                found.append((row, name))
+                places.append((row, name))
         for name in ("agents_terminated", "agents_truncated"):
             got = getattr(results, name)[:done]
             if len(got) and (rows[name][:done] != got).any():
-                found.append((int(np.argmax(rows[name][:done] != got)), name))
+                places.append((int(np.argmax(rows[name][:done] != got)), name))
         if (wrong := self._first_digest(part)) is not None:
-            found.append((wrong, "digest"))
-        return min(found, key=lambda place: place[0]) if found else None
+            places.append((wrong, "digest"))
+        return min(places, key=lambda place: place[0]) if places else None
 
     def _first_digest(self, part: Part) -> int | None:
         """Return the first row at which the episode so far has another digest than was recorded."""

@@ -105,12 +105,12 @@ class Replay:
         rows, resets = own_steps(piece, environment, self._recording.environments)
         begin = 0
         if not self.is_known(phase, environment):
-            known = next((k for k, (_, reset) in enumerate(resets) if reset.is_known), None)
-            if known is None:
+            first = next((k for k, (_, reset) in enumerate(resets) if reset.is_known), None)
+            if first is None:
                 self.skipped += len(rows)
                 return
             self._known.add(self._key(phase, environment))
-            begin, resets = resets[known][0], resets[known:]
+            begin, resets = resets[first][0], resets[first:]
             self.skipped += begin * width
         stepper = self.stepper(phase, environment)
         stepper.draws, first_drawn = False, 0
@@ -182,8 +182,8 @@ class Replay:
             except (CannotRedo, MemoryError):
                 raise
             except Exception as error:  # foreign code raises anything
-                found = f"{type(error).__name__}: {error}"
-                raise CannotRedo(f"The environment cannot be used: {found}") from error
+                reason = f"{type(error).__name__}: {error}"
+                raise CannotRedo(f"The environment cannot be used: {reason}") from error
             self._steppers[key] = stepper
         return self._steppers[key]
 

@@ -108,9 +108,9 @@ def redo_in_child(
         CannotRedo: see `redo`; or the environment hangs, crashes, or needs more memory.
     """
     options = {"render": render, "trust": trust, "draw_from": draw_from}
-    for found in stream_from_child(_redo_path, path, phase, episodes, **options):
-        if isinstance(found, RedoneSteps):  # else steps taken, which show that it does not hang
-            yield found
+    for message in stream_from_child(_redo_path, path, phase, episodes, **options):
+        if isinstance(message, RedoneSteps):  # else steps taken, which show that it does not hang
+            yield message
 
 
 def stream_from_child(

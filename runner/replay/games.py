@@ -50,13 +50,13 @@ class Turns:
 
     def observation_space(self, agent: object) -> Space:
         """Return the space of an agent's observations."""
-        found: Space = self.env.observation_space(agent)
-        return found
+        space: Space = self.env.observation_space(agent)
+        return space
 
     def action_space(self, agent: object) -> Space:
         """Return the space of an agent's actions."""
-        found: Space = self.env.action_space(agent)
-        return found
+        space: Space = self.env.action_space(agent)
+        return space
 
     @property
     def agents(self) -> list[object]:
@@ -143,13 +143,13 @@ class MultiAgent:
 
     def observation_space(self, agent: object) -> Space:
         """Return the space of an agent's observations."""
-        found: Space = self.unwrapped.get_observation_space(agent)
-        return found
+        space: Space = self.unwrapped.get_observation_space(agent)
+        return space
 
     def action_space(self, agent: object) -> Space:
         """Return the space of an agent's actions."""
-        found: Space = self.unwrapped.get_action_space(agent)
-        return found
+        space: Space = self.unwrapped.get_action_space(agent)
+        return space
 
     def reset(self, **arguments: object) -> tuple[ByAgent, ByAgent]:
         """Begin a game; return the observations and infos of the agents that act next."""

@@ -159,9 +159,9 @@ def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Env:
         creator = gymnasium.envs.registration.load_env_creator(spec.entry_point)
         modes = (getattr(creator, "metadata", None) or {}).get("render_modes", ())
         if "rgb_array" not in modes:
-            found = ", ".join(map(str, modes)) or "none"
+            names = ", ".join(map(str, modes)) or "none"
             raise CannotRedo(
-                f"{spec.id} draws no pictures: its render modes are {found}; rgb_array is needed."
+                f"{spec.id} draws no pictures: its render modes are {names}; rgb_array is needed."
             )
         kwargs["render_mode"] = "rgb_array"
     elif kwargs.get("render_mode") not in (None, "rgb_array"):
@@ -264,10 +264,10 @@ def _wrapper(entry_point: str, base: type) -> Any:
 def _attribute(name: str) -> Any:
     """Return the object that `module:attribute` names; the module is imported."""
     module, _, path = name.partition(":")
-    found: Any = importlib.import_module(module)
+    value: Any = importlib.import_module(module)
     for part in path.split("."):
-        found = getattr(found, part)
-    return found
+        value = getattr(value, part)
+    return value
 
 
 def _name_of(entry_point: str | Callable[..., object] | None) -> str:

@@ -164,8 +164,8 @@ def _extras(
         if not info["reset"] or '"reset": {' not in info["json"]:
             continue
         try:
-            found = json.loads(info["json"])["reset"]
-            options, seed = found.get("options"), found.get("seed", {}).get("value", "")
+            reset = json.loads(info["json"])["reset"]
+            options, seed = reset.get("options"), reset.get("seed", {}).get("value", "")
         except (ValueError, RecursionError, LookupError, TypeError, AttributeError):
             continue  # not of a recorder
         is_number = isinstance(seed, str) and seed.isdecimal() and len(seed) < 100

@@ -94,10 +94,10 @@ class RedoneSteps:
     def since(self, step: int) -> RedoneSteps:
         """Return what came from a step of the phase on."""
         at = int(np.searchsorted(self.step, step))
-        kept = {name: getattr(self, name)[at:] for name in ("step", "episode", "t", "actions", "frames")}
+        rest = {name: getattr(self, name)[at:] for name in ("step", "episode", "t", "actions", "frames")}
         starts = tuple(start._replace(row=start.row - at) for start in self.starts if start.row >= at)
         recorded, got = (values.part(slice(at, None)) for values in (self.recorded, self.got))
-        return replace(self, **kept, recorded=recorded, got=got, starts=starts)
+        return replace(self, **rest, recorded=recorded, got=got, starts=starts)
 
     def without_rows(self) -> RedoneSteps:
         """Return the difference alone: it is in an episode before the requested one."""

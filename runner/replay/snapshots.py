@@ -54,8 +54,8 @@ class DerivedTables(Generic[S]):
     def at(self, step: int, table: int) -> NDArray[np.float64] | None:
         """Return a table after `step` training steps, a view; None if the steps do not determine it."""
         tables = self._replay.snapshot()
-        known = self._known and step == self._replay.step and 0 <= table < len(tables)
-        return tables[table] if known else None
+        is_here = self._known and step == self._replay.step and 0 <= table < len(tables)
+        return tables[table] if is_here else None
 
     def give(self, step: int, table: int, values: NDArray[np.float64]) -> None:
         """Set a table to its recorded values; once all tables of a step are set, they are known again."""

@@ -91,14 +91,14 @@ def _wrappers_of(values: object, owner: str) -> tuple[Wrapper, ...]:
     Raises:
         CannotRedo: one lacks its name, entry point or arguments.
     """
-    found = []
+    wrappers = []
     for value in values if isinstance(values, list) else [None]:
         own = value if isinstance(value, Mapping) else {}
         name, entry_point, kwargs = own.get("name"), own.get("entry_point"), own.get("kwargs")
         if not isinstance(name, str) or not isinstance(entry_point, str) or not isinstance(kwargs, dict):
             raise CannotRedo(f"A wrapper of {owner} does not state its class and arguments.")
-        found.append((name, entry_point, kwargs))
-    return tuple(found)
+        wrappers.append((name, entry_point, kwargs))
+    return tuple(wrappers)
 
 
 def parse_game(text: str) -> tuple[str, str, dict[str, object]]:
@@ -179,10 +179,10 @@ def why_not_imported(module: str, trust: bool) -> str:
     if not trust and root not in {*PACKAGES, *_plug_ins()} and path not in MODULES:
         return f"The environment needs {module}, which is not a known package of environments. {TRUST}"
     try:
-        found = root in sys.modules or importlib.util.find_spec(root) is not None
+        exists = root in sys.modules or importlib.util.find_spec(root) is not None
     except (ImportError, ValueError):
-        found = False
-    if found:
+        exists = False
+    if exists:
         return ""
     hint = (
         " If it is a file of yours, run the command in its folder, or put that into PYTHONPATH."
@@ -195,5 +195,5 @@ def why_not_imported(module: str, trust: bool) -> str:
 @cache
 def _plug_ins() -> frozenset[str]:
     """Return the installed packages that register themselves with Gymnasium, which imports them anyway."""
-    found = importlib.metadata.entry_points(group="gymnasium.envs")
-    return frozenset(each.value.partition(":")[0].partition(".")[0] for each in found)
+    entries = importlib.metadata.entry_points(group="gymnasium.envs")
+    return frozenset(each.value.partition(":")[0].partition(".")[0] for each in entries)

@@ -152,13 +152,13 @@ class StepReplay:
         Args:
             watch: `begin_watch` was called with it at `step`, or this method for the steps before.
         """
-        found = [(empty_changes(watch, 0), 0)]
+        parts = [(empty_changes(watch, 0), 0)]
         for state, part in self._segments(steps):
             changes = empty_changes(watch, part.stop - part.start)
             filled = replay_watched(*state, steps[part].view(np.recarray), NO_ROWS, watch, changes)
             changes.row[:filled] += part.start
-            found.append((changes, filled))
-        return joined(found)
+            parts.append((changes, filled))
+        return joined(parts)
 
     def _segments(self, steps: NDArray[np.void]) -> Iterator[tuple[tuple[Any, ...], slice]]:
         """Yield the kernel's arguments for the parts of a block in order, and move forward after each."""

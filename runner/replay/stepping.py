@@ -101,9 +101,9 @@ class Stepper(ABC):
         self._learners = len(recording.agents)
         topics = [recording.topic(f"/train/{name}") for name in ("step", "reset")]
         fields = "next_state" if recording.kind == "step" else "next_observation", "observation"
-        found, known = zip(topics, fields, strict=True), recording.dtypes
+        places, dtypes = zip(topics, fields, strict=True), recording.dtypes
         varying = np.dtype(object)
-        self.dtypes = Dtypes(*(known[topic][name] if topic in known else varying for topic, name in found))
+        self.dtypes = Dtypes(*(dtypes[topic][name] if topic in dtypes else varying for topic, name in places))
 
     @abstractmethod
     def _spaces(self) -> tuple[Space, Space]:

@@ -59,14 +59,14 @@ def episode_blocks(recording: Recording, phase: str, episode: int) -> Iterator[N
     if recording.has_actions_alone(phase):
         yield whole_steps(recording, phase, episode)
         return
-    found = 0
+    count = 0
     for block in recording.blocks(topic, numbers.start, numbers.stop):
         steps = block[(numbers.start - int(block["step"][0])) % numbers.step :: numbers.step]
-        found += len(steps)
+        count += len(steps)
         yield steps
-    if found != len(numbers):
+    if count != len(numbers):
         raise RecordingError(
-            f"{recording.path}: {len(numbers) - found:,} of the {len(numbers):,} steps of "
+            f"{recording.path}: {len(numbers) - count:,} of the {len(numbers):,} steps of "
             f"{schema.PHASE_NAMES[phase]} episode {episode} were lost."
         )
 
@@ -99,11 +99,11 @@ def reset_of(recording: Recording, phase: str, episode: int) -> Any | None:
         recording.first_from(topic, "step", number)
         for number in (numbers.start - 2 * numbers.step, numbers.start + 1)
     )
-    found = None
+    latest = None
     for block in recording.blocks(topic, first, stop):
         own = block[block["environment"] % numbers.step == numbers.start % numbers.step]
-        found = own[-1] if len(own) else found
-    return found
+        latest = own[-1] if len(own) else latest
+    return latest
 
 
 def recorded_frames(recording: Recording, phase: str, episode: int, start: int = 0) -> Iterator[Message]:

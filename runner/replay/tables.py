@@ -160,17 +160,17 @@ def known_steps(recording: Recording) -> list[tuple[int, int]]:
     """
     lost = sorted((start, stop) for start, stop in recording.lost.get(schema.TRAIN_STEP.name, []))
     recorded = recording.count(schema.TRAIN_STEP)
-    found: list[tuple[int, int]] = []
+    spans: list[tuple[int, int]] = []
     tables = len(recording.agents) * len(kinds_of(from_mapping(recording.config)))
     counts = Counter(snapshot.step for snapshot in recording.snapshots(0, tables))
     for first in sorted(step for step, count in counts.items() if count == tables):
         reach = next((start for start, stop in lost if stop > first), recorded)
         last = max(first, min(reach, recorded))
-        if found and first <= found[-1][1] + 1:
-            found[-1] = found[-1][0], max(found[-1][1], last)
+        if spans and first <= spans[-1][1] + 1:
+            spans[-1] = spans[-1][0], max(spans[-1][1], last)
         else:
-            found.append((first, last))
-    return found
+            spans.append((first, last))
+    return spans
 
 
 def tables_before_training(recording: Recording) -> list[NamedTables] | None:

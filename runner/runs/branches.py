@@ -77,8 +77,8 @@ Origin = BranchOrigin | TrainingOrigin
 def training_branches(config: Mapping[str, object]) -> list[TrainingOrigin]:
     """Return the branches that led to the job with this configuration, the first one first."""
     branches = config.get("branches")
-    found = map(parse_origin, branches) if isinstance(branches, list) else ()
-    return [origin for origin in found if isinstance(origin, TrainingOrigin)]
+    origins = map(parse_origin, branches) if isinstance(branches, list) else ()
+    return [origin for origin in origins if isinstance(origin, TrainingOrigin)]
 
 
 def origin_in(config: Mapping[str, object]) -> Origin | None:

@@ -160,7 +160,7 @@ def read_checkpoints(recording: Recording, recordings: Path) -> list[Checkpoint]
     if schema.CHECKPOINT_TOPIC not in recording.topics:
         return []
     store = Store(recordings)
-    found: list[Checkpoint] = []
+    checkpoints: list[Checkpoint] = []
     for fields in recording.decoded(schema.CHECKPOINT_TOPIC, _MAX_MESSAGE):
         if not (
             DIGEST.fullmatch(fields["digest"])
@@ -170,11 +170,11 @@ def read_checkpoints(recording: Recording, recordings: Path) -> list[Checkpoint]
             and fields["format"] in FORMATS
         ):
             raise RecordingError(f"{recording.path}: found an invalid checkpoint at {fields['log_time']} ns.")
-        if len(found) == MAX_CHECKPOINTS:
+        if len(checkpoints) == MAX_CHECKPOINTS:
             raise RecordingError(f"{recording.path}: has more than {MAX_CHECKPOINTS:,} checkpoints.")
         values = {key: value for key, value in fields.items() if key != "log_time"}
-        found.append(Checkpoint(**values, path=store.path(fields["digest"])))
-    return found
+        checkpoints.append(Checkpoint(**values, path=store.path(fields["digest"])))
+    return checkpoints
 
 
 def find_checkpoint(every: Sequence[Checkpoint], reference: str, where: str) -> Checkpoint:
@@ -191,14 +191,14 @@ def find_checkpoint(every: Sequence[Checkpoint], reference: str, where: str) -> 
         raise RunNotFound(
             f"checkpoint {reference!r}: found the step {step!r}, expected a number: {name}@20000."
         )
-    found = [one for one in every if one.phase == "train"] or every
-    found = [one for one in found if not name or one.name == name]
+    candidates = [one for one in every if one.phase == "train"] or every
+    candidates = [one for one in candidates if not name or one.name == name]
     if step and step != "latest":
-        found = [one for one in found if one.step <= int(step)]
-    if found:
-        return found[-1]
-    known = ", ".join(one.reference for one in every[:20]) or "none; rec.checkpoint(...) records one"
-    raise RunNotFound(f"{where} has no checkpoint {reference!r}; it has: {known}.")
+        candidates = [one for one in candidates if one.step <= int(step)]
+    if candidates:
+        return candidates[-1]
+    available = ", ".join(one.reference for one in every[:20]) or "none; rec.checkpoint(...) records one"
+    raise RunNotFound(f"{where} has no checkpoint {reference!r}; it has: {available}.")
 
 
 def arrays_in(data: bytes, where: str) -> dict[str, Array]:

@@ -140,8 +140,8 @@ class CodeCollector:
 
     def made_by(self, run: Run) -> dict[str, str]:
         """Return the provenance in `run.json`, with the commit if it is known."""
-        found = run.facts.get("provenance")  # of a resumed run, whose file may hold anything
-        own = found.items() if isinstance(found, dict) else ()
+        provenance = run.facts.get("provenance")  # of a resumed run, whose file may hold anything
+        own = provenance.items() if isinstance(provenance, dict) else ()
         return {key: text for key, text in own if isinstance(text, str)} | {
             key: self.entries[key] for key in ("git",) if key in self.entries
         }
@@ -157,20 +157,20 @@ class CodeCollector:
             return
         if wait and self._found is None:
             self._thread.join(max(0.0, self._deadline - time.monotonic()))
-        found = self._found
-        if found is None:
+        code = self._found
+        if code is None:
             if not wait:
                 return
             entries = {"code.not_recorded": f"reading it took more than {WAIT_SECONDS:g} s"}
             if commit := _recent.commit(self._folder, self._deadline - WAIT_SECONDS):
                 missing = f"what differs from the commit: reading it took more than {WAIT_SECONDS:g} s"
                 entries |= commit | {"git.not_recorded": missing}
-            found = RecordedCode(entries)
+            code = RecordedCode(entries)
         try:
-            file.add_metadata(CODE_RECORD, found.entries)
-            self.entries = found.entries  # from here on it is not tried again
-            if found.attachment:
-                file.add_attachment(CODE_ATTACHMENT, "application/zstd", found.attachment)
+            file.add_metadata(CODE_RECORD, code.entries)
+            self.entries = code.entries  # from here on it is not tried again
+            if code.attachment:
+                file.add_attachment(CODE_ATTACHMENT, "application/zstd", code.attachment)
         except OSError as error:
             file.cut_back()
             raise storage_error(file, error) from error
@@ -208,8 +208,8 @@ class _Recent:
         """Return the code of this process, read now or a few seconds ago."""
         folder, script, key = self.place(cells)
         with self.lock:
-            if (found := self.fresh(cells, recordings)) is not None:
-                return found
+            if (recent := self.fresh(cells, recordings)) is not None:
+                return recent
 
             def note(commit: dict[str, str]) -> None:
                 self._commit = folder, time.monotonic(), commit
@@ -311,7 +311,7 @@ def _named(left_out: list[str]) -> str:
 
 def _fitting_patch(repository: Repository, sources: _Sources) -> str:
     """Return the parts of the patch that fit, and note the others as left out."""
-    kept = []
+    fitting = []
     for path, part in patch_parts(repository.patch).items():
         limit = min(sources.budget, MAX_FILE_BYTES)
         is_short = len(part) <= limit  # redaction takes seconds for megabytes
@@ -320,9 +320,9 @@ def _fitting_patch(repository: Repository, sources: _Sources) -> str:
         if size > limit:
             sources.left_out.append(f"the changes of {path} ({size:,} bytes)")
         else:
-            kept.append(shown)
+            fitting.append(shown)
             sources.budget -= size
-    return "".join(kept)
+    return "".join(fitting)
 
 
 def user_script() -> Path | None:

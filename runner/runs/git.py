@@ -111,8 +111,8 @@ def read_repository(
             (repository.untracked if entry[:2] == "??" else repository.changed).append(entry[3:])
         if paths := used(root):
             text = git.run("ls-files", "-z", "--", *(f":(literal){path}" for path in paths))
-            known = {*text.split("\0"), *repository.untracked}
-            repository.untracked += [path for path in paths if path not in known]
+            tracked = {*text.split("\0"), *repository.untracked}
+            repository.untracked += [path for path in paths if path not in tracked]
         if repository.commit and repository.changed:
             options = ("--no-color", "--no-ext-diff", "--no-textconv", "-U3", "--no-renames", "HEAD", "--")
             repository.patch = git.run("diff", _IGNORE_SUBMODULES, *options, limit=MAX_PATCH_BYTES)

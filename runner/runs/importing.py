@@ -99,8 +99,8 @@ def import_recording(
         contents = [checkpoint.digest for checkpoint in read_checkpoints(opened, recordings)]
     if not finished and not is_merely_cut_off(recording):
         raise RecordingError(f"{recording}: is damaged, not merely cut off; `dualtaxi repair` repairs it.")
-    found = record.get("labels")
-    labels = labels_from(found) if isinstance(found, dict) else Labels()
+    own_labels = record.get("labels")
+    labels = labels_from(own_labels) if isinstance(own_labels, dict) else Labels()
     digest, anonymous = content_of(recording), exported.get("anonymous") is True
     if as_new:
         facts["run_id"] = new_run_id(recordings)
@@ -164,10 +164,10 @@ def _export_record(recording: Recording) -> dict[str, object]:
     if EXPORT_RECORD not in recording.metadata_names:
         return {}
     try:
-        found = json.loads(recording.metadata(EXPORT_RECORD)["json"])
+        entries = json.loads(recording.metadata(EXPORT_RECORD)["json"])
     except (KeyError, ValueError, RecursionError) as error:
         raise RecordingError(f"{recording.path}: the metadata {EXPORT_RECORD!r} is not JSON.") from error
-    return found if isinstance(found, dict) else {}
+    return entries if isinstance(entries, dict) else {}
 
 
 def checked_facts(recording: Recording, details: JsonView) -> Json:
@@ -201,10 +201,10 @@ def _existing_run(target: Path) -> Run | None:
     Raises:
         StorageError: something that is not a run has the folder's name.
     """
-    found = run_with_id(target.name, target.parent)
-    if found is None and os.path.lexists(target):
+    run = run_with_id(target.name, target.parent)
+    if run is None and os.path.lexists(target):
         raise StorageError(f"{target}: exists and is not a run; move it away.")
-    return found
+    return run
 
 
 def _has_content(run: Run, content_digest: str) -> bool:
@@ -253,8 +253,8 @@ def _finish(run: Run, facts: Mapping[str, object]) -> Run:
 
 def _with_facts(run: Run, facts: Mapping[str, object]) -> Run:
     """Replace the facts on the recording in `run.json`; keep those on its folder."""
-    kept = {key: value for key, value in run.facts.items() if key not in ("owner", "proof", "summary")}
-    write_object(run.folder / RUN_FILE, kept | dict(facts))
+    own_facts = {key: value for key, value in run.facts.items() if key not in ("owner", "proof", "summary")}
+    write_object(run.folder / RUN_FILE, own_facts | dict(facts))
     return run_at(run.folder)
 
 

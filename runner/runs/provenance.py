@@ -118,16 +118,16 @@ def _packages() -> dict[str, str]:
     They are read from the names of their folders: `importlib.metadata` parses each one's metadata, which
     takes a hundred times as long.
     """
-    found: dict[str, str] = {}
+    versions: dict[str, str] = {}
     for folder in sys.path:
         with contextlib.suppress(OSError):
             for entry in sorted(path.name for path in Path(folder or ".").iterdir()):
                 if match := _INSTALLED.fullmatch(as_utf8(entry)):
-                    found.setdefault(f"package.{_normalised(match['name'])}", match["version"])
+                    versions.setdefault(f"package.{_normalised(match['name'])}", match["version"])
                 elif entry.endswith(".egg-info"):
                     for one in distributions(path=[folder]):
-                        found.setdefault(as_utf8(f"package.{_normalised(one.name)}"), as_utf8(one.version))
-    return dict(sorted(found.items()))
+                        versions.setdefault(as_utf8(f"package.{_normalised(one.name)}"), as_utf8(one.version))
+    return dict(sorted(versions.items()))
 
 
 def _normalised(name: str) -> str:

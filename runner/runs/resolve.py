@@ -68,8 +68,8 @@ def run_of_id(run_id: str, recordings: Path) -> Run | None:
     """
     if not RUN_ID.fullmatch(run_id) or not run_id.strip("."):
         return None
-    found = (run_in(folder / run_id) for folder in (recordings, recordings / UNLISTED))
-    return next((run for run in found if run and run.run_id == run_id), None)
+    runs = (run_in(folder / run_id) for folder in (recordings, recordings / UNLISTED))
+    return next((run for run in runs if run and run.run_id == run_id), None)
 
 
 def find_runs(name: str, recordings: Path, report: Report = lambda _: None) -> list[Run]:
@@ -81,15 +81,15 @@ def find_runs(name: str, recordings: Path, report: Report = lambda _: None) -> l
     from runner.runs.catalogue.index import look
 
     runs = look([recordings], lambda index: of_name(name, index), report, quick=True)
-    return [found.run() for found in runs] or [find_run(name, recordings, report=report)]
+    return [candidate.run() for candidate in runs] or [find_run(name, recordings, report=report)]
 
 
 def run_with_id(run_id: str, recordings: Path) -> Run | None:
     """Return the run with an id, whatever its folder is called; None if there is none."""
     from runner.runs.catalogue.index import look
 
-    found = look([recordings], lambda index: matching(run_id, index), quick=True)
-    place = next((Path(run.root, run.entry) for run in found if run.run_id == run_id), None)
+    candidates = look([recordings], lambda index: matching(run_id, index), quick=True)
+    place = next((Path(run.root, run.entry) for run in candidates if run.run_id == run_id), None)
     return run_in(place) if place else None
 
 
@@ -100,8 +100,8 @@ def matching(name: str, index: Index, exclude: str = "") -> list[Candidate]:
     newest = []
     if name.endswith(LATEST):
         newest = index.newest(name.removesuffix(LATEST), 2 if exclude else 1)
-    found = [run for run in newest or index.named(name) if run.run_id != exclude]
-    return found[:1] if newest else found
+    candidates = [run for run in newest or index.named(name) if run.run_id != exclude]
+    return candidates[:1] if newest else candidates
 
 
 def of_name(name: str, index: Index) -> list[Candidate]:
@@ -119,9 +119,9 @@ def choose(name: str, candidates: Sequence[Candidate]) -> Candidate:
     """
     exact = [run for run in candidates if run.run_id == name]
     named = [run for run in candidates if run.name == name]
-    for found in (exact, named, candidates):
-        if len(found) == 1:
-            return found[0]
+    for group in (exact, named, candidates):
+        if len(group) == 1:
+            return group[0]
     listed = [
         f"  {run.run_id}  {run_title(run.name, run.seed)}  {run.created:%Y-%m-%d %H:%M} UTC"
         for run in candidates[:_MAX_LISTED]
@@ -160,14 +160,14 @@ def completions(beginning: str, recordings: Path) -> dict[str, str]:
     from runner.runs.catalogue.index import look
 
     def work(index: Index) -> dict[str, str]:
-        found = {LATEST: "the newest run"} if index.newest() else {}
-        found |= {run.run_id: run_title(run.name, run.seed) for run in index.with_id_prefix(beginning)}
+        meanings = {LATEST: "the newest run"} if index.newest() else {}
+        meanings |= {run.run_id: run_title(run.name, run.seed) for run in index.with_id_prefix(beginning)}
         for name, count in index.names_from(beginning.rpartition("@")[0] or beginning):
             if count == 1:
-                found[name] = "the run of this name"
+                meanings[name] = "the run of this name"
             else:
-                found[f"{name}{LATEST}"] = "the newest of this name"
-        return {text: meaning for text, meaning in found.items() if text.startswith(beginning)}
+                meanings[f"{name}{LATEST}"] = "the newest of this name"
+        return {text: meaning for text, meaning in meanings.items() if text.startswith(beginning)}
 
     return look([recordings], work, quick=True)
 

@@ -101,8 +101,8 @@ def shards_of(run: Run) -> list[Run]:
     folder = run.folder / SHARDS_FOLDER
     if run.stands_alone or not folder.is_dir():
         return []
-    found = (run_in(folder / entry) for entry in run_entries(folder))
-    return sorted((shard for shard in found if shard is not None), key=lambda shard: _order(shard.run_id))
+    shards = (run_in(folder / entry) for entry in run_entries(folder))
+    return sorted((shard for shard in shards if shard is not None), key=lambda shard: _order(shard.run_id))
 
 
 def _order(name: str) -> list[tuple[int, str]]:

@@ -102,8 +102,8 @@ class Store:
                     self._refer(run, digests)
 
     def _refer(self, run: str, digests: Iterable[str]) -> None:
-        known = set(self.of_run(run))
-        if fresh := [digest for digest in dict.fromkeys(digests) if digest not in known]:
+        own = set(self.of_run(run))
+        if fresh := [digest for digest in dict.fromkeys(digests) if digest not in own]:
             path = self._folder / "runs" / run
             path.parent.mkdir(parents=True, exist_ok=True)
             with path.open("a", encoding="ascii") as stream:
@@ -128,12 +128,12 @@ class Store:
     def sizes(self) -> dict[str, int]:
         """Return the bytes of the contents by run; what several runs share counts for the first of them."""
         seen: set[str] = set()
-        found = {}
+        by_run = {}
         for run in self.runs():
             own = [digest for digest in self.of_run(run) if digest not in seen]
             seen.update(own)
-            found[run] = sum(map(self._size, own))
-        return found
+            by_run[run] = sum(map(self._size, own))
+        return by_run
 
     def only_of(self, runs: Iterable[str]) -> dict[str, int]:
         """Return the contents that only these runs refer to, with their bytes."""

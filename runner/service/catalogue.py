@@ -94,9 +94,9 @@ class Catalogue:
         """Return the run with an id, the beginning of one, a name or `@latest`; never by a path."""
         _refuse_path(name)
         for root in self.roots:
-            known = run_of_id(name, root)
-            if known is not None:
-                return known
+            run = run_of_id(name, root)
+            if run is not None:
+                return run
         candidates = self.read(lambda index: matching(name, index))
         if len(candidates) != 1:  # it may be newer than the last scan
             candidates = look(self.roots, lambda index: matching(name, index), self._log)
@@ -108,7 +108,7 @@ class Catalogue:
         """Return all runs of a name, the oldest first; else the run that `find` returns."""
         _refuse_path(name)
         alike = self.read(lambda index: of_name(name, index))
-        return [found.run() for found in alike] or [self.find(name)]
+        return [candidate.run() for candidate in alike] or [self.find(name)]
 
     def _is_current(self, now: Version) -> bool:
         """Return whether a recent scan has updated the index."""

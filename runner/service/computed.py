@@ -144,20 +144,20 @@ def curves(
                 shown += [
                     _shown_curve(panel, curve, start, stop, points, lines, memory) for curve in panel.curves
                 ]
-    found = Curves(
+    result = Curves(
         axis,
         [AxisInfo(each.name, each.title, each.label) for each in common],
         [CurveGroup(group.label, [run.run_id for run in group.runs], group.left_out) for group in groups],
         shown,
     )
-    return as_json(found)
+    return as_json(result)
 
 
 def run_histograms(path: Path, axis: str) -> bytes:
     """Return the histograms of a run's training over an axis, as JSON."""
     with open_recording(path) as recording:
-        found, notes = histograms(recording, axis_of(axis))
-        return as_json({"run_id": recording.run_id, "histograms": found, "notes": notes})
+        result, notes = histograms(recording, axis_of(axis))
+        return as_json({"run_id": recording.run_id, "histograms": result, "notes": notes})
 
 
 def _shown_curve(
@@ -187,16 +187,16 @@ def records(path: Path, kind: RecordKind, start: int, stop: int, limit: int) -> 
     """Return evaluations, reports of training or exact measures from `start` to before `stop`, as JSON."""
     with open_recording(path) as recording:
         if kind == "optimality":
-            found = list(recording.optimality())
+            everything = list(recording.optimality())
         elif kind == "evaluations":
-            found = [each.as_json() for each in evaluation_records(recording)]
+            everything = [each.as_json() for each in evaluation_records(recording)]
         else:
             recording.require_job("a report of training", "Its metrics can be had all the same.")
-            found = [each.as_json() for each in training_records(recording)]
-        shown = found[start:stop]
+            everything = [each.as_json() for each in training_records(recording)]
+        shown = everything[start:stop]
         if len(shown) > limit:
             raise too_many(len(shown), limit)
-        page = {"run_id": recording.run_id, "start": start, "total": len(found), "records": shown}
+        page = {"run_id": recording.run_id, "start": start, "total": len(everything), "records": shown}
         return as_json(page)
 
 
@@ -216,10 +216,10 @@ def thinned(values: NDArray[np.float64], points: int) -> NDArray[np.intp]:
     if points == 0 or len(values) <= points:
         return np.arange(len(values))
     sections = np.array_split(np.arange(len(values)), max(points // 2, 1))
-    known = np.where(np.isnan(values), np.inf, values)
-    lowest = [part[np.argmin(known[part])] for part in sections]
-    known = np.where(np.isnan(values), -np.inf, values)
-    highest = [part[np.argmax(known[part])] for part in sections]
+    comparable = np.where(np.isnan(values), np.inf, values)
+    lowest = [part[np.argmin(comparable[part])] for part in sections]
+    comparable = np.where(np.isnan(values), -np.inf, values)
+    highest = [part[np.argmax(comparable[part])] for part in sections]
     return np.unique([*lowest, *highest])
 
 
@@ -275,9 +275,9 @@ def difference(a: Run, b: Run, ignore: Sequence[str], first: bool, targets: Sequ
     """Return the differences between two runs, as `dualtaxi diff --json` prints them."""
     levels = dict(parse_target(target) for target in targets)
     with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
-        found = differences.diff(ours, theirs, levels, first)
-    found = found if first else differences.with_seconds(found, a, b)
-    return as_json(differences.as_json(differences.without_ignored(found, ignore)))
+        result = differences.diff(ours, theirs, levels, first)
+    result = result if first else differences.with_seconds(result, a, b)
+    return as_json(differences.as_json(differences.without_ignored(result, ignore)))
 
 
 def comparison(

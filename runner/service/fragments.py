@@ -143,19 +143,19 @@ def what_if_page(run: Run, at: StepRef, action: str | None, start: int, steps: i
         return f"/runs/{run.run_id}/what-if/{at}/{number}"
 
     with open_recording(run.recording) as recording:
-        found = what_if_in(recording, at)
-        number = next(row.action for row in found.actions if row.is_recorded)
+        branches = what_if_in(recording, at)
+        number = next(row.action for row in branches.actions if row.is_recorded)
         if action is not None:
             number = joint_action(recording.mdp, action)
         shown = ShownBranches(
-            facts=found.facts,
-            notes=found.notes,
+            facts=branches.facts,
+            notes=branches.notes,
             action=number,
             name=str(actions_in_words(recording.mdp)[number]),
-            picture=found.picture(style=""),
-            matrix=found.matrix(address),
-            grid=found.grid,
-            addresses=[address(row.action) for row in found.actions],
+            picture=branches.picture(style=""),
+            matrix=branches.matrix(address),
+            grid=branches.grid,
+            addresses=[address(row.action) for row in branches.actions],
             part=_branch_part(recording, at, str(number), start, steps),
         )
         return as_json(shown)
@@ -166,9 +166,9 @@ def when(
 ) -> bytes:
     """Return `ShownWhen` as JSON, with at most some intervals."""
     with open_recording(path) as recording:
-        found = when_in(recording, expression, every, first, last, limit=intervals)
-    replays = [each.start.at.replay_address(found.run_id) for each in found.intervals]
-    return as_json(ShownWhen(section_of(found), replays))
+        result = when_in(recording, expression, every, first, last, limit=intervals)
+    replays = [each.start.at.replay_address(result.run_id) for each in result.intervals]
+    return as_json(ShownWhen(section_of(result), replays))
 
 
 def why(
@@ -221,22 +221,22 @@ def maps(path: Path) -> bytes:
 def distributions(path: Path, axis: str) -> bytes:
     """Return the histograms of a run's training over an axis, as HTML."""
     with open_recording(path) as recording:
-        found, notes = histograms(recording, axis_of(axis))
-    if not found:
+        result, notes = histograms(recording, axis_of(axis))
+    if not result:
         return b""
     text = " ".join([EXPLANATION, *notes])
-    return str(partials().charts("distributions", "Distributions", text, heatmap_plots(found))).encode()
+    return str(partials().charts("distributions", "Distributions", text, heatmap_plots(result))).encode()
 
 
 def tasks(paths: Sequence[Path], axis: str, scores: str) -> bytes:
     """Return the comparison of runs over environments as HTML; `scores` is a table as CSV, or empty."""
     table = parse_table(scores, TABLE_NAME) if scores.strip() else None
-    found = compare_algorithms(series_of(paths, axis_of(axis)), table)
+    comparison = compare_algorithms(series_of(paths, axis_of(axis)), table)
     shown = partials()
-    plots = [Plot(chart.title, chart.svg(), False) for chart in task_charts(found)]
-    html = [shown.charts("tasks", "Normalised scores", TASKS_EXPLANATION, plots, tasks_legend(found))]
+    plots = [Plot(chart.title, chart.svg(), False) for chart in task_charts(comparison)]
+    html = [shown.charts("tasks", "Normalised scores", TASKS_EXPLANATION, plots, tasks_legend(comparison))]
     html += [
-        shown.section(f"tasks-{i}", each.title, each) for i, each in enumerate(task_sections(found)[:-1])
+        shown.section(f"tasks-{i}", each.title, each) for i, each in enumerate(task_sections(comparison)[:-1])
     ]
     return "".join(html).encode()
 
@@ -297,11 +297,11 @@ def console(path: Path, sought: str, stream: str) -> bytes:
     with open_recording(path) as recording:
         clock = read_clock(recording)
         every = read_console(recording, clock)
-    found = [
+    matching = [
         line for line in every if sought.casefold() in line.text.casefold() and stream in ("", line.stream)
     ]
-    lines = [(line.seconds, line.position, line.stream, line.text) for line in found[-MAX_OUTPUT_LINES:]]
-    return as_json(Output(lines, len(found), len(every)))
+    lines = [(line.seconds, line.position, line.stream, line.text) for line in matching[-MAX_OUTPUT_LINES:]]
+    return as_json(Output(lines, len(matching), len(every)))
 
 
 def difference(a: Run, b: Run) -> bytes:
@@ -321,14 +321,14 @@ def difference(a: Run, b: Run) -> bytes:
     shown = partials()
     body = [shown.divergences(list(map(linked, view.divergences)), view.training, view.visits)]
     body += [shown.section(other.title.lower(), other.title, other) for other in view.others]
-    found = ShownDifference(
+    shown_difference = ShownDifference(
         lead=view.lead,
         notes=view.notes,
         first_frame=str(view.divergences[0].frame) if view.divergences else None,
         body="".join(body),
         tables=shown.tables(view.tables, view.table_figures),
     )
-    return as_json(found)
+    return as_json(shown_difference)
 
 
 def timeline_step(run: Run, at: StepRef | None) -> bytes:

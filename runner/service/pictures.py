@@ -154,10 +154,10 @@ class PictureStreams:
             self._close(stream)  # it would have to go back
         alive = [stream for stream in self._streams if stream.is_alive]
         if len([stream for stream in alive if not stream.is_closed]) >= MAX_STREAMS:
-            kept = [stream for stream in alive if stream.can_continue]
-            if not kept:
+            continuing = [stream for stream in alive if stream.can_continue]
+            if not continuing:
                 raise Busy(_BUSY)
-            self._close(min(kept, key=lambda stream: stream.idle_since or 0.0))
+            self._close(min(continuing, key=lambda stream: stream.idle_since or 0.0))
         if len(alive) >= 2 * MAX_STREAMS:  # environments that hang
             raise Busy(_BUSY)
         stream = PictureStream(key, make, start)

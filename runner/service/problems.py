@@ -99,9 +99,11 @@ def error_body(error: RunnerError, settings: Settings) -> ErrorBody:
         return ErrorBody(message=message)
     problems = [
         Problem(
-            path=found.path or None, line=found.line or None, message=settings.without_folders(found.message)
+            path=detail.path or None,
+            line=detail.line or None,
+            message=settings.without_folders(detail.message),
         )
-        for found in error.problems
+        for detail in error.problems
     ]
     return ErrorBody(message=message, problems=problems)
 
@@ -146,7 +148,7 @@ async def _http_error(request: Request, error: Exception) -> Response:
 async def _invalid(request: Request, error: Exception) -> Response:  # noqa: ARG001
     assert isinstance(error, RequestValidationError)
     problems = [
-        Problem(path=".".join(map(str, found["loc"])), message=str(found["msg"])) for found in error.errors()
+        Problem(path=".".join(map(str, each["loc"])), message=str(each["msg"])) for each in error.errors()
     ]
     message = "; ".join(f"{problem.path}: {problem.message}" for problem in problems)
     return json_error(HTTPStatus.UNPROCESSABLE_ENTITY, ErrorBody(message=message, problems=problems))

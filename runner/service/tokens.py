@@ -170,8 +170,8 @@ class Tokens:
         """
         matching = [token for token in self.all() if name in (token.id, token.name)]
         if len(matching) != 1:
-            known = ", ".join(f"{token.id} ({token.name})" for token in self.all()) or "none"
-            raise RunnerError(f"token: {name!r} names {len(matching)} tokens, expected one of {known}.")
+            names = ", ".join(f"{token.id} ({token.name})" for token in self.all()) or "none"
+            raise RunnerError(f"token: {name!r} names {len(matching)} tokens, expected one of {names}.")
         self._file.change(lambda tokens: [token for token in tokens if token.id != matching[0].id])
         return matching[0]
 

@@ -164,8 +164,8 @@ class Uploads:
                 self._require_place(owner)
             if upload.run_id != source.run_id:
                 self._previews.remove(upload.id, upload.run_id)
-            known = source.model_dump(include={"run_id", "name", "size"})
-            upload = replace(upload, source=source, **known)
+            announced = source.model_dump(include={"run_id", "name", "size"})
+            upload = replace(upload, source=source, **announced)
             size = upload.size or 0
             if run is None:
                 self._require_room(upload, size - upload.offset)
@@ -222,8 +222,8 @@ class Uploads:
             return run if stored_as or has else None
         if run is None:
             raise RunNotFound("no such run: push it before the contents of its checkpoints.")
-        known = [(each.digest, each.size) for each in run.checkpoints()]
-        if (source.digest, source.size) not in known:
+        checkpoints = [(each.digest, each.size) for each in run.checkpoints()]
+        if (source.digest, source.size) not in checkpoints:
             raise UploadConflict(f"run {run.run_id} has no checkpoint of this digest and size.")
         return run if Store(self._recordings).has(source.digest or "", source.size or 0) else None
 

@@ -124,8 +124,8 @@ def learning(results: Results, recordings: Path) -> tuple[list[Group], list[Pane
         raise RunnerError(_nothing_to_draw(results))
     groups = []
     for name, trial in (("median", finished[len(finished) // 2]), ("best", finished[0])):
-        found = (at_hand(find_run(run_id, recordings)) for run_id in trial.runs.values())
-        series = series_of(run.recording for run in found)
+        runs = (at_hand(find_run(run_id, recordings)) for run_id in trial.runs.values())
+        series = series_of(run.recording for run in runs)
         values = values_text(trial.values)
         groups.append(Group(f"{name}, trial {trial.number}: {values}", tuple(series)))
     return groups, panels_of(groups)

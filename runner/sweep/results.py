@@ -178,7 +178,7 @@ def ranking_sections(results: Results, shown: int | None = DEFAULT_SHOWN) -> lis
     """Return the ranking and the trials without a value as sections; arguments as for `sections`."""
     ranked = results.ranking[:shown]
     grid = _ranking_grid(results.sweep, ranked)
-    found = [Section(f"Sweep {results.sweep.name}", _heading(results, len(ranked)), [grid])]
+    result = [Section(f"Sweep {results.sweep.name}", _heading(results, len(ranked)), [grid])]
     for state, title in (("failed", "Failed"), ("excluded", "Excluded: these values contradict each other")):
         by_error: defaultdict[str, list[str]] = defaultdict(list)
         for entry in results.ranking:
@@ -186,8 +186,8 @@ def ranking_sections(results: Results, shown: int | None = DEFAULT_SHOWN) -> lis
                 by_error[entry.errors[0]].append(str(entry.number))
         if by_error:
             lines = [f"Trial {', '.join(numbers)}: {error}" for error, numbers in by_error.items()]
-            found.append(Section(title, lines))
-    return found
+            result.append(Section(title, lines))
+    return result
 
 
 def effects_sections(results: Results) -> list[Section]:

@@ -207,8 +207,8 @@ def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: 
 
 def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> MetricResult:
     notes: list[str] = []
-    found = {group.label: measured(group, metric, line, moment, groups, notes) for group in groups}
-    present = {label: values for label, values in found.items() if values}
+    by_label = {group.label: measured(group, metric, line, moment, groups, notes) for group in groups}
+    present = {label: values for label, values in by_label.items() if values}
     title, unit = title_of(metric)
     better = higher_is_better(metric, groups)
     notes += uneven_ends(groups, metric, line) if moment.kind == "last" else []

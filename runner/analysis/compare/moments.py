@@ -111,8 +111,8 @@ def window_notes(groups: Sequence[Group], metrics: Sequence[str], moment: Moment
                 window = f"stretches of {run.axis.moment(width)}"
         if window:
             windows.setdefault(window, []).append(group.label)
-    found = "; ".join(f"{window} in {listed(labels)}" for window, labels in windows.items())
-    return [f"a value of training is the mean over a window: {found}"] if found else []
+    parts = "; ".join(f"{window} in {listed(labels)}" for window, labels in windows.items())
+    return [f"a value of training is the mean over a window: {parts}"] if parts else []
 
 
 def few_seeds(groups: Sequence[Group], seeds: Mapping[str, int]) -> list[str]:
@@ -194,23 +194,23 @@ def measured(
     group: Group, metric: str, line: str, moment: Moment, groups: Sequence[Group], notes: list[str]
 ) -> Measured:
     """Return the value of each seed of a group; `notes` gets the runs that are left out."""
-    found: dict[Seed, list[tuple[str, float]]] = {}
+    by_seed: dict[Seed, list[tuple[str, float]]] = {}
     without: dict[str, list[str]] = {}
     for run in group.runs:
         value, reason = value_of(run, metric, line, moment, groups)
         if value is None:
             without.setdefault(reason, []).append(run.run_id)
         else:
-            found.setdefault(seed_of(run), []).append((run.run_id, value))
+            by_seed.setdefault(seed_of(run), []).append((run.run_id, value))
     notes += [f"{group.label}, left out: {listed(runs)} ({reason})" for reason, runs in without.items()]
-    count = sum(map(len, found.values()))
-    if count > len(found):
+    count = sum(map(len, by_seed.values()))
+    if count > len(by_seed):
         notes.append(
-            f"{group.label}: {count} runs of {len(found)} seeds, each seed with the mean of its runs"
+            f"{group.label}: {count} runs of {len(by_seed)} seeds, each seed with the mean of its runs"
         )
     return {
         seed: ([run_id for run_id, _ in runs], float(np.mean([value for _, value in runs])))
-        for seed, runs in sorted(found.items(), key=lambda entry: seed_order(entry[0]))
+        for seed, runs in sorted(by_seed.items(), key=lambda entry: seed_order(entry[0]))
     }
 
 
@@ -256,5 +256,7 @@ def _area(
     if first >= last:
         return None, "it has no part of training in common with the other runs"
     places = sorted({first, *(place for place in points if first <= place <= last), last})
-    known = sorted(points)
-    return mean_height(places, np.interp(places, known, [points[place] for place in known]).tolist()), ""
+    measured_at = sorted(points)
+    return mean_height(
+        places, np.interp(places, measured_at, [points[place] for place in measured_at]).tolist()
+    ), ""

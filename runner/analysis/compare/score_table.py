@@ -93,9 +93,9 @@ def _mapping(text: str, name: str) -> Mapping[object, object]:
     import yaml
 
     try:
-        found = json.loads(text) if name.endswith(".json") else yaml.safe_load(text)
+        table = json.loads(text) if name.endswith(".json") else yaml.safe_load(text)
     except (ValueError, RecursionError, yaml.YAMLError) as error:
         raise RunnerError(f"{name}: cannot be parsed ({' '.join(str(error).split())}).") from error
-    if not isinstance(found, Mapping):
+    if not isinstance(table, Mapping):
         raise RunnerError(f"{name}: expected a mapping of environments to `random` and `expert`.")
-    return found
+    return table

@@ -82,10 +82,10 @@ def iqm_band(values: Values) -> tuple[Values, Values, Values]:
     bootstrap is that of `interquartile_mean`, for hundreds of positions at once and without SciPy: the IQM of
     a resample is a weighted mean of the sorted values, so that all positions share the weights.
     """
-    known = ~np.isnan(values)
+    is_known = ~np.isnan(values)
     result = np.empty((3, values.shape[1]))
-    for n in np.unique(known.sum(axis=0)).tolist():
-        chosen = np.flatnonzero(known.sum(axis=0) == n)
+    for n in np.unique(is_known.sum(axis=0)).tolist():
+        chosen = np.flatnonzero(is_known.sum(axis=0) == n)
         ordered = np.sort(values[:, chosen], axis=0)[:n]  # NaN is sorted last
         if n < FEWEST_FOR_IQM:
             result[:, chosen] = ordered.mean(axis=0), ordered[0], ordered[-1]

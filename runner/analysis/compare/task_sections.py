@@ -62,21 +62,21 @@ def grids(comparison: TaskComparison) -> list[Grid]:
         )
         for result in comparison.algorithms
     ]
-    found = [Grid(("", "runs", *headings), rows)]
+    all_grids = [Grid(("", "runs", *headings), rows)]
     if comparison.improvements:
         pairs = [
             (pair.a, pair.b, number(pair.probability.value), interval(pair.probability))
             for pair in comparison.improvements
         ]
-        found.append(Grid(("A", "B", "P(A higher)", "95 %"), pairs))
+        all_grids.append(Grid(("A", "B", "P(A higher)", "95 %"), pairs))
     if len(comparison.thresholds) > 1:
-        found.append(profile_grid(comparison.algorithms, comparison.thresholds, "at least"))
+        all_grids.append(profile_grid(comparison.algorithms, comparison.thresholds, "at least"))
     if len(comparison.positions) > 1:
         at = spread_over(len(comparison.positions))
         curves = [(result.label, *(number(result.curve[k]) for k in at)) for result in comparison.algorithms]
         places = (f"{comparison.positions[k]:,.6g}" for k in at)
-        found.append(Grid((f"IQM after {comparison.axis}", *places), curves))
-    return found
+        all_grids.append(Grid((f"IQM after {comparison.axis}", *places), curves))
+    return all_grids
 
 
 def _tasks(comparison: TaskComparison) -> Grid:

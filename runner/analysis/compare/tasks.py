@@ -136,14 +136,16 @@ def compare_tasks(
     if moment.level is not None:
         raise RunnerError("normalise: found a target as well, expected a moment: a level has no score.")
     own_notes: list[str] = []
-    found = {group.label: dict(_values(group, metric, moment, groups, own_notes)) for group in groups}
-    tasks = _common_tasks(found, own_notes)
+    by_label = {group.label: dict(_values(group, metric, moment, groups, own_notes)) for group in groups}
+    tasks = _common_tasks(by_label, own_notes)
     better = higher_is_better(metric[0], groups)
     if better is None and table is None:
         own_notes.append(f"higher is taken as better, as nobody can say it of {metric[0]}")
-    bounds = _bounds(tasks, found, table, better is False, own_notes)
+    bounds = _bounds(tasks, by_label, table, better is False, own_notes)
     tasks = list(bounds)
-    scores = {label: {task: bounds[task].score(own[task]) for task in tasks} for label, own in found.items()}
+    scores = {
+        label: {task: bounds[task].score(own[task]) for task in tasks} for label, own in by_label.items()
+    }
     every = np.concatenate([values for own in scores.values() for values in own.values()])
     thresholds = np.linspace(float(every.min()), float(every.max()), POINTS)
     if moment.kind != "position":  # which takes runs that are not finished too

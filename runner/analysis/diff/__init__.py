@@ -144,10 +144,12 @@ def _diff_jobs(
             overlap, (visits_a, visits_b) = training_overlap(a, b)
             visits = visits_a + visits_b
             difference = replace(difference, overlap=overlap, visits=visits_diff(a.mdp, visits_a, visits_b))
-            known = None if divergence is None or cause is None else (divergence, cause)
-            if (found := next(evaluation_divergences(a, b), None)) is not None:
-                why = find_cause(found, a, b, known)
-                difference = replace(difference, evaluation_divergence=found, evaluation_cause=why)
+            training = None if divergence is None or cause is None else (divergence, cause)
+            if (divergence_in_trials := next(evaluation_divergences(a, b), None)) is not None:
+                why = find_cause(divergence_in_trials, a, b, training)
+                difference = replace(
+                    difference, evaluation_divergence=divergence_in_trials, evaluation_cause=why
+                )
     if relation is not None and difference.divergence is None:
         difference.notes.append(relation.text)
     if first:
@@ -161,11 +163,11 @@ def _diff_branch(
 ) -> RunDiff:
     """Add to the difference of a loop and a branch of it where the branched episode diverges."""
     difference = replace(difference, notes=["of the parent only the branched episode is compared"])
-    if (found := branch_divergence(a, b, origin)) is None:
+    if (divergence := branch_divergence(a, b, origin)) is None:
         return difference
     if origin.phase == "train":
-        return replace(difference, divergence=found, cause=cause)
-    return replace(difference, evaluation_divergence=found, evaluation_cause=cause)
+        return replace(difference, divergence=divergence, cause=cause)
+    return replace(difference, evaluation_divergence=divergence, evaluation_cause=cause)
 
 
 def _diff_loops(difference: RunDiff, a: Recording, b: Recording) -> RunDiff:
@@ -252,10 +254,10 @@ def divergences(a: Recording, b: Recording) -> Iterator[Divergence]:
     Of training there is also one where a run has no more steps; it has no step of that run then.
     """
     if a.has_tables and b.has_tables:
-        found = [training_divergence(a, b), next(evaluation_divergences(a, b), None)]
+        both = [training_divergence(a, b), next(evaluation_divergences(a, b), None)]
     else:
-        found = [loop_divergence(a, b, phase) for phase in schema.PHASES]
-    yield from filter(None, found)
+        both = [loop_divergence(a, b, phase) for phase in schema.PHASES]
+    yield from filter(None, both)
 
 
 def _same_sizes(a: Recording, b: Recording) -> bool:

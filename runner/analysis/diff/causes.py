@@ -124,11 +124,11 @@ def find_cause(
     from runner.replay.tables import TableReplay
 
     steps = divergence.trained or (divergence.step, divergence.step)  # training steps before the choice
-    known = training is not None and training[0].step < min(steps)
+    is_after_training = training is not None and training[0].step < min(steps)
     try:
-        if known or steps[0] != steps[1] or a.agents != b.agents:
+        if is_after_training or steps[0] != steps[1] or a.agents != b.agents:
             replays = [TableReplay(recording, step) for recording, step in zip((a, b), steps, strict=True)]
-            update = training[1].update if training is not None and known else None
+            update = training[1].update if training is not None and is_after_training else None
         else:
             replays, update = replay_to(a, b, steps[0])
     except RecordingError as error:

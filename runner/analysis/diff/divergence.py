@@ -159,14 +159,14 @@ def evaluation_divergences(a: Recording, b: Recording) -> Iterator[Divergence]:
         steps = [_trial_steps(one, first, trials) for one, first in ((a, left.start), (b, right.start))]
         if steps[0] is None or steps[1] is None:
             continue
-        found = _divergence(
+        divergence = _divergence(
             "eval", first_difference(steps[0], steps[1], _EVALUATION_FIELDS), _EVALUATION_FIELDS
         )
-        if found is not None:
-            start = right.start if found.a_step is None else left.start
+        if divergence is not None:
+            start = right.start if divergence.a_step is None else left.start
             yield replace(
-                found,
-                episode=found.episode - start,
+                divergence,
+                episode=divergence.episode - start,
                 evaluation=left.number,
                 after=left.after,
                 trained=(left.train_step, right.train_step),
@@ -245,37 +245,43 @@ def loop_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None
     """
     if any(one.leaves_out_steps and not one.has_actions for one in (a, b)):
         return None
-    found = _first_in_phase(a, b, phase)
-    if found is None or phase == "train":
-        return found
+    divergence = _first_in_phase(a, b, phase)
+    if divergence is None or phase == "train":
+        return divergence
     for recording in (a, b):
         for one in evaluations_of(recording):
-            if one.start <= found.episode < one.stop:
+            if one.start <= divergence.episode < one.stop:
                 return replace(
-                    found, episode=found.episode - one.start, evaluation=one.number, after=one.after
+                    divergence, episode=divergence.episode - one.start, evaluation=one.number, after=one.after
                 )
     after = a.count(schema.TRAIN_EPISODE)  # the trial was not finished in either run, so it is after all
     start = next((one.start for one in evaluations_of(a) if one.after == after), a.count(schema.EVAL_EPISODE))
-    return replace(found, episode=found.episode - start, after=after)
+    return replace(divergence, episode=divergence.episode - start, after=after)
 
 
 def _first_in_phase(a: Recording, b: Recording, phase: str) -> Divergence | None:
     """Return the same; the number of a trial is that among all evaluations."""
     name, is_tabular = f"/{phase}/step", a.has_states
     alone = [one.has_actions_alone(phase) for one in (a, b)]
-    known = set.intersection(*(set(one.row_dtype(name).names or ()) for one in (a, b)))
+    common = set.intersection(*(set(one.row_dtype(name).names or ()) for one in (a, b)))
     digest = ("digest",) if all(alone) else ()
-    fields = (*(each for each in (FIELDS if is_tabular else _TRANSITION_FIELDS) if each in known), *digest)
-    found = _divergence(phase, first_difference(a.rows(name), b.rows(name), fields), fields)
+    fields = (*(each for each in (FIELDS if is_tabular else _TRANSITION_FIELDS) if each in common), *digest)
+    divergence = _divergence(phase, first_difference(a.rows(name), b.rows(name), fields), fields)
     if not is_tabular:  # else a step has the state before it
-        found = _reset_divergence(a, b, phase, math.inf if found is None else found.step) or found
-    if found is None:
+        divergence = (
+            _reset_divergence(a, b, phase, math.inf if divergence is None else divergence.step) or divergence
+        )
+    if divergence is None:
         return None
-    if isinstance(found.a, bytes):
-        found = replace(found, a=_legible(a, found.field, found.a), b=_legible(b, found.field, found.b))
+    if isinstance(divergence.a, bytes):
+        divergence = replace(
+            divergence,
+            a=_legible(a, divergence.field, divergence.a),
+            b=_legible(b, divergence.field, divergence.b),
+        )
     if any(alone) or a.kind == "variable":
-        found = replace(found, a_step=None, b_step=None, actions_alone=any(alone))
-    return found
+        divergence = replace(divergence, a_step=None, b_step=None, actions_alone=any(alone))
+    return divergence
 
 
 def _legible(recording: Recording, field: str, value: bytes) -> str:
@@ -295,11 +301,11 @@ def branch_divergence(a: Recording, b: Recording, origin: BranchOrigin) -> Diver
         episode_blocks(one, origin.phase, origin.episode if one.run_id == origin.run else 0) for one in (a, b)
     ]
     fields = tuple(name for name in (FIELDS if a.kind == "step" else _TRANSITION_FIELDS) if name != "episode")
-    found = _divergence(origin.phase, first_difference(blocks[0], blocks[1], fields), fields)
-    if found is None:
+    divergence = _divergence(origin.phase, first_difference(blocks[0], blocks[1], fields), fields)
+    if divergence is None:
         return None
     at = StepRef.parse(origin.at)
-    return replace(found, episode=at.episode, after=at.after, a_step=None, b_step=None)
+    return replace(divergence, episode=at.episode, after=at.after, a_step=None, b_step=None)
 
 
 def _reset_divergence(a: Recording, b: Recording, phase: str, last: float) -> Divergence | None:

@@ -103,14 +103,14 @@ def _common_lengths(a: Recording, b: Recording) -> Iterator[tuple[Lengths, Lengt
 
     An episode longer than that comes alone.
     """
-    known = [unbroken(recording) for recording in (a, b)]
-    episodes = min(count for _, count in known)
+    lengths = [unbroken(recording) for recording in (a, b)]
+    episodes = min(count for _, count in lengths)
     for first in range(0, episodes, _BATCH_EPISODES):
         last = min(first + _BATCH_EPISODES, episodes)
         records = [recording.episodes("train", first, last) for recording in (a, b)]
         whole = min(
             int(np.searchsorted(one["last_step"], steps))
-            for one, (steps, _) in zip(records, known, strict=True)
+            for one, (steps, _) in zip(records, lengths, strict=True)
         )
         ours, theirs = (one["length"][:whole].astype(np.int64) for one in records)
         longer = np.maximum(ours, theirs)

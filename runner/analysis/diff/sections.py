@@ -23,7 +23,7 @@ _MAX_SETTINGS: Final = 4
 
 def sections(difference: RunDiff, everything: bool = False) -> list[Section]:
     """Return the text of a difference; `everything` includes what does not differ."""
-    found = [
+    all_sections = [
         _runs(difference),
         _values("Configuration", difference, "config", setting),
         _environment(difference),
@@ -35,9 +35,11 @@ def sections(difference: RunDiff, everything: bool = False) -> list[Section]:
         _code(difference.code),
         _values("Provenance", difference, "provenance"),
     ]
-    filled = [section for section in found if section.sentences or section.grids]
+    filled = [section for section in all_sections if section.sentences or section.grids]
     if everything:
-        return [section if section in filled else Section(section.title, ["the same"]) for section in found]
+        return [
+            section if section in filled else Section(section.title, ["the same"]) for section in all_sections
+        ]
     return filled
 
 
@@ -230,9 +232,9 @@ def why_in_words(divergence: Divergence, cause: Cause | None) -> str:
 
 def evaluation_updates(difference: RunDiff, cause: Cause | None) -> list[str]:
     """Return how the tables came to differ that an evaluation used, in a sentence or two."""
-    known = difference.cause
-    if cause is not None and known is not None:
-        if known.update is not None and known.update == cause.update:
+    training_cause = difference.cause
+    if cause is not None and training_cause is not None:
+        if training_cause.update is not None and training_cause.update == cause.update:
             return ["The tables came to differ by the same update as above."]
         if cause.kind == "greedy_action" and cause.update is None:
             return ["Training had diverged before, so the tables are not the same."]

@@ -45,9 +45,9 @@ def replay_to(a: Recording, b: Recording, stop: int) -> tuple[list[TableReplay],
     update = None
     if _are_equal(replays):
         for step in range(start, stop, _BATCH_STEPS):
-            found = _first_other_update(replays, step, min(step + _BATCH_STEPS, stop))
-            if found is not None:
-                update = _describe_update(a, b, found, replays)
+            place = _first_other_update(replays, step, min(step + _BATCH_STEPS, stop))
+            if place is not None:
+                update = _describe_update(a, b, place, replays)
                 break
     for replay in replays:
         replay.advance(stop)

@@ -86,12 +86,12 @@ def _print_archived(archived: Archived, dry_run: bool, as_json: bool) -> None:
         )
         return
     per_step = f", {manifest.size / steps:.2f} bytes per step" if steps else ""
-    kept = "removed" if archived.removed else "kept"
+    fate = "removed" if archived.removed else "kept"
     state = "" if archived.new else "  (existed already, undamaged)"
     rows = {
         "run": f"{run.run_id}  {run.title}",
         "archive": archived.place + state,
-        "size": f"{size(manifest.size)}{per_step}; the recording: {size(archived.recording_bytes)}, {kept}",
+        "size": f"{size(manifest.size)}{per_step}; the recording: {size(archived.recording_bytes)}, {fate}",
         "digest": manifest.digest,
     }
     draw(facts(rows))

@@ -135,7 +135,7 @@ def branch_command(
         if run.can_train_again:
             stack.enter_context(compilation_notice())
             stop = stack.enter_context(interruptible(second=signal.SIG_DFL))
-        found = branch(
+        branched_run = branch(
             run,
             at=at,
             action=action,
@@ -150,10 +150,10 @@ def branch_command(
             report=report,
             stop=stop,
         )
-    if isinstance(found, TrainingBranch):
-        _print_training(run, found, as_json)
+    if isinstance(branched_run, TrainingBranch):
+        _print_training(run, branched_run, as_json)
     else:
-        _print_episode(run, found, as_json)
+        _print_episode(run, branched_run, as_json)
 
 
 def _refuse_what_training_takes() -> None:
@@ -230,10 +230,10 @@ def _print_what_if(run: Run, at: StepRef, actions: tuple[str, ...], as_json: boo
     from runner.debugging.what_if import what_if
 
     with compilation_notice():
-        found = what_if(run, at=at, actions=actions)
+        result = what_if(run, at=at, actions=actions)
     if as_json:
-        print_json(found.as_json())
+        print_json(result.as_json())
         return
-    draw(facts({"run": f"{run.run_id}  {run.title}"} | found.facts), "", grid_table(found.grid))
-    for note in found.notes:
+    draw(facts({"run": f"{run.run_id}  {run.title}"} | result.facts), "", grid_table(result.grid))
+    for note in result.notes:
         say(f"Note: {note}.")

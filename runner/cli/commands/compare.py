@@ -160,10 +160,12 @@ def _compare(
         return _Made(tasks, task_sections(tasks), contents, render_tasks(tasks) if with_page else "")
     groups, notes = grouped(series, by)
     require_two(groups, by)
-    found = compare(groups, metrics_of(groups, chosen), moment, notes)
+    comparison = compare(groups, metrics_of(groups, chosen), moment, notes)
     runs = sum(len(group.runs) for group in groups)
-    contents = f"{counted(len(found.metrics), 'metric')} of {runs} runs in {len(groups)} groups"
-    return _Made(found, sections(found), contents, render_comparison(found, groups) if with_page else "")
+    contents = f"{counted(len(comparison.metrics), 'metric')} of {runs} runs in {len(groups)} groups"
+    return _Made(
+        comparison, sections(comparison), contents, render_comparison(comparison, groups) if with_page else ""
+    )
 
 
 @click.command("diff", cls=Command)

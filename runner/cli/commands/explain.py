@@ -123,10 +123,10 @@ def explain_command(
 def _in_words(plan: Plan) -> str:
     """Return what will be trained, and how long it takes."""
     runs, most = plan.mixtures * plan.seeds, plan.most_mixtures * plan.seeds
-    known = f", {plan.known:,} of them known" if plan.known else ""
+    reused = f", {plan.known:,} of them known" if plan.known else ""
     settings, seeds = counted(plan.settings, "setting"), counted(plan.seeds, "seed")
     if most != runs:
         text = f"from {runs:,} to {most:,} runs: delta debugging of {settings}, each mixture with {seeds}"
-        return f"{text}{known}; up to about {duration(plan.most_seconds)}"
-    text = f"{runs:,} runs: {plan.mixtures:,} mixtures of {settings}, {seeds} each{known}"
+        return f"{text}{reused}; up to about {duration(plan.most_seconds)}"
+    text = f"{runs:,} runs: {plan.mixtures:,} mixtures of {settings}, {seeds} each{reused}"
     return f"{text}; about {duration(plan.seconds)}" if plan.seconds else f"{text}: nothing to train"

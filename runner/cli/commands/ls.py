@@ -237,7 +237,7 @@ def _informative(rows: Sequence[Row], folders: int) -> list[str]:
 
 def _fitting(rows: Sequence[Row], columns: Sequence[str]) -> list[str]:
     """Return the columns that fit the terminal."""
-    kept, terminal = list(columns), console()
+    fitting, terminal = list(columns), console()
     widths = {
         column: 2 + max(len(HEADINGS.get(column, column)), *(len(_cell(row, column)) for row in rows))
         for column in columns
@@ -245,9 +245,13 @@ def _fitting(rows: Sequence[Row], columns: Sequence[str]) -> list[str]:
     for column in _SHRINKING:
         widths[column] = min(widths.get(column, 0), _MIN_WIDTH)
     for column in _OPTIONAL:
-        if terminal.is_terminal and column in kept and sum(map(widths.__getitem__, kept)) > terminal.width:
-            kept.remove(column)
-    return kept
+        if (
+            terminal.is_terminal
+            and column in fitting
+            and sum(map(widths.__getitem__, fitting)) > terminal.width
+        ):
+            fitting.remove(column)
+    return fitting
 
 
 def _print_table(rows: Sequence[Row], columns: Sequence[str]) -> None:

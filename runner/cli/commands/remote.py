@@ -161,10 +161,10 @@ def _outbox(server: Server) -> Iterator[tuple[str, Upload]]:
         with server.client(url) as client:
             return _stored(deliver(run, client, report), run.name, run_bytes)
 
-    found = waiting(outbox_folder())
-    if not found:
+    uploads = waiting(outbox_folder())
+    if not uploads:
         say(f"The outbox {outbox_folder()} is empty; there is nothing to do.")
-    for run, url in found:
+    for run, url in uploads:
         yield run.run_id, functools.partial(upload, run, url)
 
 
@@ -240,11 +240,11 @@ def jobs(limit: int = limit_option(20), server: Server = server_options, as_json
       dualtaxi remote jobs --server http://localhost:8000
     """
     with server.client() as client:
-        found = client.jobs(limit or 1000)
+        newest = client.jobs(limit or 1000)
     if as_json:
-        print_json({"jobs": [_job_as_json(job) for job in found]})
-    elif found:
-        rows = [(str(job.number), job.kind, job.name, job.state, f"{job.runs:,}") for job in found]
+        print_json({"jobs": [_job_as_json(job) for job in newest]})
+    elif newest:
+        rows = [(str(job.number), job.kind, job.name, job.state, f"{job.runs:,}") for job in newest]
         left = ("kind", "name", "state")
         draw(table("job", *left, "runs", rows=rows, left=left, shrinking=("name",)))
     else:

@@ -132,8 +132,8 @@ def prune_command(
     else:
         places = [(Path(row["root"]), row["entry"]) for row in rows]
         removals = [plan(run, root, foreign) for root, entry in places if (run := run_in(root / entry))]
-    kept = {each.run_id: each.refusal for each in removals if each.refusal}
-    for run_id, reason in kept.items():
+    refusals = {each.run_id: each.refusal for each in removals if each.refusal}
+    for run_id, reason in refusals.items():
         say(f"Run {run_id} stays: {reason}.")
     if protected:
         counts = ", ".join(f"{count:,} {reason}" for reason, count in sorted(protected.items()))
@@ -142,34 +142,34 @@ def prune_command(
     if not removals and not as_json:
         say("There is nothing to remove.")
         return
-    _carry_out(removals, kept, foreign, yes, dry_run, as_json)
+    _carry_out(removals, refusals, foreign, yes, dry_run, as_json)
 
 
 def _prune_explanations(recordings: Sequence[Path], dry_run: bool, yes: bool, as_json: bool) -> None:
     """Show what explanations trained, ask, and remove it."""
     from runner.debugging.explanation_files import remove_trained, trained_in
 
-    found = [each for folder in recordings for each in trained_in(folder)]
-    freed = sum(each.bytes for each in found)
-    if not found and not as_json:
+    explanations = [each for folder in recordings for each in trained_in(folder)]
+    freed = sum(each.bytes for each in explanations)
+    if not explanations and not as_json:
         say("There is nothing to remove.")
         return
     if not as_json:
-        cells = [(each.name, f"{len(each.runs):,}", size(each.bytes)) for each in found]
+        cells = [(each.name, f"{len(each.runs):,}", size(each.bytes)) for each in explanations]
         draw(table("explanation", "runs", "frees", rows=cells, left=("explanation",)))
-        for run in (run for each in found for run in each.runs if run.refusal):
+        for run in (run for each in explanations for run in each.runs if run.refusal):
             say(f"Run {run.run_id} stays: {run.refusal}.")
-    if found and not dry_run:
-        _confirm(f"Remove {counted(len(found), 'explanation')} for good, and free {size(freed)}?", yes)
-        for each in found:
+    if explanations and not dry_run:
+        _confirm(f"Remove {counted(len(explanations), 'explanation')} for good, and free {size(freed)}?", yes)
+        for each in explanations:
             remove_trained(each)
     if as_json:
-        rows = [{"name": each.name, "bytes": each.bytes} for each in found]
+        rows = [{"name": each.name, "bytes": each.bytes} for each in explanations]
         print_json({"dry_run": dry_run, "freed": freed, "removed": rows})
     elif dry_run:
         say(f"Nothing was removed; it would free {size(freed)}.")
     else:
-        click.echo(f"Removed {counted(len(found), 'explanation')}, freed {size(freed)}.")
+        click.echo(f"Removed {counted(len(explanations), 'explanation')}, freed {size(freed)}.")
 
 
 def _confirm(question: str, yes: bool) -> None:

@@ -113,13 +113,13 @@ def _plot_tasks(series: list[RunSeries], normalise: str, to: Writing) -> None:
 
     output, table = to.path(), scores_of(normalise)
     with stage_line("computing intervals") as stage:
-        found = compare_algorithms(series, table)
+        comparison = compare_algorithms(series, table)
         stage("drawing")
-        write_new(output, to.force, lambda path: save(tasks_sheet(found), path))
-    for note in found.notes:
+        write_new(output, to.force, lambda path: save(tasks_sheet(comparison), path))
+    for note in comparison.notes:
         say(f"Note: {note}.")
-    text = f"{output}: {len(found.algorithms)} groups in {len(found.tasks)} environments"
-    to.report(text, output, groups=len(found.algorithms), environments=len(found.tasks))
+    text = f"{output}: {len(comparison.algorithms)} groups in {len(comparison.tasks)} environments"
+    to.report(text, output, groups=len(comparison.algorithms), environments=len(comparison.tasks))
 
 
 def _refuse_style(axis: Axis, style: CurveStyle) -> None:

@@ -232,8 +232,8 @@ def _evaluate_checkpoint(
     if as_json:
         print_json(run_as_json(run) | {"origin": origin})
         return
-    found = run.summary.last_evaluation
-    means = {} if found is None else found.values
+    evaluation = run.summary.last_evaluation
+    means = {} if evaluation is None else evaluation.values
     results = {
         "played": f"{checkpoint.reference} of run {source.run_id}, {checkpoint.digest[:16]}, by {policy}",
         "mean return": number(means.get("mean_return")),

@@ -28,16 +28,16 @@ def init_command(
     from runner.config.shipped import start_folder
 
     made: list[str] = []
-    kept: list[str] = []
+    existing: list[str] = []
     for path, is_new in start_folder(folder):
-        (made if is_new else kept).append(str(path))
+        (made if is_new else existing).append(str(path))
     if as_json:
-        print_json({"folder": str(folder.absolute()), "made": made, "kept": kept})
+        print_json({"folder": str(folder.absolute()), "made": made, "kept": existing})
         return
     for name in made:
         click.echo(name)
-    if kept:
-        say(f"{len(kept)} of {len(made) + len(kept)} existed already and were left as they are.")
+    if existing:
+        say(f"{len(existing)} of {len(made) + len(existing)} existed already and were left as they are.")
     change = "" if folder == Path() else f"cd {folder} && "
     say(f"Next: {change}dualtaxi run configs/quick.yaml")
 

@@ -87,24 +87,24 @@ def _print_code(run: Run, as_json: bool) -> None:
     from runner.recording.reader import open_recording
 
     with open_recording(run.recording) as recording:
-        found = recording.code
-        known = {
+        recorded = recording.code
+        code_facts = {
             key: text
             for key, text in recording.provenance.items()
             if key.startswith(("git", "code.")) or key == "command"
         }
     if as_json:
-        print_json(known | {"files": dict(found.files), "new": found.new, "patch": found.patch})
+        print_json(code_facts | {"files": dict(recorded.files), "new": recorded.new, "patch": recorded.patch})
         return
-    if not any(key.startswith(("git", "code.")) for key in known):
-        known["code.not_recorded"] = "the code of this run"
-    committed = [path for path in found.files if path not in found.new]
-    head = [f"# {key}: {printable(text)}" for key, text in known.items()]
+    if not any(key.startswith(("git", "code.")) for key in code_facts):
+        code_facts["code.not_recorded"] = "the code of this run"
+    committed = [path for path in recorded.files if path not in recorded.new]
+    head = [f"# {key}: {printable(text)}" for key, text in code_facts.items()]
     head += [f"# also printed in full by --json: {', '.join(map(printable, committed))}"] if committed else []
     if console().is_terminal:
-        draw(*head, patch_text(found.to_patch().splitlines()))
+        draw(*head, patch_text(recorded.to_patch().splitlines()))
     else:
-        click.echo("\n".join(head) + "\n\n" + found.to_patch(), nl=False)
+        click.echo("\n".join(head) + "\n\n" + recorded.to_patch(), nl=False)
 
 
 def _parts(details: RunDetails, branches: Mapping[str, Origin]) -> list[RenderableType]:
@@ -126,8 +126,10 @@ def _parts(details: RunDetails, branches: Mapping[str, Origin]) -> list[Renderab
         parts += [title("Values recorded with steps"), facts(_extras(details.extras))]
     if details.checkpoints:
         last = details.checkpoints[-1]
-        kept = f"{len(details.checkpoints):,}, the last {last.reference}; `{command_for(run, 'checkpoints')}`"
-        parts += [title("Checkpoints"), kept]
+        summary = (
+            f"{len(details.checkpoints):,}, the last {last.reference}; `{command_for(run, 'checkpoints')}`"
+        )
+        parts += [title("Checkpoints"), summary]
     if branches:
         parts += [title("Branches"), facts({name: str(each) for name, each in branches.items()})]
     if details.optimality:

@@ -81,19 +81,21 @@ def verify_command(
     with bytes_line("reading") as reading:
         damage = damage_of(path, reading)
     with job_progress("verifying", episodes) as (report, _):
-        found = verify(path, bool(rerun), report, damage)
+        verification = verify(path, bool(rerun), report, damage)
     redone = None
-    if found.needs_redo and found.sound and not found.nothing_yet and rerun is not False:
-        steps = found.train_steps + found.eval_steps
+    if verification.needs_redo and verification.sound and not verification.nothing_yet and rerun is not False:
+        steps = verification.train_steps + verification.eval_steps
         with count_line("steps done again", 0 if sample else steps) as count:
             redone = verify_by_redoing(path, sample, tolerance, trust, count)
-    with_installed = bool(rerun) and not found.needs_redo
+    with_installed = bool(rerun) and not verification.needs_redo
     if as_json:
-        print_json(_verification_as_json(found, with_installed) | (_redone_as_json(redone) if redone else {}))
+        print_json(
+            _verification_as_json(verification, with_installed) | (_redone_as_json(redone) if redone else {})
+        )
     else:
-        draw(facts(_verification(found, with_installed) | (_redone(redone) if redone else {})))
+        draw(facts(_verification(verification, with_installed) | (_redone(redone) if redone else {})))
     failures = ("differs", "impossible") if rerun else ("differs",)
-    if not found.sound or (redone is not None and redone.verdict in failures):
+    if not verification.sound or (redone is not None and redone.verdict in failures):
         raise click.exceptions.Exit(ExitCode.DIFFERENT)
 
 

@@ -55,10 +55,10 @@ def when_command(
 
     run = find_recorded(run_name, recordings)
     with compilation_notice(), steps_line("searched") as report:
-        found = when(run, expression, every=everything, first=first, last=last, report=report)
+        result = when(run, expression, every=everything, first=first, last=last, report=report)
     if as_json:
-        print_json(found.as_json())
+        print_json(result.as_json())
         return
-    print_sections([section_of(found)], as_markdown=False)
-    if found.first is not None:
-        draw(facts({"next": command_for(run, "view", "--at", str(found.first.at))}))
+    print_sections([section_of(result)], as_markdown=False)
+    if result.first is not None:
+        draw(facts({"next": command_for(run, "view", "--at", str(result.first.at))}))

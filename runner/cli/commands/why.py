@@ -58,12 +58,12 @@ def why_command(
 
     run = find_recorded(run_name, recordings)
     with compilation_notice(), steps_line("reading") as report:
-        found = why(run, state=state, action=action, agent=agent, at=at, limit=limit, report=report)
+        result = why(run, state=state, action=action, agent=agent, at=at, limit=limit, report=report)
     if as_json:
-        print_json(found.as_json())
+        print_json(result.as_json())
         return
-    rows = facts_of(found)
-    if found.steps:
-        rows["next"] = command_for(run, "view", "--at", found.steps[0].at)
+    rows = facts_of(result)
+    if result.steps:
+        rows["next"] = command_for(run, "view", "--at", result.steps[0].at)
     draw(facts(rows))
-    print_sections(sections_of(found), as_markdown=False)
+    print_sections(sections_of(result), as_markdown=False)

@@ -316,11 +316,11 @@ def _thinned(x: Values, y: Values) -> tuple[Values, Values]:
         return x, y
     column = np.rint(x * _POINTS_PER_UNIT).astype(np.int64)
     starts = np.flatnonzero(np.diff(column, prepend=column[0] - 1))
-    kept: list[int] = []
+    chosen: list[int] = []
     for start, stop in itertools.pairwise([*starts.tolist(), len(x)]):
         inside = y[start:stop]
-        kept += sorted({start, start + int(inside.argmin()), start + int(inside.argmax()), stop - 1})
-    return x[kept], y[kept]
+        chosen += sorted({start, start + int(inside.argmin()), start + int(inside.argmax()), stop - 1})
+    return x[chosen], y[chosen]
 
 
 def _round_step(width: float) -> float:

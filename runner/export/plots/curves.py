@@ -197,8 +197,8 @@ def _draw_curve(chart: Chart, panel: Panel, curve: Curve, groups: int, style: Cu
         low = np.maximum(curve.low[shown], chart.y.low) if style.log_y else curve.low[shown]
         chart.band(curve.places[shown], low, curve.high[shown], colour, opacity=0.2)
     for run in curve.runs if style.lines and len(curve.runs) > 1 else ():
-        known = visible(curve.places, run, style)
-        chart.line(curve.places[known], run[known], colour, line, width=0.6, opacity=0.5)
+        is_visible = visible(curve.places, run, style)
+        chart.line(curve.places[is_visible], run[is_visible], colour, line, width=0.6, opacity=0.5)
     if style.smooth:
         chart.line(curve.places[shown], curve.middle[shown], colour, line, width=0.8, opacity=0.35)
     values = _shown(panel, curve, style)

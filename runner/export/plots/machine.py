@@ -43,8 +43,8 @@ def machine_facts(clock: Clock, host: HostMetrics | None) -> dict[str, str]:
             "Disk, free at the end": of["disk_free_bytes"][-1:],
         }
         for name, values in largest.items():
-            if (known := values[np.isfinite(values)]).size:
-                facts[name] = humanize.size(float(known.max()))
+            if (finite := values[np.isfinite(values)]).size:
+                facts[name] = humanize.size(float(finite.max()))
     return facts
 
 
@@ -101,8 +101,8 @@ def _plot(panel: _Panel, seconds: Values, duration: float) -> Plot:
     chart.y_ticks(labelled(y.ticks, short=highest >= 10_000))
     chart.frame(panel.title, 25.0 if len(usable) == 1 else 14.0, unit, [panel.unit])
     for number, values in enumerate(usable.values()):
-        known = ~np.isnan(values)
-        places, shown = seconds[known] / divisor, values[known]
+        is_known = ~np.isnan(values)
+        places, shown = seconds[is_known] / divisor, values[is_known]
         chart.line(places, shown, series_colour(number), number)
         if len(places) < 3:  # a line through one point is invisible
             chart.markers(places, shown, series_colour(number), series_marker(number), 1.7)

@@ -53,12 +53,12 @@ def style_of(panel: Panel, style: CurveStyle) -> CurveStyle:
 
 def visible(places: NDArray[np.float64], values: NDArray[np.float64], style: CurveStyle) -> NDArray[np.bool_]:
     """Return which points have a place on the axes of a style, bool [n]."""
-    known = ~np.isnan(values)
+    is_visible = ~np.isnan(values)
     if style.log_x:
-        known &= places > 0
+        is_visible &= places > 0
     if style.log_y:
-        known &= values > 0
-    return known
+        is_visible &= values > 0
+    return is_visible
 
 
 def not_drawn(panels: Sequence[Panel], style: CurveStyle) -> str:

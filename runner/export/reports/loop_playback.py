@@ -187,8 +187,8 @@ def _extras(recording: Recording, phase: str, part: range, notes: list[str]) -> 
     series = []
     agents = recording.agents if len(recording.agents) > 1 else ()
     extras = recording.extras(phase)
-    found = extras.at(np.arange(part.start, part.stop, part.step)) if extras else {}
-    for name, values in found.items():
+    by_name = extras.at(np.arange(part.start, part.stop, part.step)) if extras else {}
+    for name, values in by_name.items():
         agent = next((one for one in agents if name.startswith(f"{one}/")), "")
         shape = values.shape[1:]
         columns = values.reshape(len(part), -1)

@@ -56,11 +56,11 @@ def stages_of(recording: Recording) -> list[Stage]:
     The middle is the snapshot nearest to half of the episodes; without one between the first and the last,
     the steps up to there are replayed, if they were recorded.
     """
-    found: dict[int, Stage] = {}
+    by_step: dict[int, Stage] = {}
     for table in recording.snapshots():
-        stage = found.setdefault(table.step, Stage("", table.episode, table.step, []))
+        stage = by_step.setdefault(table.step, Stage("", table.episode, table.step, []))
         stage.tables.append(table.values)
-    whole = [stage for stage in found.values() if len(stage.tables) == len(recording.agents)]
+    whole = [stage for stage in by_step.values() if len(stage.tables) == len(recording.agents)]
     if not whole:
         return []
     first, last = whole[0], whole[-1]
@@ -181,8 +181,8 @@ def _row(
     draw: Callable[[int, Bounds, str], str],
 ) -> MapRow:
     """Return the maps of some grids of values, a grid for each stage, drawn by number, bounds and title."""
-    known = np.concatenate([grid[~np.isnan(grid)] for grid in grids])
-    bounds = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+    numbers = np.concatenate([grid[~np.isnan(grid)] for grid in grids])
+    bounds = (float(numbers.min()), float(numbers.max())) if len(numbers) else (0.0, 0.0)
     svgs = []
     for i, (stage, grid) in enumerate(zip(stages, grids, strict=True)):
         span = "no action is preferred anywhere"

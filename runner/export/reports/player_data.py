@@ -144,12 +144,12 @@ def logged_near(recording: Recording, phase: str, time: Sequence[int]) -> list[L
     """
     tick = schema.STEP_NANOSECONDS
     times = range(max(0, time[0] - _NEAR) * tick, (time[-1] + _NEAR) * tick + 1)
-    found: dict[str, Logged] = {}
+    by_name: dict[str, Logged] = {}
     count = 0
 
     def add(name: str, log_time: int, value: Value) -> None:
         name = name[:_MAX_LETTERS]
-        one = found.setdefault(name, Logged(name, [], []))
+        one = by_name.setdefault(name, Logged(name, [], []))
         one.at.append(log_time // tick)
         one.values.append(value)
 
@@ -157,7 +157,7 @@ def logged_near(recording: Recording, phase: str, time: Sequence[int]) -> list[L
         for report in recording.decoded(schema.TRAIN_METRICS_TOPIC, times=times):
             for name in ("epsilon", "step_size", "mean_length"):
                 add(name.replace("_", " "), report["log_time"], short(report[name]))
-        return list(found.values())
+        return list(by_name.values())
     for scalar in recording.decoded(schema.SCALAR_TOPIC, times=times):
         own = scalar["name"] if scalar["phase"] == phase else f"{scalar['name']} ({scalar['phase']})"
         add(own, scalar["log_time"], short(scalar["value"]))
@@ -169,7 +169,7 @@ def logged_near(recording: Recording, phase: str, time: Sequence[int]) -> list[L
         count += 1
         if count >= MAX_LOGGED:
             break
-    return list(found.values())
+    return list(by_name.values())
 
 
 def short(value: float) -> Value:

@@ -85,8 +85,8 @@ def environment_of(folders: Sequence[Traversable]) -> Environment:
     import jinja2
 
     def source(name: str) -> str | None:
-        found = next((folder / name for folder in folders if (folder / name).is_file()), None)
-        return None if found is None else found.read_text("utf-8")
+        file = next((folder / name for folder in folders if (folder / name).is_file()), None)
+        return None if file is None else file.read_text("utf-8")
 
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(source),

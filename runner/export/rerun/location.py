@@ -75,10 +75,10 @@ def locate_divergence(runs: Sequence[Run]) -> tuple[StepRef | None, str]:
                 None,
                 "Where they diverge is unknown: states or actions differ, or steps were not recorded.",
             )
-        found = list(divergences(a, b))
-        both = [each for each in found if None not in (each.a_step, each.b_step)]
+        places = list(divergences(a, b))
+        both = [each for each in places if None not in (each.a_step, each.b_step)]
         if not both:
-            suffix = ", as far as the shorter goes" if found else ""
+            suffix = ", as far as the shorter goes" if places else ""
             return None, f"They never diverge: every step is the same{suffix}."
         words = f"They diverge {where_in_words(both[0])}."
         if a.environments == 1:

@@ -47,7 +47,7 @@ def _parts(recording: Recording, agent: str = "") -> dict[str, list[Part]]:
     if recording.kind == "step":
         fields = {"observation": "state", "action": "action"}
         return {part: [((field,), least_number(spaces[part]), [field])] for part, field in fields.items()}
-    found: dict[str, list[Part]] = {}
+    by_part: dict[str, list[Part]] = {}
     for part, field in (("observation", "next_observation"), ("action", "action")):
         leaves = [
             leaf
@@ -57,8 +57,8 @@ def _parts(recording: Recording, agent: str = "") -> dict[str, list[Part]]:
         count = sum(math.prod(leaf.dtype.shape) for leaf in leaves if leaf.dtype is not None)
         if recording.kind != "variable" and 0 < count <= MAX_LINES:
             names = [list(number_names(leaf, part, skip=1 if agent else 0)) for leaf in leaves]
-            found[part] = [((field, *leaf.path), 0, own) for leaf, own in zip(leaves, names, strict=True)]
-    return found
+            by_part[part] = [((field, *leaf.path), 0, own) for leaf, own in zip(leaves, names, strict=True)]
+    return by_part
 
 
 def numbers_in(steps: NDArray[np.void], path: tuple[str, ...]) -> NDArray[np.float64]:

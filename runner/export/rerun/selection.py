@@ -217,10 +217,10 @@ def _steps_without_values(recording: Recording, ranges: Sequence[range]) -> int:
         return 0
     from runner.replay.tables import known_steps  # loads Numba
 
-    known, unknown = known_steps(recording), 0
+    spans, unknown = known_steps(recording), 0
     for steps in ranges:
         for block in recording.blocks(schema.TRAIN_STEP, steps.start, steps.stop):
-            inside = [(block["step"] >= first) & (block["step"] <= last) for first, last in known]
+            inside = [(block["step"] >= first) & (block["step"] <= last) for first, last in spans]
             unknown += len(block) - int(np.any(inside, axis=0).sum())
     return unknown
 

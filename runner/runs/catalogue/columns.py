@@ -242,13 +242,13 @@ def as_json(row: IndexRow, columns: Sequence[str] = DEFAULT_JSON) -> dict[str, o
 
 def as_text(row: IndexRow, name: str) -> str:
     """Return the value of a column as a table shows it."""
-    found = value(row, name)
-    if name == "episodes" and row["episodes_to_do"] not in (None, found):
-        return f"{UNKNOWN if found is None else f'{found:,}'} of {row['episodes_to_do']:,}"
+    content = value(row, name)
+    if name == "episodes" and row["episodes_to_do"] not in (None, content):
+        return f"{UNKNOWN if content is None else f'{content:,}'} of {row['episodes_to_do']:,}"
     if name.startswith(SETTING):
-        return UNKNOWN if found is None else setting(found)
+        return UNKNOWN if content is None else setting(content)
     column = _column(name)
-    return column.if_empty if found is None or found in ([], {}) else column.show(found)
+    return column.if_empty if content is None or content in ([], {}) else column.show(content)
 
 
 def _column(name: str) -> Column:

@@ -106,8 +106,8 @@ def create(path: str) -> SqliteDatabase:
 
 def tuples_of(database: SqliteDatabase, query: Expression) -> Iterator[SqlRow]:
     """Return the rows of a query as tuples of SQLite's values, without peewee's conversions."""
-    found: Iterator[SqlRow] = database.execute(query)  # type: ignore[no-untyped-call]
-    return found
+    rows: Iterator[SqlRow] = database.execute(query)  # type: ignore[no-untyped-call]
+    return rows
 
 
 def write_rows(database: SqliteDatabase, rows: Sequence[Mapping[str, object]]) -> None:

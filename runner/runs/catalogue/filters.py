@@ -189,8 +189,8 @@ class _Translation:
             else:
                 column = getattr(Row, field.stored[0])
                 if sign == "=" and value == "*":
-                    known = column.is_null(False)
-                    return known & (column != "") if field.kind in TEXT_KINDS else known
+                    has_value = column.is_null(False)
+                    return has_value & (column != "") if field.kind in TEXT_KINDS else has_value
                 condition = _condition(field, column, sign, value, self._now)
         except ValueError as error:
             raise self._error(item, f"{field.name}: found {value!r}, expected {error}") from None
@@ -208,11 +208,11 @@ class _Translation:
 
 def _syntax_error(text: str, message: str) -> RunnerError:
     """Return the error for a text that is no filter, given the parser's message."""
-    found = _PLACE.fullmatch(message)
-    if found is None:
+    match = _PLACE.fullmatch(message)
+    if match is None:
         return RunnerError(f"filter: {message}")
-    what = " ".join(found[1].split())
-    at = int(found[2]) if found[2] else len(text)
+    what = " ".join(match[1].split())
+    at = int(match[2]) if match[2] else len(text)
     if "maybe due to unmatched" in what:
         what = "ends where a value or a ')' is expected"
     elif text[at : at + 1] == "-":
@@ -249,7 +249,7 @@ def _pattern(value: str) -> str:
     """Return a word as a pattern for `matches`; * and ? are wildcards unless quoted or escaped."""
     if len(value) > 1 and value[0] == value[-1] == '"':
         return glob.escape(_plain(value))
-    pieces = (found.groups() for found in _PIECE.finditer(value))
+    pieces = (match.groups() for match in _PIECE.finditer(value))
     return "".join(wild or glob.escape(escaped or plain or stray) for escaped, wild, plain, stray in pieces)
 
 
@@ -298,7 +298,7 @@ def setting_path(path: str) -> str:
 def _setting_condition(path: str, sign: str, value: str) -> object:
     """Return the condition that a value of the configuration compares so."""
     kind = fn.json_type(Row.settings, setting_path(path))
-    found = fn.json_extract(Row.settings, setting_path(path))
+    setting = fn.json_extract(Row.settings, setting_path(path))
     plain = _plain(value)
     numeric = kind.in_(("integer", "real"))
     try:
@@ -308,12 +308,12 @@ def _setting_condition(path: str, sign: str, value: str) -> object:
     if sign != "=":
         if number is None:
             raise ValueError("a number: text has no order")
-        return numeric & _OPERATORS[sign](found, number)
+        return numeric & _OPERATORS[sign](setting, number)
     if value == "*":
         return kind.is_null(False)
-    as_text = (kind == "text") & fn.matches(found, _pattern(value))
+    as_text = (kind == "text") & fn.matches(setting, _pattern(value))
     if number is not None:
-        return as_text | (numeric & (found == number))
+        return as_text | (numeric & (setting == number))
     return as_text | (kind == plain) if plain in ("true", "false", "null") else as_text
 
 
@@ -326,12 +326,12 @@ def number_of(text: str) -> int | float:
     if re.fullmatch(r"[+-]?\d{1,18}", text, re.ASCII):
         return int(text)
     try:
-        found = float(text)
+        number = float(text)
     except ValueError:
-        found = math.nan
-    if not math.isfinite(found) or "_" in text:
+        number = math.nan
+    if not math.isfinite(number) or "_" in text:
         raise ValueError(Kind.NUMBER.value)
-    return found
+    return number
 
 
 def seed_of(text: str) -> int:
@@ -343,10 +343,10 @@ def seed_of(text: str) -> int:
 
 def size_of(text: str) -> float:
     """Return a number of bytes: `1500`, `10MB`, `1.5 GB`."""
-    found = _SIZE.fullmatch(text)
-    if found is None:
+    match = _SIZE.fullmatch(text)
+    if match is None:
         raise ValueError(Kind.SIZE.value)
-    return float(found[1]) * _BYTES[found[2].lower()]
+    return float(match[1]) * _BYTES[match[2].lower()]
 
 
 def date_span(text: str) -> tuple[int, int]:
@@ -364,10 +364,10 @@ def date_span(text: str) -> tuple[int, int]:
 
 def seconds_of(text: str) -> float:
     """Return a time span in seconds: `90s`, `12h`, `30d`, `2w`."""
-    found = _SPAN.fullmatch(text)
-    if found is None or len(found[1]) > 12:
+    match = _SPAN.fullmatch(text)
+    if match is None or len(match[1]) > 12:
         raise ValueError(Kind.AGE.value)
-    return float(found[1]) * _SECONDS[found[2]]
+    return float(match[1]) * _SECONDS[match[2]]
 
 
 @functools.lru_cache(256)

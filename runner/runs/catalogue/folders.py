@@ -61,8 +61,8 @@ class Folders:
 
     def differences(self) -> list[Difference]:
         """Return how the folders, as they were at the first call, differ from the index as it is now."""
-        found = [self._difference(root) for root in self._roots]
-        return [each for each in found if each.changed or each.died or each.gone]
+        all_differences = [self._difference(root) for root in self._roots]
+        return [each for each in all_differences if each.changed or each.died or each.gone]
 
     def apply(self, found: Sequence[Difference]) -> None:
         """Read what changed and write it to the index, a transaction for each batch."""
@@ -80,8 +80,8 @@ class Folders:
 
     def expire(self) -> None:
         """Have all runs of these folders read again, and delete the rows of folders that no longer exist."""
-        known = [root for (root,) in tuples_of(self._database, Row.select(Row.root).distinct())]
-        stale = [root for root in known if not os.path.isdir(root)]  # noqa: PTH112
+        roots = [root for (root,) in tuples_of(self._database, Row.select(Row.root).distinct())]
+        stale = [root for root in roots if not os.path.isdir(root)]  # noqa: PTH112
         Row.delete().where(Row.root.in_(stale)).execute(self._database)
         Row.update(fingerprint="", mark="").where(Row.root.in_(self._roots)).execute(self._database)
 
@@ -89,9 +89,9 @@ class Folders:
         """Return the difference of one folder; entries without files of a run are left out, or gone."""
         stored = Row.mark if self._quick else Row.fingerprint
         own = Row.select(Row.entry, stored).where(Row.root == root)
-        known: dict[str, str] = dict(tuples_of(self._database, own))
+        indexed: dict[str, str] = dict(tuples_of(self._database, own))
         tokens = self._tokens_of(root)
-        changed = [entry for entry, token in tokens.items() if known.get(entry) != token]
+        changed = [entry for entry, token in tokens.items() if indexed.get(entry) != token]
         unsteady = (Row.status == "running") | (Row.stable == False)  # noqa: E712 - an expression of SQL
         rows = Row.select(Row.entry, Row.status, Row.stable).where((Row.root == root) & unsteady)
         running = set()
@@ -99,13 +99,13 @@ class Folders:
             if status == "running":
                 running.add(entry)
             may_differ = not stable or self._quick  # the recording of a running one grows in place
-            if may_differ and known.get(entry) == tokens.get(entry) and entry not in self._read[root]:
+            if may_differ and indexed.get(entry) == tokens.get(entry) and entry not in self._read[root]:
                 changed.append(entry)
         unchanged = running - set(changed)
         died = [entry for entry in unchanged if entry in tokens and not _is_running(root, entry)]
         there = [entry for entry in dict.fromkeys(changed) if _state_of(root, entry) is not None]
-        missing = {*known} - {*tokens} | {*changed} - {*there}
-        gone = [entry for entry in missing if entry in known and _state_of(root, entry) is None]
+        missing = {*indexed} - {*tokens} | {*changed} - {*there}
+        gone = [entry for entry in missing if entry in indexed and _state_of(root, entry) is None]
         return Difference(root, there, died, gone)
 
     def _tokens_of(self, root: str) -> dict[str, str]:

@@ -98,14 +98,14 @@ class Index:
 
     def _at(self, places: Sequence[SqlRow], columns: Sequence[str] | None) -> list[IndexRow]:
         """Return the rows of folders, given by root and entry, in their order."""
-        found: dict[tuple[str, str], IndexRow] = {}
+        by_place: dict[tuple[str, str], IndexRow] = {}
         for root in {root for root, _ in places}:
             for entries in chunked([entry for there, entry in places if there == root], _MAX_VALUES):
                 some: Expression = Row.select(*_stored(columns)).where(
                     (Row.root == root) & Row.entry.in_(entries)
                 )
-                found |= {(root, row["entry"]): row for row in some.dicts().bind(self._database)}
-        return [found[place] for place in places]
+                by_place |= {(root, row["entry"]): row for row in some.dicts().bind(self._database)}
+        return [by_place[place] for place in places]
 
     def originals(self, digests: Sequence[str] | None = None) -> dict[str, tuple[str, str, str]]:
         """Return root, entry and id of the first run with each content that was recorded twice or more.
@@ -144,19 +144,19 @@ class Index:
             if top in above or len(above) == MAX_TREE:
                 break  # a configuration that names itself
             above.add(top)
-        found = {row["id"]: row for row in self.rows(Filter(Row.id == top), columns=columns)}
+        by_id = {row["id"]: row for row in self.rows(Filter(Row.id == top), columns=columns)}
         below: dict[str, list[str]] = {}
         level = [top]
-        while level and len(found) < MAX_TREE:
+        while level and len(by_id) < MAX_TREE:
             rows = self.select(Filter(Row.parent.in_(level[:_MAX_VALUES])), Row.created, columns=columns)
-            new = {row["id"]: row for row in rows[: MAX_TREE - len(found)] if row["id"] not in found}
+            new = {row["id"]: row for row in rows[: MAX_TREE - len(by_id)] if row["id"] not in by_id}
             for row in new.values():
                 below.setdefault(row["parent"], []).append(row["id"])
-            found |= new
+            by_id |= new
             level = list(new)
 
         def node(name: str) -> BranchNode:
-            row = found.get(name, {})
+            row = by_id.get(name, {})
             return BranchNode(
                 run=name,
                 name=row.get("name"),
@@ -192,8 +192,8 @@ class Index:
         return [Candidate(*row) for row in query.limit(limit).tuples().bind(self._database)]
 
     def _of(self, chosen: Filter, *columns: Expression) -> Expression:
-        known = Row.root.in_(self.roots) & Row.id.is_null(False)
-        return Row.select(*columns).where(known if chosen.condition is None else known & chosen.condition)
+        is_run = Row.root.in_(self.roots) & Row.id.is_null(False)
+        return Row.select(*columns).where(is_run if chosen.condition is None else is_run & chosen.condition)
 
     def _tuples(self, query: Expression) -> Iterator[SqlRow]:
         return tuples_of(self._database, query)
@@ -210,8 +210,8 @@ class Index:
             if list(self._tuples(some.where(kind.is_null(False)))) or not list(self._tuples(some)):
                 continue
             newest = self._of(ANY_RUN, Row.settings).order_by(Row.created.desc()).limit(200)
-            known = {path for (settings,) in self._tuples(newest) for path in json.loads(settings)}
-            raise RunnerError(f"filter: no run's configuration has {path!r}.{nearest(path, known)}")
+            paths = {path for (settings,) in self._tuples(newest) for path in json.loads(settings)}
+            raise RunnerError(f"filter: no run's configuration has {path!r}.{nearest(path, paths)}")
 
 
 def look(

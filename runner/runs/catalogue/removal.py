@@ -188,21 +188,21 @@ def unwanted(index: Index, criteria: Criteria, now: float) -> tuple[list[IndexRo
             if seen[row["config"]] < criteria.keep_last:
                 spared.add((row["root"], row["entry"]))
             seen[row["config"]] += 1
-    going, kept = [], Counter[str]()
+    going, staying = [], Counter[str]()
     for row in rows:
         if (row["root"], row["entry"]) in spared:
             continue
         if criteria.statuses and row["status"] not in criteria.statuses:
             continue
         if row["status"] == "running":
-            kept["running"] += 1
+            staying["running"] += 1
         elif KEEP in row["tags"].split():
-            kept[f"tagged {KEEP}"] += 1
+            staying[f"tagged {KEEP}"] += 1
         elif row["status"] == "archived" and not criteria.statuses:
-            kept["archived"] += 1
+            staying["archived"] += 1
         else:
             going.append(row)
-    return going, kept
+    return going, staying
 
 
 def _why_not_in(run: Run, root: Path) -> str:
@@ -239,8 +239,8 @@ def _unreadable(folder: Path) -> str:
 def _delete(folder: Path, foreign: bool) -> None:
     """Delete the run's files in a folder, foreign ones first if `foreign`, and the folder."""
     with os.scandir(folder) as entries:
-        found = sorted(entries, key=lambda entry: belongs(entry.name))
-    for entry in found:
+        in_order = sorted(entries, key=lambda entry: belongs(entry.name))
+    for entry in in_order:
         if entry.is_dir(follow_symlinks=False):
             if foreign:
                 shutil.rmtree(entry.path)

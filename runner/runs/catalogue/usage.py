@@ -74,7 +74,7 @@ def contents_of(folder: str | Path) -> Contents:
     Raises:
         OSError: it cannot be read.
     """
-    found = Contents()
+    contents = Contents()
     with os.scandir(folder) as entries:
         for entry in entries:
             try:
@@ -84,16 +84,16 @@ def contents_of(folder: str | Path) -> Contents:
             own = stat.S_ISREG(facts.st_mode) and belongs(entry.name)
             size = _size_within(entry.path) if stat.S_ISDIR(facts.st_mode) else facts.st_size
             if entry.name == RECORDING_FILE and own:
-                found.recording = size
+                contents.recording = size
             else:
-                found.other += size
+                contents.other += size
             if own:
-                found.freed += size if facts.st_nlink == 1 else 0
-                found.left_over += size if _LEFT_OVER.fullmatch(entry.name) else 0
+                contents.freed += size if facts.st_nlink == 1 else 0
+                contents.left_over += size if _LEFT_OVER.fullmatch(entry.name) else 0
             else:
-                found.foreign.append(entry.name)
-    found.foreign.sort()
-    return found
+                contents.foreign.append(entry.name)
+    contents.foreign.sort()
+    return contents
 
 
 def belongs(name: str) -> bool:
@@ -107,19 +107,19 @@ def cached(part: str) -> Counter[str]:
     Args:
         part: the folder in the cache: `EXPORTS`, `TABLES` or `RESTORED`.
     """
-    found: Counter[str] = Counter()
+    by_run: Counter[str] = Counter()
     with contextlib.suppress(OSError), os.scandir(cache_folder() / part) as entries:
         for entry in entries:
             is_folder = entry.is_dir(follow_symlinks=False)
             size = _size_within(entry.path) if is_folder else entry.stat(follow_symlinks=False).st_size
-            found[_KEY.sub("", entry.name).partition(RUN_SEPARATOR)[0]] += size
-    return found
+            by_run[_KEY.sub("", entry.name).partition(RUN_SEPARATOR)[0]] += size
+    return by_run
 
 
 def sizes(usages: Sequence[Usage | Sums]) -> dict[str, int]:
     """Return the bytes that runs use together, by kind, and their total."""
-    found = {kind: sum(getattr(usage, kind) for usage in usages) for kind in KINDS}
-    return found | {"total": sum(found.values())}
+    by_kind = {kind: sum(getattr(usage, kind) for usage in usages) for kind in KINDS}
+    return by_kind | {"total": sum(by_kind.values())}
 
 
 @dataclass(frozen=True)
@@ -215,8 +215,10 @@ def usage_of(
                 contents = contents_of(f"{root}{os.sep}{entry}")
             except OSError:
                 contents = Contents()  # removed just now
-            kept = checkpoints[root].get(entry, 0)
-            usage = Usage(row, contents.recording, contents.other, kept, exports[run_id], restored[run_id])
+            checkpoint_bytes = checkpoints[root].get(entry, 0)
+            usage = Usage(
+                row, contents.recording, contents.other, checkpoint_bytes, exports[run_id], restored[run_id]
+            )
             sums.add(usage, contents)
             yield usage
 

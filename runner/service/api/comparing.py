@@ -93,7 +93,7 @@ async def curves(
     smooth: Smooth = 0,
 ) -> Response:
     """Return every metric over an axis, runs that differ in nothing but the seed as one curve with a band."""
-    paths = [found.recording for found in await found_runs(catalogue, run)]
+    paths = [each.recording for each in await found_runs(catalogue, run)]
     options = (axis, metric or [], start, stop, points, lines, smooth)
     return await compute.json(computed.curves, paths, *options)
 
@@ -125,7 +125,7 @@ async def compare(
     ] = None,
 ) -> Response:
     """Return what `dualtaxi compare --json` prints; a run's name stands for all runs of that name."""
-    paths = [found.recording for found in await found_runs(catalogue, run, several=True)]
+    paths = [one.recording for one in await found_runs(catalogue, run, several=True)]
     options = (by, metric or [], moment, target, axis, normalise)
     return await compute.json(computed.comparison, paths, *options)
 
@@ -138,8 +138,8 @@ async def found_runs(catalogue: Catalogue, names: list[str], several: bool = Fal
 
     def find() -> list[Run]:
         if several:
-            found = {run.folder: run for name in names for run in catalogue.find_all(name)}
-            return [recorded_run(run) for run in found.values()]
+            by_folder = {run.folder: run for name in names for run in catalogue.find_all(name)}
+            return [recorded_run(run) for run in by_folder.values()]
         return [recorded_run(catalogue.find(name)) for name in names]
 
     return await run_in_threadpool(find)

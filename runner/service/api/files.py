@@ -146,8 +146,8 @@ def tag_of(run: Run) -> str:
 
 def _file(path: pathlib.Path, name: str, tag: str, if_none_match: str | None) -> Response:
     headers = {"etag": f'"{tag}"', "accept-ranges": "bytes"}
-    known = [part.strip().removeprefix("W/") for part in (if_none_match or "").split(",")]
-    if f'"{tag}"' in known or "*" in known:
+    tags = [part.strip().removeprefix("W/") for part in (if_none_match or "").split(",")]
+    if f'"{tag}"' in tags or "*" in tags:
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
     return _File(path, media_type=MEDIA, filename=name, headers=headers)
 

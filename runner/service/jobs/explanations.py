@@ -68,8 +68,8 @@ def check_explanation(given: ExplainQuestion, recordings: Path) -> CheckedJob:
 
 def _refuse_initial_path(source: str, recordings: Path) -> None:
     """Refuse a run whose configuration names a recording by its path, before that is read."""
-    known = shipped().get(source)
-    if known is not None and known.kind == "experiment":
+    experiment = shipped().get(source)
+    if experiment is not None and experiment.kind == "experiment":
         return  # it is meant, not a run of this name
     with contextlib.suppress(RunNotFound):  # reported later
         start = find_run(source, recordings).file.config.get("initial_q")
@@ -95,7 +95,7 @@ def run_explain_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
         with slotted_workers(spec, channel, question.mixtures[1]) as workers:
             while True:
                 try:
-                    found = answer(question, workers, report, stop=channel.stop)
+                    result = answer(question, workers, report, stop=channel.stop)
                     break
                 except ExplanationBusy:  # another job or command asks for another metric, or more seeds
                     report(0, 0, BUSY)
@@ -104,7 +104,7 @@ def run_explain_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
                     time.sleep(REPORT_SECONDS)
     except KeyboardInterrupt:
         return Outcome("interrupted")
-    channel.send(tuple(map(LogEvent, summary(found))))
+    channel.send(tuple(map(LogEvent, summary(result))))
     return Outcome("finished")
 
 

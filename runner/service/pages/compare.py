@@ -199,9 +199,9 @@ async def divergence(
 ) -> Response:
     """Show the first step at which two runs differ, and the cause."""
     runs = _two(await _chosen(catalogue, run))
-    found = await compute.shown(ShownDifference, fragments.difference, *runs)
+    difference = await compute.shown(ShownDifference, fragments.difference, *runs)
     compared = _compared(runs, "/divergence")
-    view = _DivergenceView(compared, found)
+    view = _DivergenceView(compared, difference)
     return await run_in_threadpool(page, request, view)
 
 

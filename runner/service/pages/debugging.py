@@ -60,10 +60,10 @@ async def when(
         return page(request, _WhenView(*form))
     options = (expression, every, first or None, last or None, INTERVALS)
     try:
-        found = await compute.shown(ShownWhen, fragments.when, run.recording, *options)
+        result = await compute.shown(ShownWhen, fragments.when, run.recording, *options)
     except RunnerError as error:
         return page(request, _WhenView(*form, None, message_of(error, request)), HTTPStatus.BAD_REQUEST)
-    return page(request, _WhenView(*form, found))
+    return page(request, _WhenView(*form, result))
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ async def what_if(
     step = StepRef.parse(at)
     shown_t = step.t if t is None else t
     start = max(0, shown_t - BEFORE)
-    found = await compute.shown(ShownBranches, fragments.what_if_page, run, step, action, start, STEPS)
+    branches = await compute.shown(ShownBranches, fragments.what_if_page, run, step, action, start, STEPS)
 
     def show() -> Response:
         view = _WhatIfView(
@@ -136,9 +136,9 @@ async def what_if(
             here="replay",
             at=str(step),
             title=f"What if? {step.episode_name}, step {step.t:,}",
-            found=found,
-            step=shown_step(found.part, shown_t),
-            source=f"/api/v1/runs/{run.run_id}/what-if/{step}/{found.action}",
+            found=branches,
+            step=shown_step(branches.part, shown_t),
+            source=f"/api/v1/runs/{run.run_id}/what-if/{step}/{branches.action}",
             recorded=f"/runs/{run.run_id}/replay/{step.episode_path}?t={step.t}",
         )
         return page(request, view)

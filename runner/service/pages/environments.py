@@ -92,11 +92,11 @@ def _episodes_at(recording: Recording, place: EpisodePlace, span: range) -> list
     """Return each environment and the number of its episode at the first step of another one, if it ended."""
     topic, n = recording.topic(f"/{place.phase}/episode"), span.step
     begin = span.start // n * n
-    found = {span.start % n: place.number}
+    by_environment = {span.start % n: place.number}
     for block in recording.blocks(topic, recording.first_from(topic, "last_step", begin)):
         for last, number in zip(block["last_step"].tolist(), block["episode"].tolist(), strict=True):
             if last >= begin:
-                found.setdefault(last % n, number)
-        if len(found) == n:
+                by_environment.setdefault(last % n, number)
+        if len(by_environment) == n:
             break
-    return sorted(found.items())
+    return sorted(by_environment.items())

@@ -75,9 +75,11 @@ async def explain(request: Request, sent: Form, jobs: JobsOf) -> Response:
 @router.get("/sweeps/explanations/{pair}/{metric}")
 def explanation(request: Request, pair: Part, metric: Part, settings: SettingsOf) -> Response:
     """Show an explanation."""
-    found = found_explanation(pair, metric, settings)
-    first, *others = sections(found)
-    return page(request, _ExplanationView(first.title, first.sentences, _links(found), plots(found), others))
+    result = found_explanation(pair, metric, settings)
+    first, *others = sections(result)
+    return page(
+        request, _ExplanationView(first.title, first.sentences, _links(result), plots(result), others)
+    )
 
 
 def _links(found: Explanation) -> list[Link]:

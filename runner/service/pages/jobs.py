@@ -91,20 +91,20 @@ def queue_status(request: Request, jobs: JobsOf, number: PageNumber = 1) -> Resp
 def job(request: Request, jobs: JobsOf, number: Number) -> Response:
     """Show a job: its progress, its log, its runs."""
     events, place = jobs.store.last_events(number, MAX_LINES)
-    found = jobs.store.job(number)  # read after its log: the script of the page receives later events
+    own_job = jobs.store.job(number)  # read after its log: the script of the page receives later events
     view = _JobView(
-        job=shown_job(found, jobs),
+        job=shown_job(own_job, jobs),
         log=events,
         place=place,
         submitted=jobs.store.submitted(number),
-        is_over=found.is_over,
-        seconds=_seconds(found),
+        is_over=own_job.is_over,
+        seconds=_seconds(own_job),
         explanations=[
             name
             for name in (
-                explanations_in(jobs.recordings) if found.kind == "explain" and found.is_over else ()
+                explanations_in(jobs.recordings) if own_job.kind == "explain" and own_job.is_over else ()
             )
-            if name.startswith(f"{found.name}/")
+            if name.startswith(f"{own_job.name}/")
         ],
     )
     return page(request, view)

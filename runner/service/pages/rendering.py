@@ -154,7 +154,7 @@ def _error_page(request: Request, response: Response) -> Response:
         return response
     status = HTTPStatus(response.status_code)
     message = json.loads(bytes(response.body))["error"]["message"]
-    found = page(request, _ProblemView(status.phrase.capitalize(), message), status)
+    error_page = page(request, _ProblemView(status.phrase.capitalize(), message), status)
     headers = {key: value for key, value in response.headers.items() if not key.startswith("content-")}
-    found.headers.update(headers)
-    return found
+    error_page.headers.update(headers)
+    return error_page

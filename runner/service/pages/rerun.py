@@ -89,9 +89,9 @@ async def frame(
         recording=link(f"/api/v1/runs/{run.run_id}/replay.rrd", query),
         step=int(time),
     )
-    found = page(request, view)
-    found.headers["content-security-policy"] = FRAME_POLICY
-    return found
+    response = page(request, view)
+    response.headers["content-security-policy"] = FRAME_POLICY
+    return response
 
 
 @router.api_route("/static/rerun/{number}/{name}", methods=["GET", "HEAD"])

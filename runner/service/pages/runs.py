@@ -170,8 +170,8 @@ def _view(catalogue: Catalogue, text: str, sort: str, columns: str, number: int)
     is_usual = list(shown) == list(USUAL)
 
     def work(index: Index) -> tuple[list[IndexRow], int, int]:
-        found, total = index.page(chosen, *order, limit=ROWS, offset=(number - 1) * ROWS)
-        return index.with_same_as(found), total, index.count(Filter(None)) if text else total
+        shown_rows, total = index.page(chosen, *order, limit=ROWS, offset=(number - 1) * ROWS)
+        return index.with_same_as(shown_rows), total, index.count(Filter(None)) if text else total
 
     rows, total, all_runs = catalogue.read(work)
     query = {"filter": text, "sort": sort, "columns": "" if is_usual else ",".join(shown)}

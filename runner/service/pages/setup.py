@@ -104,16 +104,16 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
 @router.get("/code")
 def code(request: Request, run: RecordedRun, recording: OpenRecording) -> Response:
     """Show the user's code and the installed packages."""
-    provenance, problem, found = recording.provenance, "", Code()
+    provenance, problem, recorded = recording.provenance, "", Code()
     try:
-        found = recording.code
+        recorded = recording.code
     except RecordingError as error:
         problem = message_of(error, request)
-    patch = found.patch.splitlines()
+    patch = recorded.patch.splitlines()
     files = [
-        CodeFile(path, "not in the commit" if path in found.new else "", text)
+        CodeFile(path, "not in the commit" if path in recorded.new else "", text)
         for path, text in sorted(
-            found.files.items(), key=lambda file: file[0] != provenance.get("code.script")
+            recorded.files.items(), key=lambda file: file[0] != provenance.get("code.script")
         )
     ]
     is_code = ("git", "code.")

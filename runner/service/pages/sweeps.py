@@ -76,21 +76,21 @@ class _SweepPageView(View):
 @router.get("")
 def sweeps(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Response:
     """Show the sweeps."""
-    found: list[ListedSweep] = []
+    listed_sweeps: list[ListedSweep] = []
     for folder in settings.recordings:
         for name in sweeps_in(folder):
             try:
                 sweep = read_sweep(name, folder)
             except RunnerError as error:
-                found.append(ListedSweep(name, message_of(error, request)))
+                listed_sweeps.append(ListedSweep(name, message_of(error, request)))
                 continue
             runs = _tagged(catalogue, name)
             parameters = ", ".join(sweep.file.parameters)
-            found.append(
+            listed_sweeps.append(
                 ListedSweep(name, "", sweep.file.strategy, parameters, sweep.objective.description, runs)
             )
     names = [name for folder in settings.recordings for name in explanations_in(folder)]
-    return page(request, _SweepsView(found, names))
+    return page(request, _SweepsView(listed_sweeps, names))
 
 
 @router.get("/{name}")
