@@ -44,7 +44,9 @@ def killed(folder, taxis):
     """A recording that was cut off, alone in its folder."""
     (folder / "cut").mkdir()
     path = folder / "cut" / "recording.mcap"
-    path.write_bytes(taxis.recording.read_bytes()[:-30_000])
+    data = taxis.recording.read_bytes()
+    summary = int.from_bytes(data[-28:-20], "little")  # the footer has where it begins
+    path.write_bytes(data[: summary - 50])
     return path
 
 
