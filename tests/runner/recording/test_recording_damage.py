@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 import zlib
 from collections.abc import Iterator
@@ -18,7 +17,6 @@ from runner.errors import RecordingError, RunnerError
 from runner.execution.verify import verify
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
-from runner.recording.metadata import environment_description
 from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from runner.recording.rewriting import rewrite
@@ -333,43 +331,6 @@ def test_learners_without_names_are_refused(agents, lake, tmp_path):
     )
     with pytest.raises(RecordingError, match="its run has agents"):
         everything(path)
-
-
-ENVIRONMENT = {
-    **dict.fromkeys(("agents", "action_counts", "event_names", "success_events", "arrays"), ()),
-    **{"env_id": "A-v1", "kwargs": {}, "step_limit": 0, "penalty_below": None, "scene": None},
-}
-
-
-@pytest.mark.parametrize("key", ["arrays", "event_names", "success_events", "agents"])
-@pytest.mark.parametrize("names", [None, "wall", [1]])
-def test_an_environment_that_names_nothing_is_refused(key, names):
-    with pytest.raises(RecordingError, match=f"here: environment.json: found .* as {key}, expected a list"):
-        environment_description(json.dumps(ENVIRONMENT | {key: names}).encode(), "here")
-
-
-@pytest.mark.parametrize("key", sorted(ENVIRONMENT.keys() - {"scene"}))
-def test_an_environment_without_a_part_of_its_description_is_refused(key):
-    assert environment_description(json.dumps(ENVIRONMENT).encode(), "here")["env_id"] == "A-v1"
-    entries = {name: value for name, value in ENVIRONMENT.items() if name != key}
-    with pytest.raises(RecordingError, match=f"here: environment.json: found nothing as {key}, expected"):
-        environment_description(json.dumps(entries).encode(), "here")
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("env_id", [1], r"found \[1\] as env_id, expected a text"),
-        ("kwargs", 3, "found 3 as kwargs, expected an object"),
-        ("penalty_below", "x", "found 'x' as penalty_below, expected a number or null"),
-        ("action_counts", [-1], "expected a list of whole numbers"),
-        ("step_limit", True, "expected a whole number from 0 up"),
-        ("scene", "x", "a scene must have"),
-    ],
-)
-def test_an_impossible_value_in_the_description_of_an_environment_is_refused(key, value, message):
-    with pytest.raises(RecordingError, match=message):
-        environment_description(json.dumps(ENVIRONMENT | {key: value}).encode(), "here")
 
 
 def _text(text: str) -> bytes:
