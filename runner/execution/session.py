@@ -330,7 +330,7 @@ def evaluation_metrics(learner: Learner, evaluation: int, trials: Records) -> Me
         "successes": successes if has_success else -1,
         **{each.field: math.nan for each in METRICS},
         **{
-            each.field: each.combine(each.of_trials(trials)).tolist()
+            each.field: np.asarray(each.combine(each.of_trials(trials))).tolist()
             for each in defined_metrics(has_success, True)
         },
         "terminations": int(trials["terminated"].sum()),

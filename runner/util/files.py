@@ -39,8 +39,11 @@ def cache_folder() -> Path:
 
 def remove_oldest(folder: Path, pattern: str, keep: int) -> None:
     """Remove the files of a pattern in a folder, but for those that were changed last."""
-    files = sorted(folder.glob(pattern), key=lambda path: path.stat().st_mtime, reverse=True)
-    for old in files[keep:]:
+    changed = []
+    for path in folder.glob(pattern):
+        with contextlib.suppress(FileNotFoundError):  # another process removed it meanwhile
+            changed.append((path.stat().st_mtime, path))
+    for _, old in sorted(changed, reverse=True)[keep:]:
         old.unlink(missing_ok=True)
 
 

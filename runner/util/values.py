@@ -80,6 +80,8 @@ def flatten(
 
     Args:
         keep_empty: whether an empty mapping counts as a value.
+        prefix: what every key begins with.
+        separator: what stands between the keys of nested mappings.
     """
     flat: dict[str, object] = {}
     for key, value in values.items():
