@@ -20,7 +20,7 @@ from runner.loops.options import PackingOptions, options_of
 from runner.loops.recorded import RecordedAlone, require_pictures
 from runner.loops.rows import Rows
 from runner.loops.single_rows import ROWS
-from runner.loops.values import check_phase
+from runner.loops.values import UNCHANGEABLE, as_given, check_phase
 from runner.runs.run import Run
 
 
@@ -50,13 +50,14 @@ class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[object, object, object,
 
         A name keeps the dtype and the shape of its first value; a step need not have all names.
         """
+        given = action if action.__class__ in UNCHANGEABLE else as_given(action)
         result = self._env_step(action)
         try:
             observation, reward, terminated, truncated, info = result
             with self._lock:
                 if self._loop.active is not self._rows:
                     self._loop.activate(self._rows)
-                self._take(action, observation, reward, terminated, truncated)
+                self._take(given, observation, reward, terminated, truncated)
                 if extras is not None:
                     try:
                         self._take_extras(extras)

@@ -17,7 +17,7 @@ from runner.loops.makers import checked_make, game_maker_of
 from runner.loops.options import RecordOptions, options_of
 from runner.loops.recorded import RecordedAlone, require_pictures
 from runner.loops.single_rows import AgentRows
-from runner.loops.values import check_phase
+from runner.loops.values import as_given, check_phase
 from runner.loops.vector import by_field, require_fixed
 from runner.recording.spaces import Value
 from runner.replay.games import ByAgent, GameStepResult, Turns, is_in_turns
@@ -50,13 +50,14 @@ class RecordedParallel(RecordedAlone[AgentRows]):
         self, actions: Mapping[str, object], extras: Mapping[str, Mapping[str, object]] | None = None
     ) -> GameStepResult:
         """Take a step of all agents, and record it, with values of your own by agent and name."""
+        given = as_given(actions)
         result = self.env.step(actions)
         try:
             observations, rewards, terminated, truncated, infos = result
             with self._loop.lock:
                 self._loop.activate(self._rows)
                 over = not self.env.agents
-                self._rows.take_game(actions, observations, rewards, terminated, truncated, over)
+                self._rows.take_game(given, observations, rewards, terminated, truncated, over)
                 if extras is not None:
                     try:
                         self._take_extras(self._extras_by_name(extras))

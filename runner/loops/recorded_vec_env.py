@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from runner.errors import ConfigError
 from runner.loops.options import Arguments
 from runner.loops.recorded import Recorded
-from runner.loops.values import warn_user
+from runner.loops.values import as_given, warn_user
 from runner.loops.vec_env import VecEnvVector
 from runner.loops.vector import record_vector
 
@@ -89,7 +89,7 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
 
     def step_async(self, actions: object) -> None:
         """Begin a step in each environment."""
-        self._actions = actions
+        self._actions = as_given(actions)
         self._vector.step_async(actions)
 
     def step_wait(self) -> object:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import sys
 import warnings
 from collections.abc import Iterator, Mapping
@@ -14,12 +15,31 @@ from gymnasium.error import ResetNeeded
 from runner.errors import ConfigError, RecordingError
 from runner.recording import schema
 from runner.recording.chunks import MAX_CHUNK_BYTES
+from runner.recording.gym_values import SCALARS
+from runner.recording.spaces import Value
 from runner.util.arrays import Array
 from runner.util.jsonable import as_json, as_mapping
 from runner.util.values import is_utf8
 
 MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)
 _PACKAGE: Final = str(Path(__file__).parents[1])
+UNCHANGEABLE: Final = frozenset((bool, int, float, str, type(None), *SCALARS))
+"""Classes of values that nobody can change in place."""
+
+
+def as_given(action: Value) -> Value:
+    """Return a copy of an action before a step, as an environment may change its arrays in place."""
+    kind = action.__class__
+    if kind in UNCHANGEABLE:
+        return action
+    if kind is np.ndarray:
+        return action.copy()
+    if kind is dict:
+        return {key: as_given(part) for key, part in action.items()}
+    try:
+        return copy.deepcopy(action)
+    except Exception:  # such as a tensor with a gradient: it is recorded, or refused, as it is after the step
+        return action
 
 
 def lone_number(value: object, what: str) -> float:

@@ -22,7 +22,7 @@ from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, vector_maker_of
 from runner.loops.options import RecordOptions, options_of
 from runner.loops.recorded import Recorded, require_pictures, without_none
-from runner.loops.values import check_phase, frozen_options
+from runner.loops.values import as_given, check_phase, frozen_options
 from runner.loops.vector_rows import VectorRows
 from runner.recording.episode_log import Flags
 from runner.recording.spaces import Value
@@ -70,9 +70,10 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
                 over = self._rows.over
             if watch.steps > watch.due:
                 states = watch.before_step(over)
+        given = as_given(actions)
         result = self.env.step(actions)
         try:
-            self._record_step(actions, result, extras, over, states)
+            self._record_step(given, result, extras, over, states)
         except Exception as error:
             self._loop.fail(error)
         return result

@@ -74,6 +74,30 @@ def test_the_learning_curves_are_those_of_the_monitor(recordings):
     assert sorted(episodes["returns"][:, 0]) == sorted(monitored)
 
 
+class Halving(gymnasium.ActionWrapper):
+    """Changes its action in place, as some environments do."""
+
+    def action(self, action):
+        action *= 0.5
+        return action
+
+
+def make_halving():
+    return Halving(gymnasium.make("Pendulum-v1"))
+
+
+@pytest.mark.parametrize("vec_env", [DummyVecEnv, SubprocVecEnv])
+def test_actions_that_environments_change_in_place_are_recorded_as_given(recordings, vec_env):
+    envs = runner.record(vec_env([make_halving] * 2), name="halving", make=make_halving)
+    envs.reset()
+    for _ in range(5):
+        envs.step(np.full((2, 1), 0.8, np.float32))
+    envs.close()
+    with runner.open_recording(envs.run.recording) as recording:
+        rows = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+    assert np.array_equal(rows["action"], np.full((10, 1), 0.8, np.float32))
+
+
 class Watch(BaseCallback):
     """Keeps what the algorithm itself sees."""
 

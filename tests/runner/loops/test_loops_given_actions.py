@@ -1,0 +1,154 @@
+"""Actions are recorded as the policy gave them, also where the environment changes its arrays in place."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.lib.recfunctions import structured_to_unstructured
+
+import runner
+from tests.runner.loops.making import dualtaxi
+
+GIVEN = (0.8, -0.4)
+BOX = spaces.Box(-1, 1, (2,), np.float32)
+
+
+def halved(action: Any) -> Any:
+    """Halve every array of an action in place; return the sum of what they are then."""
+    if isinstance(action, np.ndarray):
+        action *= 0.5
+        return float(action.sum())
+    if isinstance(action, int | np.integer):
+        return 0.0
+    return sum(halved(part) for part in (action.values() if isinstance(action, dict) else action))
+
+
+class Halving(gymnasium.Env[Any, Any]):
+    """Changes its action in place, and pays the sum of what it is then."""
+
+    observation_space = spaces.Box(-9, 9, (1,), np.float32)
+
+    def __init__(self, action_space: spaces.Space[Any] = BOX) -> None:
+        self.action_space = action_space
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        return np.zeros(1, np.float32), halved(action), False, False, {}
+
+
+class HalvingVector(VectorEnv[Any, Any, Any]):
+    """A vector of its own class that changes its actions in place."""
+
+    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - as in Gymnasium
+    num_envs = 2
+    single_observation_space, single_action_space = Halving.observation_space, BOX
+    observation_space = batch_space(Halving.observation_space, 2)
+    action_space = batch_space(BOX, 2)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return np.zeros((2, 1), np.float32), {}
+
+    def step(self, actions: Any) -> Any:
+        actions *= 0.5
+        never = np.zeros(2, np.bool_)
+        return np.zeros((2, 1), np.float32), actions.sum(axis=1).astype(np.float64), never, never, {}
+
+
+class HalvingGame:
+    """A PettingZoo parallel game that changes its agents' actions in place."""
+
+    metadata = {"name": "halving"}  # noqa: RUF012 - as PettingZoo has it
+    possible_agents = ["a", "b"]  # noqa: RUF012
+    agents = possible_agents
+    unwrapped = property(lambda self: self)
+
+    def observation_space(self, agent: str) -> Any:
+        return Halving.observation_space
+
+    def action_space(self, agent: str) -> Any:
+        return BOX
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        return {agent: np.zeros(1, np.float32) for agent in self.agents}, {agent: {} for agent in self.agents}
+
+    def step(self, actions: Any) -> Any:
+        seen, infos = self.reset()
+        rewards = {agent: halved(actions[agent]) for agent in self.agents}
+        never = dict.fromkeys(self.agents, False)
+        return seen, rewards, never, never, infos
+
+    def close(self) -> None:
+        pass
+
+
+def make_sync() -> Any:
+    return SyncVectorEnv([Halving, Halving])
+
+
+def array() -> Any:
+    return np.array(GIVEN, np.float32)
+
+
+NESTED = spaces.Dict({"arm": BOX, "legs": spaces.Tuple((BOX, spaces.Discrete(3)))})
+
+
+def make_nested() -> Any:
+    return Halving(NESTED)
+
+
+def make_varying() -> Any:
+    return Halving(spaces.Sequence(BOX))
+
+
+WAYS: dict[str, tuple[Any, Any, Any, tuple[float, ...]]] = {
+    "one": (runner.record, Halving, array, GIVEN),
+    "parts": (
+        runner.record,
+        make_nested,
+        lambda: {"arm": array(), "legs": (array(), 2)},
+        (*GIVEN, *GIVEN, 2),
+    ),
+    "vector": (runner.record_vector, make_sync, lambda: np.tile(array(), (2, 1)), GIVEN),
+    "own vector": (runner.record_vector, HalvingVector, lambda: np.tile(array(), (2, 1)), GIVEN),
+    "game": (runner.record_parallel, HalvingGame, lambda: {"a": array(), "b": array()}, GIVEN * 2),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_the_action_of_the_policy_is_recorded_and_reproduces_the_run(way, tmp_path):
+    record, make, action, flat = WAYS[way]
+    with record(make(), tmp_path, name="halving", make=make) as rec:
+        rec.reset(seed=0)
+        for _ in range(3):
+            given = action()
+            rec.step(given)
+            changed = copy.deepcopy(action())
+            halved(changed)
+            assert repr(given) == repr(changed)  # what the environment was given is the caller's own array
+    with runner.open_recording(rec.run.recording) as recording:
+        rows = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+    recorded = rows["action"]
+    if recorded.dtype.names:
+        recorded = structured_to_unstructured(recorded)
+    floats = np.float32(recorded.reshape(-1, recorded.shape[-1]))
+    assert np.array_equal(floats, np.tile(np.float32(flat), (len(floats), 1)))
+    verified = dualtaxi(tmp_path, "verify", "halving", "--trust")
+    assert (verified.exit_code, "reproduced" in verified.output) == (0, True), verified.output
+
+
+def test_actions_of_varying_size_reproduce_the_run(tmp_path):
+    with runner.record(make_varying(), tmp_path, name="halving", make=make_varying) as rec:
+        rec.reset(seed=0)
+        for n in range(3):
+            rec.step(tuple(array() for _ in range(n)))
+    verified = dualtaxi(tmp_path, "verify", "halving", "--trust")
+    assert (verified.exit_code, "reproduced" in verified.output) == (0, True), verified.output
