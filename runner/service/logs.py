@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import math
 import os
 import queue
 import re
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from logging.handlers import QueueHandler, QueueListener
@@ -21,11 +23,15 @@ from runner.service.tokens import PREFIX
 
 NAME: Final = "dualtaxi.service"
 LOG: Final = logging.getLogger(NAME)
+FLOODS: Final = LOG.getChild("floods")
+"""For warnings that clients can cause at any rate."""
 MAX_WAITING: Final = 5_000
 """Lines that wait to be written; more, if nobody reads them, are dropped and counted."""
 FLUSH_SECONDS: Final = 2.0
 """How long the remaining lines may take at the end."""
-_LOGGERS: Final = (NAME, "uvicorn.error")
+_LOGGERS: Final = (NAME, "uvicorn.error", "asyncio")
+_REPEAT_SECONDS: Final = 1.0
+"""Time between two warnings of one kind by libraries or `FLOODS`."""
 _SECRET: Final = re.compile(re.escape(PREFIX) + r"[\w-]{20,}")
 _OWN: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName", "color_message"}
 _MAX_PATH: Final = 2_000
@@ -66,6 +72,7 @@ def logged_to(stream: TextIO, for_people: bool = False) -> Iterator[None]:
     """
     lines: queue.Queue[logging.LogRecord] = queue.Queue(MAX_WAITING)
     handler = _DroppingHandler(lines)
+    handler.addFilter(_Thinning())
     handler.setFormatter(TextFormatter() if for_people else JsonFormatter())
     for name in _LOGGERS:
         logger = logging.getLogger(name)
@@ -81,6 +88,28 @@ def logged_to(stream: TextIO, for_people: bool = False) -> Iterator[None]:
         end = threading.Thread(target=listener.stop, daemon=True)
         end.start()
         end.join(FLUSH_SECONDS)
+
+
+class _Thinning(logging.Filter):
+    """Passes one warning a second of each kind; `left_out` is the number dropped before it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._passed: dict[tuple[str, int], float] = {}
+        """When the last record of each statement was passed."""
+        self._left_out: Counter[tuple[str, int]] = Counter()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if record.name == NAME or record.levelno < logging.WARNING:
+            return True
+        statement = record.pathname, record.lineno
+        if record.created - self._passed.get(statement, -math.inf) < _REPEAT_SECONDS:
+            self._left_out[statement] += 1
+            return False
+        self._passed[statement] = record.created
+        if left_out := self._left_out.pop(statement, 0):
+            record.left_out = left_out
+        return True
 
 
 class _DroppingHandler(QueueHandler):

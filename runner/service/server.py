@@ -13,11 +13,16 @@ from fastapi import FastAPI
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from runner.errors import RunnerError
+from runner.service.logs import FLOODS
 from runner.service.settings import Limits, Settings
 
 MAX_HEAD_BYTES: Final = 64 << 10
 """Size of a request's target and headers."""
 BACKLOG: Final = 1024
+BURST: Final = 8
+"""Connections accepted at once; asyncio accepts this many before the first of them is known here."""
+OWN_DESCRIPTORS: Final = 64
+"""File descriptors of the service itself: log, databases, pipes of child processes, connections to accept."""
 _DISCARD: Final = struct.pack("ii", 1, 0)
 """The option SO_LINGER: discard unsent data when the socket is closed."""
 
@@ -52,10 +57,11 @@ def serve(app: FastAPI, settings: Settings, listening: socket.socket) -> None:
         loop="auto",
         ws="none",
         lifespan="off",
+        backlog=BURST,
         log_config=None,
         access_log=False,
         server_header=False,
-        limit_concurrency=settings.limits.connections,
+        limit_concurrency=max_connections(settings.limits) + 4 * BURST,  # with those that are being closed
         timeout_keep_alive=settings.limits.keep_alive_seconds,
         timeout_graceful_shutdown=settings.limits.stop_seconds,
         proxy_headers=settings.proxies != "",
@@ -71,12 +77,29 @@ def serve(app: FastAPI, settings: Settings, listening: socket.socket) -> None:
         loop.run(run())
 
 
+def max_connections(limits: Limits) -> int:
+    """Return the maximum number of connections; each may need a second descriptor, for a file it reads."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return limits.connections
+    descriptors, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if descriptors == resource.RLIM_INFINITY:
+        return limits.connections
+    return min(limits.connections, max(BURST, (descriptors - OWN_DESCRIPTORS) // 2))
+
+
 class _Server(uvicorn.Server):
     """Ends event streams when the server stops."""
 
     def __init__(self, config: uvicorn.Config, stopping: asyncio.Event) -> None:
         super().__init__(config)
         self._stopping = stopping
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        for listening in sockets or ():
+            listening.listen(BACKLOG)  # uvicorn also limits the waiting connections to a burst
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         super().handle_exit(sig, frame)
@@ -89,6 +112,9 @@ def _protocol(limits: Limits) -> type[HttpToolsProtocol]:
 
     Uvicorn itself has no such limits, see docs/decisions/uvicorn-limits.md.
     """
+    most = max_connections(limits)
+    by_activity: dict[Protocol, None] = {}
+    """The open connections, the least recently active one first."""
 
     class Protocol(HttpToolsProtocol):
         _timer: asyncio.TimerHandle | None = None
@@ -96,6 +122,9 @@ def _protocol(limits: Limits) -> type[HttpToolsProtocol]:
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
+            if len(by_activity) >= most:
+                _close_idle()
+            by_activity[self] = None
             connection = transport.get_extra_info("socket")
             if connection is not None:  # asyncio does this only for sockets that it made itself
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -103,13 +132,20 @@ def _protocol(limits: Limits) -> type[HttpToolsProtocol]:
 
         def connection_lost(self, exc: Exception | None) -> None:
             self._set_timer(None)
+            by_activity.pop(self, None)
             super().connection_lost(exc)
 
         def data_received(self, data: bytes) -> None:
             super().data_received(data)
-            is_idle = self.cycle is None or self.cycle.response_complete
-            if is_idle and self._timer is None and not self.transport.is_closing():
+            if self in by_activity:
+                by_activity[self] = by_activity.pop(self)
+            if self.is_idle and self._timer is None and not self.transport.is_closing():
                 self._set_timer(limits.header_seconds)
+
+        @property
+        def is_idle(self) -> bool:
+            """Whether no request is being answered."""
+            return self.cycle is None or self.cycle.response_complete
 
         def on_message_begin(self) -> None:
             self._head_bytes = 0
@@ -152,5 +188,13 @@ def _protocol(limits: Limits) -> type[HttpToolsProtocol]:
             if connection is not None:  # else the system would go on sending
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _DISCARD)
             self.transport.abort()
+
+    def _close_idle() -> None:
+        """Make room for another connection; if all are busy, uvicorn answers its request with 503."""
+        idle = next((connection for connection in by_activity if connection.is_idle), None)
+        if idle is not None:
+            del by_activity[idle]
+            idle.transport.close()
+        FLOODS.warning("too many connections", extra={"maximum": most, "closed_idle": idle is not None})
 
     return Protocol

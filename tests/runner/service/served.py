@@ -44,6 +44,8 @@ class Served:
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}"
         self.origin = {"Origin": self.url}
+        self.prefix: list[str] = []
+        """Words before its command, such as those that limit what it may use."""
         self.process: subprocess.Popen[str] | None = None
 
     def __enter__(self) -> Self:
@@ -58,7 +60,10 @@ class Served:
         words = ["serve", "--port", str(self.port), "--recordings", str(self.recordings), *self.options]
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "runner", *words], stdout=subprocess.PIPE, stderr=log, text=True
+                [*self.prefix, sys.executable, "-m", "runner", *words],
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
             )
         self.client = httpx2.Client(base_url=f"{self.url}/api/v1", headers=self.origin, timeout=60)
         if self.process.stdout.readline() != f"{self.url}/\n":

@@ -128,6 +128,24 @@ def test_many_slow_clients_do_not_block_others(impatient):
             connection.close()
 
 
+def test_more_idle_connections_than_descriptors_do_not_block_others(own_server):
+    own_server.prefix = ["sh", "-c", 'ulimit -n 128 && exec "$@"', "sh"]
+    with own_server, contextlib.ExitStack() as idle:
+        address = "127.0.0.1", own_server.port
+        connections = [idle.enter_context(socket.create_connection(address)) for _ in range(300)]
+        for path in ("/runs", "/readyz", "/api/v1/runs"):
+            assert httpx.get(own_server.url + path, timeout=5).status_code == 200
+        connections[0].settimeout(5)
+        assert connections[0].recv(1) == b"", "the oldest is closed"
+        connections[-1].setblocking(False)
+        with pytest.raises(BlockingIOError):  # the newest stays open
+            connections[-1].recv(1)
+    lines = own_server.log.read_text().splitlines()
+    assert len(lines) < 50
+    events = [json.loads(line)["event"] for line in lines]
+    assert 1 <= events.count("too many connections") <= 5
+
+
 def test_a_deleted_or_damaged_index_is_created_again(client, recordings):
     before = client.get("/api/v1/runs").json()
     for damage in (index_path().unlink, lambda: index_path().write_bytes(b"no database" * 1000)):
