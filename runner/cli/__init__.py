@@ -20,6 +20,7 @@ import click
 from runner.cli.command import Group
 from runner.errors import ConfigError, ConfigProblem, ExitCode, RunnerError, StorageError
 from runner.util import __version__
+from runner.util.humanize import printable
 
 COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     "Run": {
@@ -133,7 +134,7 @@ class Failure(click.ClickException):
         text = f"Error: {head}{self.message}"
         if self.as_json:
             text = error_as_json(self.message, self.exit_code, self.problems)
-        click.echo(text, file=file or sys.stderr)
+        click.echo(printable(text), file=file or sys.stderr)
 
 
 def exit_code_of(error: RunnerError) -> int:
@@ -201,6 +202,7 @@ class LazyGroup(Group):
         except click.exceptions.NoArgsIsHelpError:
             raise
         except click.ClickException as error:
+            error.message = printable(error.message)  # type: ignore[misc]  # final by name alone
             raise (Failure(error, as_json) if as_json else error) from error
 
 

@@ -1,21 +1,29 @@
-"""Print results: JSON on stdout, tables fitted to the terminal, notices on stderr."""
+"""Print results: JSON on stdout, tables fitted to the terminal, notices on stderr.
+
+All that commands print goes through `echo` and `console`: what is not ours, such as the name of a run, may
+hold control characters of terminals, which are shown escaped.
+"""
 
 from __future__ import annotations
 
 import csv
 import json
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import click
 
 from runner.analysis.sections import markdown
 from runner.export.places import require_new
+from runner.util.humanize import printable
 from runner.util.values import finite
 
 if TYPE_CHECKING:  # imported when something is drawn
-    from rich.console import Console, RenderableType
+    from rich.console import Console, ConsoleOptions, RenderableType
+    from rich.segment import Segment
     from rich.table import Table
     from rich.text import Text
 
@@ -28,9 +36,19 @@ UNBOUNDED: Final = 1000
 """Width without a terminal."""
 
 
+def echo(text: object, err: bool = False, nl: bool = True) -> None:
+    """Print a text on stdout or stderr."""
+    click.echo(printable(str(text)), err=err, nl=nl)
+
+
+def echo_csv(columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+    """Print a table of any length as CSV."""
+    sys.stdout.writelines(map(printable, csv_lines(columns, rows)))
+
+
 def print_json(value: object, indent: int | None = 1) -> None:
     """Print a value as JSON on stdout; None for `indent` makes it one line. NaN and infinity become null."""
-    click.echo(json.dumps(finite(value), indent=indent, allow_nan=False))
+    echo(json.dumps(finite(value), indent=indent, allow_nan=False))
 
 
 def json_list(name: str, rows: Iterable[Mapping[str, object]]) -> Iterator[str]:
@@ -70,7 +88,7 @@ def print_written(text: str, as_json: bool, *paths: Path, **more: object) -> Non
     if as_json:
         print_json({"files": files_written(*paths)} | more)
     else:
-        click.echo(text)
+        echo(text)
 
 
 def files_written(*paths: Path) -> list[dict[str, object]]:
@@ -81,14 +99,33 @@ def files_written(*paths: Path) -> list[dict[str, object]]:
 
 def say(text: str) -> None:
     """Print a notice on stderr."""
-    click.echo(text, err=True)
+    echo(text, err=True)
 
 
-def console() -> Console:
-    """Return the console of stdout: colours on a terminal only, and lines of any length elsewhere."""
+@cache
+def _console_type() -> type[Console]:
     from rich.console import Console
 
-    drawn = Console(highlight=False, markup=False, emoji=False)
+    class SafeConsole(Console):
+        """A console that shows the control characters in a text."""
+
+        def render_str(self, text: str, **options: Any) -> Text:
+            """Render a text; here, so that a column is wide enough."""
+            return super().render_str(printable(text), **options)
+
+        def render(
+            self, renderable: RenderableType, options: ConsoleOptions | None = None
+        ) -> Iterator[Segment]:
+            """Yield the segments of anything; those of control codes are the library's own."""
+            for segment in super().render(renderable, options):
+                yield segment if segment.control else segment._replace(text=printable(segment.text))
+
+    return SafeConsole
+
+
+def console(stderr: bool = False) -> Console:
+    """Return the console of a stream: colours on a terminal only, and lines of any length elsewhere."""
+    drawn = _console_type()(stderr=stderr, highlight=False, markup=False, emoji=False)
     if not drawn.is_terminal:
         drawn.width = UNBOUNDED
     return drawn
@@ -105,7 +142,7 @@ def draw(*parts: RenderableType) -> None:
     with drawn.capture() as captured:
         for part in parts:
             drawn.print(part)
-    click.echo("\n".join(line.rstrip() for line in captured.get().splitlines()))
+    echo("\n".join(line.rstrip() for line in captured.get().splitlines()))
 
 
 def _least_width(part: RenderableType) -> int:
@@ -116,7 +153,7 @@ def _least_width(part: RenderableType) -> int:
     if not isinstance(part, Table) or not part.columns or part.show_header is False:
         return 0
     widths = [
-        max(cell_len(line) for cell in (heading, *column.cells) for line in str(cell).split("\n"))
+        max(cell_len(line) for cell in (heading, *column.cells) for line in printable(str(cell)).split("\n"))
         for column in part.columns
         for heading in [getattr(column.header, "renderable", column.header)]
     ]
@@ -184,6 +221,7 @@ def facts(pairs: Mapping[str, str]) -> Table:
 
 def aligned(lines: Sequence[Sequence[str]], left: Sequence[bool]) -> list[str]:
     """Return lines of cells aligned in columns; far quicker than a table where there are many."""
+    lines = [[on_one_line(cell) for cell in line] for line in lines]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     columns = list(zip(widths, left, strict=True))
     return [
@@ -196,7 +234,7 @@ def aligned(lines: Sequence[Sequence[str]], left: Sequence[bool]) -> list[str]:
 
 
 def patch_text(lines: Iterable[str]) -> Text:
-    """Return the lines of a patch, coloured, without control characters of terminals."""
+    """Return the lines of a patch, coloured."""
     from rich.text import Text
 
     text = Text()
@@ -207,9 +245,9 @@ def patch_text(lines: Iterable[str]) -> Text:
     return text
 
 
-def printable(text: str) -> str:
-    """Return a text on one line, without control characters of terminals."""
-    return "".join(character if character.isprintable() else " " for character in text)
+def on_one_line(text: str) -> str:
+    """Return a text as a cell of a table that has a line for each row."""
+    return printable(text.replace("\n", " ").replace("\t", " "))
 
 
 # --- sections of comparisons ------------------------------------------------------------------------------
@@ -218,7 +256,7 @@ def printable(text: str) -> str:
 def print_sections(sections: Sequence[Section], as_markdown: bool) -> None:
     """Print sections as tables, or as Markdown."""
     if as_markdown:
-        click.echo("\n".join(markdown(sections)))
+        echo("\n".join(markdown(sections)))
         return
     for section in sections:
         draw(title(section.title), *section.sentences)

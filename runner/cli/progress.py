@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+from runner.cli.output import console
 from runner.util.humanize import number, size
 
 if TYPE_CHECKING:
@@ -89,7 +90,6 @@ def _line(
         yield lambda **_: None
         return
     from rich import progress
-    from rich.console import Console
 
     columns = {
         _BAR: progress.BarColumn(bar_width=BAR_WIDTH),
@@ -101,7 +101,7 @@ def _line(
     }
     with progress.Progress(
         *(columns.get(name) or progress.TextColumn(name, markup=False) for name in [label, *names] if name),
-        console=Console(stderr=True, highlight=False),
+        console=console(stderr=True),
         transient=True,
         refresh_per_second=REDRAWS_PER_SECOND,
     ) as line:

@@ -20,6 +20,7 @@ from typing import Final, TextIO
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from runner.service.tokens import PREFIX
+from runner.util.humanize import printable
 
 NAME: Final = "dualtaxi.service"
 LOG: Final = logging.getLogger(NAME)
@@ -44,7 +45,7 @@ class TextFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
-        return _SECRET.sub(f"{PREFIX}***", self.line(record))
+        return printable(_SECRET.sub(f"{PREFIX}***", self.line(record)))
 
     def line(self, record: logging.LogRecord) -> str:
         """Return the line, perhaps with secrets."""

@@ -7,12 +7,24 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Final
 
 UNKNOWN: Final = "–"
 _MAX_LISTED: Final = 6
+_CONTROLS: Final = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+"""C0 without tab and newline, DEL, C1, overrides of the writing direction, and lone surrogates."""
+
+
+def printable(text: str) -> str:
+    """Return a text whose control characters are visible, as JSON escapes them.
+
+    A name, note or file that somebody else wrote cannot move the cursor, set the title or answer questions of
+    a terminal. Tabs and newlines stay; JSON stays the same value.
+    """
+    return _CONTROLS.sub(lambda control: f"\\u{ord(control[0]):04x}", text)
 
 
 def size(count: float) -> str:

@@ -23,7 +23,7 @@ from runner.cli.options import (
     trial_option,
     trust_option,
 )
-from runner.cli.output import csv_lines, draw, files_written, print_json, say, table
+from runner.cli.output import csv_lines, draw, echo, files_written, print_json, say, table
 from runner.cli.progress import stage_line
 from runner.cli.runs import find_recorded
 from runner.export.places import write_new, write_text_new
@@ -98,7 +98,7 @@ def get_command(
     if as_json:
         print_json(checkpoint.as_json() | {"files": files_written(path)})
     else:
-        click.echo(f"{path}  {size(checkpoint.size)}, {checkpoint.reference}, {checkpoint.format}")
+        echo(f"{path}  {size(checkpoint.size)}, {checkpoint.reference}, {checkpoint.format}")
 
 
 @click.command("values", cls=Command)
@@ -155,7 +155,7 @@ def values_command(
         files = [] if output is None else files_written(output)
         print_json({"run_id": run.run_id, **facts, "steps": steps, "files": files})
     elif output is not None:
-        click.echo(f"{output}  {size(output.stat().st_size)}, {len(rows):,} steps")
+        echo(f"{output}  {size(output.stat().st_size)}, {len(rows):,} steps")
     else:
         shown = ((f"{x:.4g}" if isinstance(x, float) else str(x) for x in row) for row in rows)
         draw(table(*columns, rows=shown))

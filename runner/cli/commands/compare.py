@@ -21,7 +21,7 @@ from runner.cli.options import (
     runs_argument,
     target_option,
 )
-from runner.cli.output import print_json, print_sections, require_one_form, require_page, say
+from runner.cli.output import echo, print_json, print_sections, require_one_form, require_page, say
 from runner.cli.parameter_types import INDEX, RunName
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_all_recorded, find_recorded
@@ -121,7 +121,7 @@ def compare_command(
     if html is not None:
         for note in made.result.notes:
             say(f"Note: {note}.")
-        (say if as_json else click.echo)(f"{html}: {made.contents}")
+        (say if as_json else echo)(f"{html}: {made.contents}")
     if as_json:
         print_json(dataclasses.asdict(made.result))
     elif html is None:
@@ -219,7 +219,7 @@ def diff_command(
                 stage("drawing the page")
                 write_text_new(html, force, render_diff(difference, recording_a, recording_b))
         if html is not None:
-            (say if as_json or as_markdown else click.echo)(f"{html}: {size(html.stat().st_size)}")
+            (say if as_json or as_markdown else echo)(f"{html}: {size(html.stat().st_size)}")
     if as_json:
         print_json(differences.as_json(difference))
     elif html is None or as_markdown:

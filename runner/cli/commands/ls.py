@@ -14,7 +14,7 @@ import click
 
 from runner.cli.command import Command, option
 from runner.cli.options import filter_argument, folders_option, json_option, limit_option
-from runner.cli.output import aligned, console, csv_lines, draw, json_list, printable, say, table
+from runner.cli.output import aligned, console, csv_lines, draw, echo, json_list, on_one_line, say, table
 from runner.cli.parameter_types import INDEX
 from runner.runs.catalogue.columns import (
     DEFAULT_JSON,
@@ -174,7 +174,7 @@ def _stream(
         total = look(recordings, work, say)
         spool.seek(0)
         while part := spool.read(_READ_BYTES):
-            click.echo(part, nl=False)
+            echo(part, nl=False)
     left = max(total - query.offset, 0)
     return left if query.limit is None else min(left, query.limit), total, problems
 
@@ -260,14 +260,14 @@ def _print_table(rows: Sequence[Row], columns: Sequence[str]) -> None:
     left = [column not in FIELDS or FIELDS[column].kind in _LEFT for column in columns]
     cells = [[_cell(row, column) for column in columns] for row in rows]
     if not console().is_terminal:
-        click.echo("\n".join(aligned([headings, *cells], left)))
+        echo("\n".join(aligned([headings, *cells], left)))
         return
     left_headings = tuple(heading for heading, is_left in zip(headings, left, strict=True) if is_left)
     draw(table(*headings, rows=cells, left=left_headings, shrinking=_SHRINKING))
 
 
 def _cell(row: Row, column: str) -> str:
-    return printable(as_text(row, column))
+    return on_one_line(as_text(row, column))
 
 
 def _print_remainder(

@@ -23,7 +23,7 @@ from runner.cli.options import (
     run_argument,
     trust_option,
 )
-from runner.cli.output import console, print_json, say
+from runner.cli.output import console, echo, print_json, say
 from runner.cli.progress import stage_line
 from runner.cli.runs import find_recorded
 from runner.errors import MissingExtra
@@ -105,7 +105,7 @@ def play_command(
         if not terminal.is_terminal:
             for frame in played.frames():
                 text = (frame.above + frame.below).plain
-                click.echo("\n".join(line.rstrip() for line in text.splitlines()) + "\n")
+                echo("\n".join(line.rstrip() for line in text.splitlines()) + "\n")
             return
         image = None if no_pictures else _image_type(recording.tabular)
         frames = played.frames()

@@ -13,7 +13,7 @@ import click
 from runner.archive.places import archive_place
 from runner.cli.command import Command, option
 from runner.cli.options import filter_argument, folders_option, json_option, recordings_option, runs_argument
-from runner.cli.output import aligned, console, draw, print_json, printable, say, table
+from runner.cli.output import aligned, console, draw, echo, print_json, say, table
 from runner.cli.parameter_types import INDEX
 from runner.cli.runs import find
 from runner.errors import RunnerError
@@ -169,7 +169,7 @@ def _prune_explanations(recordings: Sequence[Path], dry_run: bool, yes: bool, as
     elif dry_run:
         say(f"Nothing was removed; it would free {size(freed)}.")
     else:
-        click.echo(f"Removed {counted(len(explanations), 'explanation')}, freed {size(freed)}.")
+        echo(f"Removed {counted(len(explanations), 'explanation')}, freed {size(freed)}.")
 
 
 def _confirm(question: str, yes: bool) -> None:
@@ -211,7 +211,7 @@ def _carry_out(
     elif dry_run:
         say(f"Nothing was removed; it would free {size(freed)}.")
     else:
-        click.echo(f"Removed {counted(len(removals), 'run')}, freed {size(freed)}.")
+        echo(f"Removed {counted(len(removals), 'run')}, freed {size(freed)}.")
 
 
 def _as_json(removal: Removal) -> dict[str, object]:
@@ -229,8 +229,7 @@ def _draw(removals: Sequence[Removal]) -> None:
     if console().is_terminal and len(removals) <= _MAX_DRAWN:
         draw(table(*_HEADINGS, rows=rows, left=_LEFT, shrinking=("name",)))
     else:
-        lines = [_HEADINGS, *(tuple(map(printable, row)) for row in rows)]
-        click.echo("\n".join(aligned(lines, [heading in _LEFT for heading in _HEADINGS])))
+        echo("\n".join(aligned([_HEADINGS, *rows], [heading in _LEFT for heading in _HEADINGS])))
     for removal in removals:
         if removal.is_archived:
             say(_archive_notice(removal.run()))

@@ -9,7 +9,7 @@ import click
 
 from runner.cli.command import Command, option
 from runner.cli.options import folders_option, workers_option
-from runner.cli.output import say
+from runner.cli.output import echo, say
 from runner.cli.parameter_types import FILE
 from runner.service.settings import Settings
 from runner.util.extras import require
@@ -94,7 +94,7 @@ def serve_command(
     lock_folder(settings.recordings[0], LOCK_FILE).release()  # fail before requests are accepted
     app = create_app(settings)
     listening = bind(settings)
-    click.echo(url_of(listening))
+    echo(url_of(listening))
     sys.stdout.flush()
     if sys.stderr.isatty():
         say("Ctrl-C stops it.")

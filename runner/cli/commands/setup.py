@@ -9,7 +9,7 @@ from click.shell_completion import get_completion_class
 
 from runner.cli.command import Command, Group, argument
 from runner.cli.options import config_argument, json_option, output_option, set_option
-from runner.cli.output import draw, print_json, print_written, say, table
+from runner.cli.output import draw, echo, print_json, print_written, say, table
 from runner.cli.parameter_types import DIRECTORY, SHIPPED
 
 
@@ -35,7 +35,7 @@ def init_command(
         print_json({"folder": str(folder.absolute()), "made": made, "kept": existing})
         return
     for name in made:
-        click.echo(name)
+        echo(name)
     if existing:
         say(f"{len(existing)} of {len(made) + len(existing)} existed already and were left as they are.")
     change = "" if folder == Path() else f"cd {folder} && "
@@ -116,8 +116,8 @@ def check(
     if as_json:
         print_json({"file": str(config), "config": experiment.to_mapping()})
     else:
-        click.echo(f"# {config} is fine. Spelled out:")
-        click.echo(experiment.to_yaml(), nl=False)
+        echo(f"# {config} is fine. Spelled out:")
+        echo(experiment.to_yaml(), nl=False)
 
 
 @config_command.command("schema")
@@ -150,4 +150,4 @@ def completion_command(shell: str = argument(type=click.Choice(["bash", "zsh", "
     kind = get_completion_class(shell)
     if kind is None:
         raise click.BadParameter(f"click knows no completion for {shell}.")
-    click.echo(kind(cli, {}, "dualtaxi", "_DUALTAXI_COMPLETE").source())
+    echo(kind(cli, {}, "dualtaxi", "_DUALTAXI_COMPLETE").source())

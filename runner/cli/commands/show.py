@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +12,7 @@ import click
 
 from runner.cli.command import Command, option
 from runner.cli.options import json_option, recordings_option, run_argument
-from runner.cli.output import console, draw, facts, patch_text, print_json, printable, say, title
+from runner.cli.output import console, draw, echo, facts, on_one_line, patch_text, print_json, say, title
 from runner.cli.progress import stage_line
 from runner.cli.runs import command_for, find, restored
 from runner.runs.branches import Origin, origin_in
@@ -99,12 +100,15 @@ def _print_code(run: Run, as_json: bool) -> None:
     if not any(key.startswith(("git", "code.")) for key in code_facts):
         code_facts["code.not_recorded"] = "the code of this run"
     committed = [path for path in recorded.files if path not in recorded.new]
-    head = [f"# {key}: {printable(text)}" for key, text in code_facts.items()]
-    head += [f"# also printed in full by --json: {', '.join(map(printable, committed))}"] if committed else []
+    head = [f"# {key}: {on_one_line(text)}" for key, text in code_facts.items()]
+    head += (
+        [f"# also printed in full by --json: {', '.join(map(on_one_line, committed))}"] if committed else []
+    )
     if console().is_terminal:
         draw(*head, patch_text(recorded.to_patch().splitlines()))
     else:
-        click.echo("\n".join(head) + "\n\n" + recorded.to_patch(), nl=False)
+        echo("\n".join(head) + "\n")
+        sys.stdout.write(recorded.to_patch())  # exact, for `git apply`
 
 
 def _parts(details: RunDetails, branches: Mapping[str, Origin]) -> list[RenderableType]:

@@ -23,7 +23,7 @@ from runner.cli.options import (
     recordings_option,
     workers_option,
 )
-from runner.cli.output import draw, facts, print_json, print_sections, require_one_form, say
+from runner.cli.output import console, draw, echo, facts, print_json, print_sections, require_one_form, say
 from runner.cli.parameter_types import ConfigName
 from runner.cli.progress import stage_line
 from runner.errors import ExitCode, RunnerError
@@ -200,7 +200,7 @@ def ls(recordings: Path | None = recordings_option, as_json: bool = json_option)
     if as_json:
         print_json({"sweeps": names})
     elif names:
-        click.echo("\n".join(names))
+        echo("\n".join(names))
     else:
         say("No sweeps yet. `dualtaxi sweep run FILE` starts one.")
 
@@ -211,10 +211,9 @@ def _live_status(sweep: Sweep) -> Iterator[Callable[[SweepStatus], None]]:
     if not sys.stderr.isatty():
         yield lambda _: None
         return
-    from rich.console import Console
     from rich.live import Live
 
-    with Live(console=Console(stderr=True, highlight=False), transient=True, refresh_per_second=4) as live:
+    with Live(console=console(stderr=True), transient=True, refresh_per_second=4) as live:
         yield lambda status: live.update(facts(_status_rows(sweep, status)))
 
 

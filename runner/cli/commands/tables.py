@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +10,7 @@ import click
 
 from runner.cli.command import Command, option
 from runner.cli.options import force_option, json_option, recordings_option, run_argument, set_option
-from runner.cli.output import csv_lines, draw, facts, files_written, print_json, say, table, title
+from runner.cli.output import draw, echo_csv, facts, files_written, print_json, say, table, title
 from runner.cli.parameter_types import FILE, INDEX
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_recorded
@@ -169,4 +168,4 @@ def table_command(
         for row in rows():
             print_json(dict(zip(columns, row, strict=True)), indent=None)
     else:
-        sys.stdout.writelines(csv_lines(columns, rows()))
+        echo_csv(columns, rows())

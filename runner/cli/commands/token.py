@@ -6,7 +6,7 @@ import click
 
 from runner.cli.command import Group, argument, option
 from runner.cli.options import json_option
-from runner.cli.output import draw, print_json, say, table
+from runner.cli.output import draw, echo, print_json, say, table
 from runner.service.settings import tokens_file
 
 
@@ -48,7 +48,7 @@ def create(
     if as_json:
         print_json(token.as_json() | {"token": secret})
     else:
-        click.echo(secret)
+        echo(secret)
         say(f"Keep it; it is not shown again. `dualtaxi token revoke {token.id}` revokes it.")
 
 

@@ -12,7 +12,7 @@ import click
 from runner.cli.command import Command, argument, option
 from runner.cli.commands.export import print_selection
 from runner.cli.options import force_option, recordings_option, selection_options
-from runner.cli.output import say
+from runner.cli.output import echo, say
 from runner.cli.parameter_types import PICTURE_SIZE, STEP, RunName
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_recorded
@@ -115,10 +115,10 @@ def _show(
     if screenshot is not None:
         with stage_line("drawing"):
             viewer.screenshot(path, location.time, screenshot, picture_size)
-        click.echo(screenshot)
+        echo(screenshot)
     elif web:
         with viewer.web_viewer(viewer.check_port(port), path) as (started, address):
-            click.echo(address)
+            echo(address)
             say(f"The step is {location.time:,}: enter it at the lower right. Ctrl-C ends the viewer.")
             started.process.wait()
     else:

@@ -22,6 +22,8 @@ from runner.cli.commands import remote
 from runner.cli.parameter_types import RunName
 from runner.client.jobs import RemoteJob
 from runner.errors import ExitCode
+from runner.recording.rewriting import rewrite
+from runner.runs.resolve import find_run
 
 
 def walk(group=cli, path=()):
@@ -80,7 +82,7 @@ WORDS = {
     "evaluate": "@latest --trials 2",
     "rerecord": "@latest",
     "show": "@latest",
-    "play": "@latest",
+    "play": "@latest --speed 1000",
     "diff": "@latest @latest",
     "compare": "@latest other@latest",
     "verify": "@latest",
@@ -108,6 +110,8 @@ WORDS = {
     "token revoke": "laptop",
 }
 """What is typed after a command; nothing for the others."""
+HOSTILE = "a\x1b]0;owned\x1b\\\x9b31m\x7f\u202eb"
+"""Sets the title of a terminal, begins a red text, and turns the direction of writing."""
 JOB = RemoteJob(1, "config", "tiny", "finished", 1, "", None, {3: "k3v9m2xq"})
 
 
@@ -116,12 +120,32 @@ def always_left(content, *spaces):
     return lambda observation: ("left", "right").index(content.decode())
 
 
+def made_hostile(folder):
+    """Put control characters of terminals into the texts of a run, as nobody's recorder does."""
+    run, fresh = find_run(str(folder)), folder / "fresh.mcap"
+    rewrite(run.recording, fresh, lambda _, entries: entries | {"git.branch": HOSTILE, HOSTILE: "x"})
+    fresh.replace(run.recording)
+    facts = json.loads((folder / "run.json").read_text()) | {"name": HOSTILE, "host": HOSTILE}
+    facts["config"] |= {"name": HOSTILE, HOSTILE: HOSTILE}
+    facts["provenance"] = {HOSTILE: HOSTILE, "git": HOSTILE, "command": HOSTILE}
+    facts["summary"] |= {"error": HOSTILE, "logged": {HOSTILE: 1.0}}
+    (folder / "run.json").write_text(json.dumps(facts))
+    (folder / "labels.json").write_text(json.dumps({"note": HOSTILE, "tags": ["good"]}))
+
+
+def controls(text):
+    """Return the control characters in an output, except colours and the moves of a live display."""
+    own = re.compile(r"\r?\x1b\[([\d;]*[mA]|2K|\?25[lh])")
+    return set(re.findall(r"[\0-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e]", own.sub("", text)))
+
+
 @pytest.fixture(scope="module")
 def place(tmp_path_factory, recorded_run, command_in):
     """A folder with two runs, an archive of one, and a sweep."""
     folder = tmp_path_factory.mktemp("contract")
     recordings = folder / "recordings"
     shutil.copytree(recorded_run.folder, recordings / recorded_run.run_id)
+    made_hostile(recordings / recorded_run.run_id)
     tiny = folder / "tiny.yaml"
     shutil.copy(recorded_run.folder.parents[1] / "tiny.yaml", tiny)
     command = command_in(recordings)
@@ -132,6 +156,7 @@ def place(tmp_path_factory, recorded_run, command_in):
         loop.reset(seed=0)
         while not any(loop.step(0)[2:4]):
             pass
+    made_hostile(loop.run.folder)
     patient = folder / "patient.yaml"
     patient.write_text(yaml.safe_dump(yaml.safe_load(tiny.read_text()) | {"discount": 0.99}))
     sweep = folder / "small.yaml"
@@ -183,6 +208,7 @@ def test_json_is_an_object_or_one_per_line(place, path):
         place.command("token", "create", "laptop")
     done = place.command(*path, *words, "--json")
     assert done.exit_code in (ExitCode.OK, ExitCode.DIFFERENT), done.output
+    assert not controls(done.output)
     objects = (
         [json.loads(line) for line in done.stdout.splitlines()]
         if name in LINES
@@ -197,6 +223,25 @@ def test_json_is_an_object_or_one_per_line(place, path):
         for file in objects[0]["files"]:
             assert Path(file["path"]).is_absolute()
             assert Path(file["path"]).stat().st_size == file["bytes"]
+
+
+@pytest.mark.parametrize("path", WITH_JSON, ids=" ".join)
+def test_no_control_character_of_a_recording_reaches_a_terminal(place, path, monkeypatch, tmp_path):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    at_once = vars(place) | {"folder": tmp_path}
+    words = (WORDS | WRITING | LOOPS).get(" ".join(path), "").format(**at_once).split()
+    done = place.command(*path, *words, color=True)
+    assert "Traceback" not in done.output
+    assert not controls(done.output)
+
+
+@pytest.mark.parametrize(
+    "words", [("show",), ("show", "--code"), ("ls",), ("du",), ("label",), ("play", "--episode", 0)]
+)
+def test_control_characters_are_visible(place, words):
+    command, *options = words
+    shown = place.command(command, *([place.loop] if command not in ("ls", "du") else []), *options)
+    assert "\\u001b]0;owned\\u001b\\\\u009b31m\\u007f\\u202eb" in shown.stdout, shown.output
 
 
 @pytest.mark.parametrize("path", EVERY, ids=" ".join)
