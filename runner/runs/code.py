@@ -24,7 +24,7 @@ from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD, MAX_CODE_BYTES, 
 from runner.recording.writer import RecordingFile, storage_error
 from runner.runs.git import GIT_SECONDS, NotRecorded, Repository, read_repository
 from runner.runs.provenance import is_code_wanted
-from runner.runs.redaction import is_secret_name, redacted_text
+from runner.runs.redaction import SETTINGS_FILES, is_secret_file, redacted_text
 from runner.runs.run import Run
 from runner.util.files import open_regular
 from runner.util.values import as_utf8
@@ -35,12 +35,14 @@ WAIT_SECONDS: Final = GIT_SECONDS + 1
 """How long after its start a run waits at its end for the code."""
 _FRESH_SECONDS: Final = 10.0
 """Runs that begin within this time of each other in one process share what was read."""
-_SETTINGS: Final = frozenset({".toml", ".yaml", ".yml", ".json", ".cfg", ".ini", ".xml"})
-"""Suffixes of untracked files that are recorded, unless they have the name of a secret."""
-_SOURCES: Final = _SETTINGS | frozenset(
-    {*(".py", ".pyx", ".pyi", ".c", ".cc", ".cpp", ".cu", ".h", ".hpp"), *(".rs", ".jl", ".sh", ".gin")}
+_SOURCES: Final = frozenset(
+    {
+        *SETTINGS_FILES,
+        *(".py", ".pyx", ".pyi", ".c", ".cc", ".cpp", ".cu", ".h", ".hpp"),
+        *(".rs", ".jl", ".sh", ".gin"),
+    }
 )
-"""Suffixes of all untracked files that are recorded."""
+"""Suffixes of untracked files that are recorded."""
 _CELLS: Final = "notebook-cells.py"
 _MAX_CELL_BYTES: Final = 256 << 10
 _MAX_NAMED: Final = 10
@@ -68,6 +70,9 @@ class _Sources:
     def add_file(self, root: Path, path: str) -> None:
         """Add a regular file of UTF-8 text, or note why not; a link is not followed."""
         if path in self.files or not path.isprintable():
+            return
+        if is_secret_file(path):
+            self.left_out.append(f"{path} (it has the name of a secret)")
             return
         if self.budget <= 0 or len(self.files) == MAX_FILES:
             self.left_out.append(path)
@@ -268,8 +273,8 @@ def collect(
     root, sources = repository.root.resolve(), _Sources()
     outputs = "" if recordings is None else _within(root, recordings)
     untracked = [path for path in repository.untracked if not (outputs and path.startswith(f"{outputs}/"))]
-    paths, others = used(root), [path for path in untracked if _is_source(path)]
-    changed = [path for path in repository.changed if Path(path).suffix in _SOURCES]
+    paths, others = used(root), [path for path in untracked if Path(path).suffix in _SOURCES]
+    changed = [path for path in repository.changed if Path(path).suffix in _SOURCES or is_secret_file(path)]
     if script is not None and paths:
         sources.add_file(root, paths[0])
     if cells:
@@ -283,7 +288,7 @@ def collect(
         "git": repository.commit + ("-dirty" if is_dirty else ""),
         "code.script": "" if script is None else _within(root, script),
         "git.not_recorded": "; ".join(problems),
-        "code.left_out": _named(sources.left_out),
+        "code.left_out": _named(list(dict.fromkeys(sources.left_out))),
     }
     code = Code(sources.files, tuple(sorted(new)), patch)
     return RecordedCode(
@@ -363,12 +368,6 @@ def _installed_folders() -> tuple[str, ...]:
 def _is_installed(file: str) -> bool:
     parts = Path(file).parts
     return file.startswith(_installed_folders()) or "site-packages" in parts or "dist-packages" in parts
-
-
-def _is_source(path: str) -> bool:
-    """Return whether an untracked file is recorded, by its name."""
-    suffix = Path(path).suffix
-    return suffix in _SOURCES and not (suffix in _SETTINGS and is_secret_name(Path(path).name))
 
 
 def _cells() -> str:

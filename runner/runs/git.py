@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from runner.runs.redaction import is_secret_file
 from runner.util.humanize import size
 
 GIT_SECONDS: Final = 2.0
@@ -65,7 +66,7 @@ class Repository:
     untracked: list[str] = field(default_factory=list)
     """Paths that are neither tracked nor ignored, and those ignored ones that are used."""
     patch: str = ""
-    """What `git diff HEAD` gives."""
+    """What `git diff HEAD` gives, without files that have names of secrets."""
     problems: list[str] = field(default_factory=list)
     """What could not be read, and why."""
 
@@ -114,7 +115,18 @@ def read_repository(
             tracked = {*text.split("\0"), *repository.untracked}
             repository.untracked += [path for path in paths if path not in tracked]
         if repository.commit and repository.changed:
-            options = ("--no-color", "--no-ext-diff", "--no-textconv", "-U3", "--no-renames", "HEAD", "--")
+            # Here, since no reader of a patch tells a hidden file from all that its lines may look like.
+            hidden = [f":(exclude,literal){path}" for path in repository.changed if is_secret_file(path)]
+            options = (
+                "--no-color",
+                "--no-ext-diff",
+                "--no-textconv",
+                "-U3",
+                "--no-renames",
+                "HEAD",
+                "--",
+                *hidden,
+            )
             repository.patch = git.run("diff", _IGNORE_SUBMODULES, *options, limit=MAX_PATCH_BYTES)
     except NotRecorded as problem:
         repository.problems.append(str(problem))

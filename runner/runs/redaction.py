@@ -20,6 +20,18 @@ SECRET_NAMES: Final = (
 _MIN_VARIABLE: Final = 12
 """The shortest value of an environment variable that is looked for; shorter ones are words."""
 _NAME: Final = re.compile("|".join(SECRET_NAMES).replace("token", "token(?!i[sz])"), re.IGNORECASE)
+_FILE: Final = re.compile(
+    r"""
+    \.env | .*\.env$ | [._](?:netrc|pypirc|npmrc|pgpass|htpasswd|boto|s3cfg|dockercfg)$ | \.(?:ssh|aws|gnupg)$
+    | .*\.(?:pem|key|p12|pfx|p8|ppk|jks|keystore|kdbx|gpg|asc)$
+    | id_(?:(?:rsa|dsa|ecdsa|ed25519).*|[^.]*)$
+    | .*(?:credential | secret(?!ar) | passw(?:or)?d | service[_-]?account)
+    """,
+    re.IGNORECASE | re.VERBOSE,
+)
+"""Names of files and folders that hold secrets; a `secretary` has none."""
+SETTINGS_FILES: Final = (".toml", ".yaml", ".yml", ".json", ".cfg", ".ini", ".xml")
+"""Ends of the names of settings files, which hold secrets if they have the name of one: `api-key.json`."""
 _HARMLESS: Final = re.compile(r"\d{1,5}|\d?\.\d{1,5}|true|false|none|null", re.IGNORECASE)
 """Values that stay, such as that of `--max-tokens 512`, unless the name has `pass`."""
 _IN_SOURCES: Final = (
@@ -80,6 +92,16 @@ _BARE: Final = re.compile(
     re.IGNORECASE,
 )
 """Without quotes, as in shell scripts and YAML: only what is long and has a digit."""
+
+
+def is_secret_file(path: str) -> bool:
+    """Return whether a file, or a folder that it is in, has a name under which secrets are kept.
+
+    Args:
+        path: with `/` between its parts.
+    """
+    name = path.rpartition("/")[2]
+    return any(map(_FILE.match, path.split("/"))) or (name.endswith(SETTINGS_FILES) and is_secret_name(name))
 
 
 @lru_cache(1024)

@@ -121,6 +121,55 @@ def test_secrets_are_removed(project):
     assert token not in f"{found.entries}{code}"
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(
+            ".env",
+            "conf/.env.local",
+            "prod.env",
+            "server.pem",
+            "tls/a.key",
+            "id_rsa",
+            "id_work",
+            "aws_credentials",
+        ),
+        *(
+            "client_secret.json",
+            "secrets/x.py",
+            ".netrc",
+            ".pypirc",
+            "store.p12",
+            "api-token.yaml",
+            'mY"Secret',
+        ),
+    ],
+)
+def test_a_file_with_the_name_of_a_secret_is_named_and_not_stored(project, name):
+    path = project / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("before\n")
+    git(project, "add", "-A")
+    git(project, "commit", "-qm", "Add it")
+    path.write_text("DB=p@ss word!\n")
+    (project / "train.py").write_text("rate = 2\n")
+    entries, code = read(project, path)
+    assert f"{name} (it has the name of a secret)" in entries["code.left_out"]
+    assert entries["git"].endswith("-dirty")
+    assert "p@ss" not in f"{entries}{code}"
+    assert "before" not in code.patch
+    assert "+rate = 2" in code.patch
+    path.unlink()
+    assert "before" not in read(project)[1].patch
+
+
+@pytest.mark.parametrize("name", ["environment.py", "secretary.py", "id_mapping.py", "monkey.py"])
+def test_a_source_with_a_harmless_name_is_recorded(project, name):
+    (project / name).write_text("x = 1\n")
+    _, code = read(project, project / name)
+    assert code.files == {name: "x = 1\n"}
+
+
 def test_submodules_are_recorded_by_their_commits(project, tmp_path):
     git(project, "-c", "protocol.file.allow=always", "submodule", "add", "-q", str(project), "part")
     git(project, "commit", "-qm", "Add a part")
