@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gc
+import os
 import sys
+from pathlib import Path
 
 GC_THRESHOLD = 50_000
 """New objects after which Python searches for cycles, instead of 700: most objects of imports stay."""
@@ -12,6 +14,7 @@ GC_THRESHOLD = 50_000
 def main() -> None:
     """Run the command line; Ctrl-C only sets the exit code, even while modules are imported."""
     gc.set_threshold(GC_THRESHOLD)
+    os.environ.setdefault("PYTHONSAFEPATH", "1")  # no child imports from the current folder
     try:
         from runner.cli import main as command_line
 
@@ -23,4 +26,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    if not sys.flags.safe_path and sys.path[0] != str(Path(__file__).parents[1]):
+        del sys.path[0]  # the current folder, which `python -m` puts there
     main()

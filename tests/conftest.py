@@ -19,9 +19,10 @@ os.environ["DUALTAXI_CODE"] = "off"  # thousands of runs need not ask git; tests
 
 @pytest.fixture(autouse=True, scope="session")
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keep what the tests leave behind out of the user's cache."""
+    """Keep what the tests leave behind out of the user's cache, and the user's key out of the tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("XDG_DATA_HOME", str(tmp_path_factory.mktemp("data")))
         yield
 
 

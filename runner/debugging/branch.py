@@ -36,8 +36,10 @@ from runner.replay.episodes import episode_at
 from runner.replay.makers import why_not_redone
 from runner.replay.stepping import RowStepper
 from runner.replay.steps import transitions_of
+from runner.replay.trust import trusting
 from runner.runs.branches import BranchOrigin
 from runner.runs.listing import run_at
+from runner.runs.marks import marking_nothing
 from runner.runs.run import Run, recordings_folder
 from runner.util.files import storage_errors
 from runner.util.jsonable import as_json
@@ -266,14 +268,15 @@ class _Player:
             action_in_words(self._space, self._action, names),
         )
         wrap: Callable[..., Any] = record_parallel if self._is_game else record
-        self.rec = stepper.env = wrap(
-            env,
-            self._folder,
-            name=task.name or f"{recording.name[:90]}.branch",
-            seed=recording.seed,
-            config={"origin": self.origin},
-            make=maker.make if task.trust and maker.make else None,
-        )
+        with trusting(recording.path, maker, task.trust) as is_trusted, marking_nothing(not is_trusted):
+            self.rec = stepper.env = wrap(
+                env,
+                self._folder,
+                name=task.name or f"{recording.name[:90]}.branch",
+                seed=recording.seed,
+                config={"origin": self.origin},
+                make=maker.make if is_trusted and maker.make else None,
+            )
         self.rec._enter(self.phase)
 
     def play(self) -> str:

@@ -86,7 +86,8 @@ def branch_training(
     run_name, folder = branch_name(run, name), recordings_folder(recordings)
     with open_recording(run.recording) as recording:
         job, where = branch_job(recording, at, action, overrides, episodes)
-        own = train_branch(recording, job, create_run(folder, job.config, job.seed, run_name), report, stop)
+        fresh = create_run(folder, job.config, job.seed, run_name, parent=run)
+        own = train_branch(recording, job, fresh, report, stop)
     origin = origin_in(job.config.to_mapping())
     assert isinstance(origin, TrainingOrigin)
     return TrainingBranch(own, origin, where)

@@ -144,7 +144,7 @@ def evaluate(
         RunnerError: there is no such table, or the new run cannot be recorded.
     """
     config = evaluation_of(run, recordings, step, trials, start, seed)
-    fresh = runs.create_run(recordings, config, seed)
+    fresh = runs.create_run(recordings, config, seed, parent=run)
     with unless_empty(fresh):
         return run_job(Job(config, seed), fresh, report, stop)
 

@@ -157,7 +157,7 @@ def pictures(recording: Recording, phase: str, episode: int, trust: bool = False
         recording: the run.
         phase: `train` or `eval`.
         episode: among the episodes of the phase, counted from 0.
-        trust: whether what the recording names may be imported, see `runner.replay.makers`.
+        trust: whether what the recording names may be imported, see `runner.replay.trust`.
 
     Raises:
         RecordingError: there is no such episode, or the recording has no steps.

@@ -42,6 +42,7 @@ from runner.recording.recorder import Recorder
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import create_recording
 from runner.runs.listing import run_at
+from runner.runs.marks import merge_marks
 from runner.runs.run import RECORDING_FILE, SHARDS_FOLDER, Run
 from runner.runs.shards import ENDS_AS, are_over, handed_over, shards_locked, shards_of
 from runner.util.arrays import Array
@@ -99,6 +100,7 @@ def _fold(run: Run, report: Report) -> Run:
     facts = {key: value for key, value in run.facts.items() if key != ENDS_AS}
     summary = {**run.file.summary, **summary}
     folded = Run(run.folder, facts).update(status=_ending_of_run(run), summary=summary)
+    merge_marks(run.folder, [shard.folder for shard in shards_of(run)])
     shutil.rmtree(run.folder / SHARDS_FOLDER)
     return folded
 

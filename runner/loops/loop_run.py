@@ -36,6 +36,7 @@ from runner.recording.syncing import SYNCER
 from runner.recording.writer import create_recording
 from runner.runs.code import CodeCollector
 from runner.runs.listing import run_at
+from runner.runs.marks import mark
 from runner.runs.provenance import provenance_entries
 from runner.runs.redaction import LineRedactor
 from runner.runs.run import RECORDING_FILE, Run, made_by, new_run, recordings_folder, unless_empty
@@ -65,6 +66,7 @@ class LoopRun:
         path = self.run.folder / RECORDING_FILE
         with unless_empty(self.run):
             self._file = create_recording(path, schema.KINDS[described.kind])
+        mark(self.run.folder, maker)
         self._beat_code = self._code.beat(self.run, self._file)
         self._facts = self._run_facts()
         self.outcomes = Outcomes(described.mdp)
@@ -123,6 +125,7 @@ class LoopRun:
     def _write_makers(self) -> None:
         for phase, maker in list(self.own_makers.items()):
             write_maker(self._file, phase, maker)
+            mark(self.run.folder, maker)
             del self.own_makers[phase]
 
     def _watch(self, topic: Topic, records: NDArray[np.void]) -> None:

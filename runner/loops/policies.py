@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -32,9 +31,12 @@ from runner.recording.gym_values import element_of
 from runner.recording.reader import Recording, open_recording
 from runner.replay.makers import make_environment, why_not_alone, why_not_made
 from runner.replay.stepping import game_spaces
+from runner.replay.trust import trusting
 from runner.runs.checkpoints import Checkpoint
+from runner.runs.marks import marking_nothing
 from runner.runs.run import Run
 from runner.util.arrays import Array
+from runner.util.processes import importing_from
 
 MAX_NUMBERS: Final = 256
 """The most numbers in one of the values that a policy returns along an episode."""
@@ -51,16 +53,14 @@ def policy_named(name: str) -> Callable[..., Any]:
     module_name, _, function_name = name.partition(":")
     if not module_name or not function_name:
         raise ConfigError(f"policy: found {name!r}, expected module:function")
-    sys.path.insert(0, str(Path.cwd()))
     try:
-        function = getattr(importlib.import_module(module_name), function_name)
+        with importing_from([str(Path.cwd())]):
+            function = getattr(importlib.import_module(module_name), function_name)
     except Exception as error:  # a module of the user's may raise anything
         raise ConfigError(
             f"policy: {name!r} cannot be imported ({type(error).__name__}: {error}); it is looked for on "
             "Python's path and in the current folder"
         ) from error
-    finally:
-        sys.path.pop(0)
     if not callable(function):
         raise ConfigError(f"policy: found {type(function).__name__} at {name!r}, expected a function")
     return function  # type: ignore[no-any-return]
@@ -88,12 +88,13 @@ def play_checkpoint(
     """
     with open_recording(run.recording) as recording:
         maker = recording.maker_of("eval")
-    if maker is None or (reason := why_not_made(maker, trust)):
+    if maker is None or (reason := why_not_alone(maker)):
         raise CannotRedo(reason if maker else why_not_made(None, trust))
-    if reason := why_not_alone(maker):
-        raise CannotRedo(reason)
-    make, weights = policy_named(policy), checkpoint.load(trust)
-    env = make_environment(maker, trust)
+    with trusting(run.recording, maker, trust) as is_trusted:
+        if reason := why_not_made(maker, is_trusted):
+            raise CannotRedo(reason)
+        make, weights = policy_named(policy), checkpoint.load(trust)
+        env = make_environment(maker, is_trusted)
     is_game = maker.kind == "pettingzoo"
     origin = {"run": run.run_id, "checkpoint": checkpoint.name, "step": checkpoint.step}
     settings = {"origin": origin | {"digest": checkpoint.digest}, "policy": policy}
@@ -106,7 +107,9 @@ def play_checkpoint(
         raise
     begin: Any = record_parallel if is_game else record
     name = f"{run.name[:90]}.evaluated"
-    with begin(env, recordings, name=name, seed=seed, config=settings) as rec, rec.phase("eval"):
+    with marking_nothing(not is_trusted):
+        recorded = begin(env, recordings, name=name, seed=seed, config=settings)
+    with recorded as rec, rec.phase("eval"):
         for number in range(episodes):
             _play(rec, act, seed + number, policy, is_game)
             report(number + 1)

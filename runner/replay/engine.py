@@ -21,6 +21,7 @@ from runner.replay.recorded import Piece, RecordedReset, pieces
 from runner.replay.redone import Frame, RedoneSteps
 from runner.replay.stepping import EnvironmentStepper, GameStepper, Stepper
 from runner.replay.stepping_vector import VectorStepper
+from runner.replay.trust import trusting
 
 BLOCK_SECONDS: Final = 0.2
 """Blocks of steps take about this long, so that progress and a hanging environment can be seen."""
@@ -42,7 +43,7 @@ class Replay:
     """A replay of a recording, from its beginning or from a reset; runs foreign code in this process.
 
     Args:
-        trust: whether what the recording names may be imported, see `runner.replay.specifications`.
+        trust: whether what the recording names may be imported, see `runner.replay.trust`.
         tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
         make: returns the environment, instead of making it as the recording describes.
     """
@@ -192,9 +193,9 @@ class Replay:
             return self._make()
         if maker is None:
             raise CannotRedo(why_not_made(maker, self._trust))
-        if environment == ALL:
-            return make_vector(maker, self._trust, self.render)
-        return make_environment(maker, self._trust, self.render)
+        with trusting(self._recording.path, maker, self._trust) as trust:
+            make = make_vector if environment == ALL else make_environment
+            return make(maker, trust, self.render)
 
 
 def _are_separate(recording: Recording) -> bool:

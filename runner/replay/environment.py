@@ -60,7 +60,7 @@ def redo(
         episodes: numbers of ended episodes of the phase, in any order; of a single environment also that of
             the last, unfinished one. None for all that happened, in the order of time.
         render: whether to draw a picture after each reset and step.
-        trust: whether what the recording names may be imported, see `runner.replay.specifications`.
+        trust: whether what the recording names may be imported, see `runner.replay.trust`.
         tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
         report: called with the number of steps taken so far, also of those before an episode.
         make: returns the environment, which is closed at the end, instead of making it as recorded.

@@ -1,4 +1,4 @@
-"""A recorded loop's environment, made again, as far as `runner.replay.specifications` allows."""
+"""A recorded loop's environment, made again, as far as `runner.replay.trust` allows."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import importlib.util
 import inspect
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from runner.errors import CannotRedo
@@ -19,15 +19,21 @@ from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
 from runner.replay.games import as_parallel
 from runner.replay.specifications import (
-    ONLY_PICTURES,
-    TRUST,
     EnvironmentSpec,
-    check_arguments,
-    check_plain,
     modules_of,
     parse_game,
     parse_spec,
     vector_wrappers,
+)
+from runner.replay.trust import (
+    PACKAGES,
+    TRUST,
+    is_left_out,
+    name_of,
+    require_listed_game,
+    require_listed_wrapper,
+    require_registered_arguments,
+    trusting,
     why_not_imported,
 )
 from runner.util.processes import raise_if_out_of_memory
@@ -39,8 +45,6 @@ if TYPE_CHECKING:
 
 _OF_VECTORS: Final = frozenset({"num_envs", "vectorization_mode", "vector_kwargs", "max_episode_steps"})
 """Arguments of `make_vec` in the specification of a vector, which its environments do not take."""
-_GAMES: Final = ("parallel_env", "env")
-"""The names of the functions that make a PettingZoo environment, parallel or in turns, in every module."""
 
 
 def why_not_made(maker: EnvironmentMaker | None, trust: bool) -> str:
@@ -143,10 +147,8 @@ def make_vector(maker: EnvironmentMaker, trust: bool, render: bool = False) -> o
                 [lambda: make_environment(maker, trust, render)] * vector.number,
                 autoreset_mode=gymnasium.vector.AutoresetMode(vector.autoreset),
             )
-        for name, entry_point, arguments in vector_wrappers(vector):
-            if not trust:
-                check_plain(f"argument of the wrapper {name}", arguments, {})
-            envs = _wrapper(entry_point, gymnasium.vector.VectorWrapper)(envs, **arguments)
+        for _, entry_point, arguments in vector_wrappers(vector):
+            envs = _wrapper(entry_point, gymnasium.vector.VectorWrapper, arguments, trust)(envs, **arguments)
         return envs
 
 
@@ -169,10 +171,10 @@ def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Env:
     wrappers = tuple(
         gymnasium.envs.registration.WrapperSpec(name, entry_point, own)
         for name, entry_point, own in spec.wrappers
-        if name not in ONLY_PICTURES
+        if not is_left_out(entry_point)
     )
     for wrapper in wrappers:
-        _wrapper(wrapper.entry_point, gymnasium.Wrapper)
+        _wrapper(wrapper.entry_point, gymnasium.Wrapper, wrapper.kwargs or {}, trust)
     made: Env = gymnasium.make(
         dataclasses.replace(
             registered,
@@ -195,6 +197,8 @@ def _registered(maker: EnvironmentMaker, trust: bool) -> tuple[EnvironmentSpec, 
     import gymnasium
 
     spec = parse_spec(maker.spec)
+    if not trust and maker.registered_by not in ("", *PACKAGES):
+        raise CannotRedo(f"{spec.id} is registered by {maker.registered_by}. {TRUST}")
     if maker.registered_by:
         importlib.import_module(maker.registered_by)
     registered = gymnasium.registry.get(spec.id)
@@ -205,24 +209,24 @@ def _registered(maker: EnvironmentMaker, trust: bool) -> tuple[EnvironmentSpec, 
             f"{spec.id} is not registered with Gymnasium {gymnasium.__version__} here, by "
             f"{maker.registered_by or 'Gymnasium itself'}."
         )
-    if _name_of(registered.entry_point) != spec.entry_point:
+    if name_of(registered.entry_point) != spec.entry_point:
         if not trust:
             raise CannotRedo(
                 f"{spec.id} is {spec.entry_point} in the recording, and "
-                f"{_name_of(registered.entry_point)} here: it is another environment, or another version."
+                f"{name_of(registered.entry_point)} here: it is another environment, or another version."
             )
         registered = dataclasses.replace(registered, entry_point=spec.entry_point)
     if not trust:
-        check_arguments(spec, registered.kwargs)
+        is_whole = maker.vector is not None and maker.vector.mode == "custom"
+        own = {key: value for key, value in spec.kwargs.items() if key not in _OF_VECTORS}
+        require_registered_arguments(spec.id, registered, own, is_whole)
     return spec, registered
 
 
 def _made_game(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
     module, function, kwargs = parse_game(maker.spec)
     if not trust:
-        check_plain("keyword argument", kwargs, {})
-        if function not in _GAMES:
-            raise CannotRedo(f"The environment is made by {module}:{function}. {TRUST}")
+        require_listed_game(f"{module}:{function}", kwargs)
     make = _attribute(f"{module}:{function}")
     kwargs = {key: value for key, value in kwargs.items() if key != "render_mode"}
     return make(**kwargs, **({"render_mode": "rgb_array"} if render else {}))
@@ -246,12 +250,14 @@ def _made_by_function(name: str, render: bool) -> Any:
     return env
 
 
-def _wrapper(entry_point: str, base: type) -> Any:
+def _wrapper(entry_point: str, base: type, arguments: Mapping[str, object], trust: bool) -> Any:
     """Return a wrapper.
 
     Raises:
-        CannotRedo: it is something else.
+        CannotRedo: it is something else, or may not be made.
     """
+    if not trust:
+        require_listed_wrapper(entry_point, arguments)
     wrapper = _attribute(entry_point)
     if not (isinstance(wrapper, type) and issubclass(wrapper, base)):
         raise CannotRedo(f"{entry_point} is not a wrapper of Gymnasium.")
@@ -268,12 +274,6 @@ def _attribute(name: str) -> Any:
     for part in path.split("."):
         value = getattr(value, part)
     return value
-
-
-def _name_of(entry_point: str | Callable[..., object] | None) -> str:
-    if entry_point is None or isinstance(entry_point, str):
-        return entry_point or ""
-    return f"{entry_point.__module__}:{getattr(entry_point, '__qualname__', '')}"
 
 
 def _without_display() -> None:
@@ -306,6 +306,14 @@ def why_not_redone(recording: Recording, trust: bool = False) -> str:
                     "A process stepped a vector that cannot be taken apart. As several processes recorded "
                     "the run, its environments are recorded one by one."
                 )
-            reason = reason or why_not_made(maker, trust)
+            reason = reason or _why_not_made_of(recording, maker, trust)
         first += shard.environments
-    return reason or why_not_made(recording.maker, trust)
+    return reason or _why_not_made_of(recording, recording.maker, trust)
+
+
+def _why_not_made_of(recording: Recording, maker: EnvironmentMaker | None, trust: bool) -> str:
+    try:
+        with trusting(recording.path, maker, trust) as is_trusted:
+            return why_not_made(maker, is_trusted)
+    except CannotRedo as error:
+        return str(error)

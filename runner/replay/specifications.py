@@ -1,45 +1,25 @@
 """The specification of a recorded environment, parsed with checks; nothing is imported or made here.
 
-A recording is hostile input. Without trust, only packages of environments that are installed here are
-imported: those of `PACKAGES` and `MODULES`, and those that register themselves with Gymnasium as plug-ins.
-The recorded entry point is compared with the registered one, and never called itself. The recording's own are
-the keyword arguments (plain JSON of bounded size without file names), the step limit, and wrappers of those
-packages.
+What of it may be made is decided in `runner.replay.trust`.
 """
 
 from __future__ import annotations
 
-import importlib.metadata
-import importlib.util
 import json
-import os
-import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from typing import Final
 
 from runner.errors import CannotRedo
 from runner.recording.maker import EnvironmentMaker, VectorMaker
+from runner.replay.trust import is_left_out
 from runner.util.values import Json, is_whole
 
-PACKAGES: Final = (
-    *("ale_py", "dualtaxi", "gymnasium", "gymnasium_robotics", "highway_env"),
-    *("minigrid", "miniworld", "mo_gymnasium", "mpe2", "pettingzoo"),
-)
-"""Packages of environments that are imported without trust, if they are installed."""
-MODULES: Final = ("stable_baselines3.common.atari_wrappers",)
-"""Modules of wrappers that are imported without trust, if they are installed: they touch no files."""
 _MAX_SPEC: Final = 1 << 16
 """The most characters of a specification that is not trusted."""
 _MAX_STEPS: Final = 2**62
-ONLY_PICTURES: Final = frozenset({"HumanRendering", "RecordVideo", "RenderCollection"})
-"""Wrappers of Gymnasium that show or write pictures and change no step: they are left out."""
-_ONLY_INFOS: Final = frozenset({"DictInfoToList", "RecordEpisodeStatistics"})
-"""Wrappers of vectors that change nothing but infos: left out too."""
 Wrapper = tuple[str, str, dict[str, object]]
 """Name, entry point and keyword arguments of a wrapper."""
-TRUST: Final = "It is imported only if you trust the recording (--trust)."
 
 
 @dataclass(frozen=True)
@@ -126,74 +106,10 @@ def _json_of(text: str) -> dict[str, object]:
     return values
 
 
-def check_arguments(spec: EnvironmentSpec, registered: Mapping[str, object]) -> None:
-    """Refuse arguments of an environment and its wrappers that name a file, unless they are registered.
-
-    Raises:
-        CannotRedo: one does.
-    """
-    check_plain(f"keyword argument of {spec.id}", spec.kwargs, registered)
-    for name, _, kwargs in spec.wrappers:
-        if name not in ONLY_PICTURES:
-            check_plain(f"argument of the wrapper {name}", kwargs, {})
-
-
-def check_plain(what: str, kwargs: Mapping[str, object], registered: Mapping[str, object]) -> None:
-    """Refuse arguments that name a file, unless they are the registered ones.
-
-    Raises:
-        CannotRedo: one does; the message begins with `what`.
-    """
-    for key, value in kwargs.items():
-        if registered.get(key) != value and any("/" in text or os.sep in text for text in _texts(value)):
-            raise CannotRedo(f"Found the {what} {key}={value!r}, which names a file. {TRUST}")
-
-
-def _texts(value: object) -> Iterator[str]:
-    """Yield the texts in a JSON value."""
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, dict | list):
-        for part in value.values() if isinstance(value, dict) else value:
-            yield from _texts(part)
-
-
 def vector_wrappers(vector: VectorMaker) -> list[Wrapper]:
     """Return the wrappers around a vector that change what it returns, from the innermost out."""
     return [
         wrapper
         for wrapper in _wrappers_of(json.loads(vector.wrapper_specs or "[]"), "the vector")
-        if wrapper[0] not in {*ONLY_PICTURES, *_ONLY_INFOS}
+        if not is_left_out(wrapper[1])
     ]
-
-
-def why_not_imported(module: str, trust: bool) -> str:
-    """Return why a module may not or cannot be imported; empty if it can be tried."""
-    path = module.partition(":")[0]
-    root = path.partition(".")[0]
-    if root == "__main__":
-        return (
-            "The environment was defined in the script that recorded it, which cannot be imported: move it "
-            "to a module, and name the function that makes it: make='module:function'."
-        )
-    if not trust and root not in {*PACKAGES, *_plug_ins()} and path not in MODULES:
-        return f"The environment needs {module}, which is not a known package of environments. {TRUST}"
-    try:
-        exists = root in sys.modules or importlib.util.find_spec(root) is not None
-    except (ImportError, ValueError):
-        exists = False
-    if exists:
-        return ""
-    hint = (
-        " If it is a file of yours, run the command in its folder, or put that into PYTHONPATH."
-        if root not in PACKAGES
-        else ""
-    )
-    return f"The package {root}, which the environment needs, is not installed here.{hint}"
-
-
-@cache
-def _plug_ins() -> frozenset[str]:
-    """Return the installed packages that register themselves with Gymnasium, which imports them anyway."""
-    entries = importlib.metadata.entry_points(group="gymnasium.envs")
-    return frozenset(each.value.partition(":")[0].partition(".")[0] for each in entries)

@@ -241,15 +241,29 @@ class Run:
 
 
 def create_run(
-    recordings: Path, config: ExperimentConfig, seed: int, name: str | None = None, run_id: str | None = None
+    recordings: Path,
+    config: ExperimentConfig,
+    seed: int,
+    name: str | None = None,
+    run_id: str | None = None,
+    parent: Run | None = None,
 ) -> Run:
     """Create the folder of a new run with its `run.json`; an id is never used twice.
 
     Args:
         name: the name of the run; the configuration's name by default.
         run_id: an id from `new_run_id`; replaced if it is taken by now.
+        parent: the run that the configuration is from: if it has no mark, neither has the new one.
     """
-    return new_run(recordings, config.to_mapping(), seed, name or config.name, run_id)
+    from runner.runs.marks import environment_of_job, mark, merge_marks
+
+    values = config.to_mapping()
+    run = new_run(recordings, values, seed, name or config.name, run_id)
+    if parent is None:
+        mark(run.folder, environment_of_job(values))
+    else:
+        merge_marks(run.folder, [parent.folder])
+    return run
 
 
 def new_run(

@@ -20,7 +20,7 @@ from multiprocessing import forkserver
 from typing import Final, ParamSpec, Self, TypeVar
 
 from runner.service.errors import Busy
-from runner.util.processes import CallFailed, ChildProcess, ProcessDied, process_context
+from runner.util.processes import CallFailed, ChildProcess, ProcessDied, process_context, starting_processes
 
 Args = ParamSpec("Args")
 Result = TypeVar("Result")
@@ -88,7 +88,8 @@ class ProcessPool:
     def __enter__(self) -> Self:
         """Start the process that all others are forked from, so that the first call need not wait for it."""
         if self._context.get_start_method() == "forkserver":
-            forkserver.ensure_running()
+            with starting_processes():
+                forkserver.ensure_running()
         return self
 
     def __exit__(self, *_: object) -> None:

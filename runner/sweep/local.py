@@ -13,6 +13,8 @@ from multiprocessing.context import SpawnContext
 from multiprocessing.synchronize import Event
 from typing import Final, Generic, Protocol, Self, TypeVar
 
+from runner.util.processes import starting_processes
+
 CLOSE_SECONDS: Final = 30.0
 """The time that a worker has to close its recording before it is killed."""
 
@@ -55,7 +57,8 @@ class LocalWorkers(Generic[T, R]):
         self._count = count
         # Fresh interpreters: a fork would copy locks that threads of this one hold.
         self._context = multiprocessing.get_context("spawn")
-        self._stopping = self._context.Event()
+        with starting_processes():  # an event starts one that tracks it
+            self._stopping = self._context.Event()
         self._idle: list[_Worker[R]] = []
         self._busy: dict[object, tuple[_Worker[R], T]] = {}
 
@@ -111,7 +114,8 @@ class _Worker(Generic[R]):
         self._process = context.Process(
             target=serve, args=(theirs, stopping), name="sweep-worker", daemon=True
         )
-        self._process.start()
+        with starting_processes():
+            self._process.start()
         theirs.close()
 
     def send(self, task: Work) -> bool:

@@ -12,6 +12,7 @@ from typing import Final
 
 from runner.recording.labels import Labels
 from runner.runs.listing import run_in
+from runner.runs.marks import environment_of_job, mark
 from runner.runs.run import new_run
 from runner.sweep import tag_of
 from runner.sweep.local import Workers
@@ -172,7 +173,9 @@ class _Runner:
         """
         labels = Labels(tags=tuple(sorted((tag_of(self.sweep.name), f"trial={task.trial}"))))
         facts = task.config, task.seed, self.sweep.name
-        return new_run(self.recordings, *facts, labels=labels, status="interrupted").run_id
+        run = new_run(self.recordings, *facts, labels=labels, status="interrupted")
+        mark(run.folder, environment_of_job(task.config))
+        return run.run_id
 
     def _died_twice(self, task: Task) -> Result:
         """Return the result of a task whose worker died twice; remove its run if it has no recording."""

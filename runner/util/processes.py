@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import os
 import signal
 import sys
 import threading
@@ -18,6 +19,7 @@ import time
 import traceback
 import types
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from multiprocessing import process
 from pathlib import Path
 from typing import Any, Final, ParamSpec, Self, TypeVar
 
@@ -26,6 +28,9 @@ from runner.util.humanize import size
 
 _RESERVE_BYTES: Final = 64 << 20
 """Memory counts as used up if no block of this size is left."""
+OWN_ONLY: Final = "DUALTAXI_OWN_ONLY"
+"""The variable of a process, and of its children, that make only what their user recorded; if not empty."""
+_SAFE_PATH: Final = "PYTHONSAFEPATH"
 Args = ParamSpec("Args")
 Result = TypeVar("Result")
 
@@ -56,15 +61,49 @@ def report_progress(value: object) -> None:
 
 
 @contextlib.contextmanager
-def _without_main_module() -> Iterator[None]:
-    """Start a process without importing the user's script in it, which may not guard its statements."""
+def importing_from(folders: Sequence[str], is_for_good: bool = False) -> Iterator[None]:
+    """Find modules in further folders too, after all others, while the block runs or from then on."""
+    added = [folder for folder in folders if folder not in sys.path]
+    sys.path.extend(added)
+    try:
+        yield
+    finally:
+        for folder in () if is_for_good else added:
+            sys.path.remove(folder)
+
+
+@contextlib.contextmanager
+def starting_processes(with_main: bool = True) -> Iterator[None]:
+    """Start interpreters in the block that import nothing from the current folder.
+
+    Python lets `python -c` and `python -m` look there first, and `multiprocessing` starts its processes by
+    the one and hands them this process's `sys.path`, with the folder that the other put there.
+
+    Args:
+        with_main: whether the script of this process is imported in them, as `multiprocessing` does.
+    """
     with _starting:
-        main = sys.modules["__main__"]
-        sys.modules["__main__"] = types.ModuleType("__main__")
+        main, before, path = sys.modules["__main__"], os.environ.get(_SAFE_PATH), sys.path
+        os.environ[_SAFE_PATH] = "1"
+        sys.path = _without_current_folder(path)
+        if not with_main:  # it may not guard its statements
+            sys.modules["__main__"] = types.ModuleType("__main__")
         try:
             yield
         finally:
-            sys.modules["__main__"] = main
+            sys.modules["__main__"], sys.path = main, path
+            if before is None:
+                del os.environ[_SAFE_PATH]
+            else:
+                os.environ[_SAFE_PATH] = before
+
+
+def _without_current_folder(path: list[str]) -> list[str]:
+    """Return the entries of `sys.path` but that of `python -m`, `-c` or a prompt: the current folder."""
+    is_module = getattr(sys.modules["__main__"], "__spec__", None) is not None and not sys.flags.safe_path
+    current: str = process.ORIGINAL_DIR  # type: ignore[attr-defined]
+    is_added = is_module and path[:1] == [current] and current != str(Path(__file__).parents[2])
+    return [entry for entry in path[is_added:] if Path(entry).is_absolute()]
 
 
 def process_context(preload: Sequence[str] = ()) -> Any:
@@ -99,9 +138,10 @@ class ChildProcess:
         self._on_progress = on_progress
         context = context or process_context()
         self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, memory_bytes), daemon=True)
+        is_own_only = os.environ.get(OWN_ONLY, "")
+        self._process = context.Process(target=_serve, args=(theirs, memory_bytes, is_own_only), daemon=True)
         try:
-            with _without_main_module():
+            with starting_processes(with_main=False):
                 self._process.start()
         except BaseException:
             self._pipe.close()
@@ -201,8 +241,9 @@ class ChildProcess:
         self._pipe.close()
 
 
-def _serve(pipe: Any, memory_bytes: int) -> None:
+def _serve(pipe: Any, memory_bytes: int, is_own_only: str) -> None:
     """Call functions that come through a pipe, and send what they return, until it is closed."""
+    os.environ[OWN_ONLY] = is_own_only
     global _pipe_to_parent  # noqa: PLW0603 - one pipe for the whole process
     _pipe_to_parent = pipe
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent to act on

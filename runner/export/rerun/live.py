@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from runner.environments.mdp import Mdp
 from runner.recording import schema
 from runner.recording.messages import Message
+from runner.util.processes import starting_processes
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -62,14 +63,16 @@ class LiveView:
         self.failure = ""
         """Why nothing more was shown; empty if everything was. Set at the end."""
         context = multiprocessing.get_context("spawn")
-        self._queue = context.Queue(MAX_QUEUED)
+        with starting_processes():  # a queue starts one that tracks it
+            self._queue = context.Queue(MAX_QUEUED)
         self._errors, errors = context.Pipe(duplex=False)
         self._process = context.Process(
             target=_send_all, args=(self._queue, errors, title, run_id, url), name="live view", daemon=True
         )
 
     def __enter__(self) -> LiveView:
-        self._process.start()
+        with starting_processes():
+            self._process.start()
         return self
 
     def __exit__(self, *_: object) -> None:

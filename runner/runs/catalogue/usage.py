@@ -18,6 +18,7 @@ from runner.runs.catalogue.columns import IndexRow
 from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import Index
 from runner.runs.locking import RUN_LOCK
+from runner.runs.marks import MARK_FILE
 from runner.runs.run import RECORDING_FILE, RUN_FILE, UNLISTED
 from runner.runs.store import Store
 from runner.util.files import EXPORTS, RESTORED, RUN_SEPARATOR, TABLES, cache_folder
@@ -42,10 +43,10 @@ FREED_BY: Final = {
 }
 """What could be freed, with its heading and how to do it."""
 
-_OWN: Final = frozenset((RUN_FILE, RECORDING_FILE, LABELS_FILE, LOCK_FILE, RUN_LOCK))
+_OWN: Final = frozenset((RUN_FILE, RECORDING_FILE, LABELS_FILE, MARK_FILE, LOCK_FILE, RUN_LOCK))
 _LEFT_OVER: Final = re.compile(
     r"recording\.(resuming|repairing|rerecording|restoring)|recording\.damaged-\d+\.mcap"
-    r"|\.[0-9a-f]{8}\.(run|labels)\.json|(run|labels)\.[0-9a-f]{8}\.tmp"
+    r"|\.[0-9a-f]{8}\.(run|labels|trust)\.json|(run|labels)\.[0-9a-f]{8}\.tmp"
 )
 _COLUMNS: Final = ("root", "entry", "id", "name", "status", "tags", "digest")
 """The columns of the index that are needed of a run."""

@@ -78,7 +78,7 @@ def run_seed(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed:
     else:
         job = Job(config, seed)
         parent = _parent_of(job, spec.recordings) if spec.kind == "branch" else None
-        run = create_run(spec.recordings, config, seed, spec.name, spec.run_ids[seed])
+        run = create_run(spec.recordings, config, seed, spec.name, spec.run_ids[seed], parent)
         reporter = Reporter(channel, run.run_id, config, seed)
         if parent is None:
             run = run_job(job, run, reporter.report, channel.stop)

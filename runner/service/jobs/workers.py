@@ -22,6 +22,7 @@ from runner.service.jobs.store import WITHOUT_RUNS, Job, JobStore, now
 from runner.service.jobs.worker import work
 from runner.service.logs import LOG
 from runner.util.humanize import size
+from runner.util.processes import starting_processes
 
 STOP_SECONDS: Final = 15.0
 """How long a worker may take to close its recording before it is killed."""
@@ -170,7 +171,8 @@ class WorkerPool:
             # Not a daemon: a sweep's worker has child processes of its own.
             process = self._context.Process(target=work, args=(theirs, spec), name=f"job-{job.number}")
             try:
-                process.start()
+                with starting_processes():
+                    process.start()
             except BaseException:
                 ours.close()
                 raise

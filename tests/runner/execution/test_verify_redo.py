@@ -9,6 +9,8 @@ import sys
 import gymnasium
 import pytest
 
+from runner.runs.marks import MARK_FILE
+from runner.runs.resolve import find_run
 from tests.runner.loops.making import dualtaxi
 from tests.runner.replay import loops
 from tests.runner.replay.loops import record
@@ -66,9 +68,10 @@ def test_a_loop_that_differs_exits_with_1(recordings):
 
 @pytest.mark.parametrize(
     ("words", "reason"),
-    [([], "only if you trust the recording (--trust)"), (["--trust"], "more than its seed")],
+    [([], "that is made only with --trust"), (["--trust"], "more than its seed")],
 )
 def test_a_loop_that_cannot_be_done_again_is_an_error_only_if_that_is_demanded(recordings, words, reason):
+    find_run("noisy", recordings).folder.joinpath(MARK_FILE).unlink(missing_ok=True)
     code, output = verify(recordings, "noisy", *words)
     assert code == 0
     assert "sound; it cannot be reproduced here" in output
@@ -131,6 +134,8 @@ def test_a_function_of_a_file_in_the_current_folder_makes_the_environment_of_a_t
     done = run(sys.executable, "own_pole.py")
     assert done.returncode == 0, done.stderr
     command = (sys.executable, "-P", "-m", "runner")  # without the current folder, as `dualtaxi`
+    assert "reproduced: 1 episode, " in run(*command, "verify", "own").stdout
+    next(tmp_path.glob(f"recordings/*/{MARK_FILE}")).unlink()
     assert "--trust" in run(*command, "verify", "own").stdout
     assert "reproduced: 1 episode, " in run(*command, "verify", "own", "--trust").stdout
     done = run(*command, "export", "film", "own", "--episode", "0", "--trust", "-o", "own.gif")

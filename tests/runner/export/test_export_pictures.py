@@ -16,6 +16,7 @@ from runner.drawing.svg import Drawing
 from runner.errors import RecordingError
 from runner.export.pictures import Source, pictures
 from runner.recording.reader import open_recording
+from runner.runs.marks import MARK_FILE
 from tests.runner.export.making import made_otherwise
 from tests.runner.loops.making import Rooms, make, play
 
@@ -130,6 +131,9 @@ def test_what_a_recording_names_is_imported_if_it_is_trusted_only(tmp_path):
     with runner.record(own_pole(), tmp_path, make=own_pole) as rec:
         list(play(rec, 60))
     with open_recording(rec.run.recording) as recording:
+        with contextlib.closing(pictures(recording, "train", 0)) as shown:
+            assert shown.source is Source.REDRAWN
+        (rec.run.folder / MARK_FILE).unlink()
         shown = pictures(recording, "train", 0)
         assert shown.source is Source.VALUES
         assert "--trust" in shown.reason

@@ -270,7 +270,7 @@ def test_a_disk_without_space_for_both_keeps_the_small_chunks(tmp_path, monkeypa
 
     monkeypatch.setattr("runner.recording.compaction.RecordingFile", fail)
     run = single("CartPole-v1")(tmp_path, steps="actions")
-    assert sorted(path.name for path in run.folder.iterdir()) == ["recording.mcap", "run.json"]
+    assert sorted(path.name for path in run.folder.iterdir()) == ["recording.mcap", "run.json", "trust.json"]
     with open_recording(run.recording) as recording:
         assert len(list(recording.actions("train"))) > 1
     assert verify_by_redoing(run.recording).verdict == "reproduced"

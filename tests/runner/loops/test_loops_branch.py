@@ -21,6 +21,7 @@ from runner.execution.verify import verify
 from runner.recording.reader import open_recording
 from runner.runs.branches import origin_in
 from runner.runs.catalogue.index import look
+from runner.runs.marks import MARK_FILE
 from tests.runner.loops.making import Rooms, make, play
 
 # Of Box2D's and PettingZoo's own makers.
@@ -190,6 +191,7 @@ def test_the_command_and_what_show_lists(runs, tmp_path):
 
 def test_a_dict_space_takes_json(tmp_path):
     run = recorded(tmp_path, Rooms(), 60, make="tests.runner.loops.making:Rooms")
+    (run.folder / MARK_FILE).unlink()
     with pytest.raises(CannotRedo, match="--trust"):
         runner.branch(run, at="0:1", recordings=tmp_path)
     given = '{"go": 2, "push": [0.25]}'

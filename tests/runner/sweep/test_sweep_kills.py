@@ -68,5 +68,5 @@ def test_workers_killed_at_each_moment_of_a_task_change_nothing(start, moments, 
     assert [run.status for run in runs] == ["finished"] * 8
     assert {path.name for path in recordings.iterdir()} == {".sweeps", *(run.run_id for run in runs)}
     files = {path.name for run in runs for path in run.folder.iterdir()}
-    assert files - {"owner.lock"} == {"run.json", "labels.json", "recording.mcap"}
+    assert files - {"owner.lock"} == {"run.json", "labels.json", "recording.mcap", "trust.json"}
     assert list(own.glob("dualtaxi-*")) == []
