@@ -1,4 +1,4 @@
-"""Progress lines on a terminal's stderr, which disappear at the end."""
+"""Progress lines on a terminal's stderr, which disappear at the end; elsewhere a line a minute."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final
 
-from runner.cli.output import console
+from runner.cli.output import console, say
 from runner.util.humanize import number, size
 
 if TYPE_CHECKING:
@@ -19,8 +20,13 @@ REDRAWS_PER_SECOND: Final = 5
 BAR_WIDTH: Final = 12
 """Leaves space at the edge: the terminal's echo of Ctrl-C would break a full line and leave it there."""
 
+LINE_SECONDS: Final = 60.0
+"""How often a line is printed where stderr is no terminal, so that a log shows that work goes on."""
+
 _BAR: Final = "bar"
 _SPINNER: Final = "spinner"
+_DRAWN: Final = (_BAR, _SPINNER, "speed", "left", "elapsed")
+"""Columns that need a terminal."""
 
 
 @contextlib.contextmanager
@@ -65,7 +71,8 @@ def bytes_line(label: str) -> Iterator[Callable[[int, int], None]]:
 @contextlib.contextmanager
 def count_line(what: str, total: int) -> Iterator[Callable[[int], None]]:
     """Yield a function that is called with the number done."""
-    with _line("", [_BAR, f"{{task.completed:,}} {what}", "left"], total=total or None) as update:
+    of_all = " of {task.total:,}" if total else ""
+    with _line("", [_BAR, f"{{task.completed:,}}{of_all} {what}", "left"], total=total or None) as update:
         yield lambda done: update(completed=done)
 
 
@@ -81,13 +88,13 @@ def total_line() -> Iterator[Callable[[int, int, str], None]]:
 def _line(
     label: str, names: list[str], total: float | None = None, **fields: Any
 ) -> Iterator[Callable[..., None]]:
-    """Yield the function that updates a line of columns; it does nothing without a terminal.
+    """Yield the function that updates a line of columns; without a terminal, prints it now and then.
 
     The columns are names of the table below, or texts, which use the fields; `total` is None if it is
     unknown.
     """
     if not sys.stderr.isatty():
-        yield lambda **_: None
+        yield _plain_line([label, *names], total=total, **fields)
         return
     from rich import progress
 
@@ -106,6 +113,34 @@ def _line(
         refresh_per_second=REDRAWS_PER_SECOND,
     ) as line:
         yield partial(line.update, line.add_task("", total=total, **fields))
+
+
+def _plain_line(names: list[str], **values: Any) -> Callable[..., None]:
+    """Return the function that updates a line which is printed now and then, as text."""
+    task = SimpleNamespace(**{"completed": 0, "description": ""} | values, fields=values)
+    texts = {"bytes": "{task.completed:,} of {task.total:,} bytes", **dict.fromkeys(_DRAWN, "")}
+    template = "  ".join(filter(None, (texts.get(name, name) for name in names)))
+    print_seldom = seldom(lambda: say(template.format(task=task)))
+
+    def update(**values: Any) -> None:
+        vars(task).update(values)
+        task.fields.update(values)
+        print_seldom()
+
+    return update
+
+
+def seldom(function: Callable[..., None]) -> Callable[..., None]:
+    """Return a function that calls another one at most every `LINE_SECONDS`, and not at once."""
+    due = time.monotonic() + LINE_SECONDS
+
+    def call(*values: object) -> None:
+        nonlocal due
+        if time.monotonic() >= due:
+            due = time.monotonic() + LINE_SECONDS
+            function(*values)
+
+    return call
 
 
 def progress_facts(progress: Progress, speed: float | None) -> str:

@@ -84,11 +84,12 @@ def write_grid(
     fps: float,
     width: int | None = None,
     progress: Callable[[int], None] = lambda _: None,
+    max_frames: int | None = None,
 ) -> Film:
     """Write a film of several episodes side by side; each stays at its last frame until all have ended.
 
     The arguments are those of `write_film`, of episodes row by row; `progress` counts the frames of single
-    episodes, and a `width` of None is at most `MAX_WIDTH`.
+    episodes, a `width` of None is at most `MAX_WIDTH`, and no episode has more than `max_frames`.
     """
     form = format_of(path)
     notes: list[str] = []
@@ -97,7 +98,8 @@ def write_grid(
         done = 0
         for number, shot in enumerate(shots):
             with contextlib.closing(shot.pictures), Encoder(Path(folder, f"{number}"), LOSSLESS, fps) as one:
-                for frame in captioned(shot, (width or MAX_WIDTH) // columns, notes):
+                captions = captioned(shot, (width or MAX_WIDTH) // columns, notes)
+                for frame in islice(captions, max_frames):
                     one.add(frame)
                     done += 1
                     progress(done)

@@ -24,6 +24,7 @@ from runner.recording.spaces import leaves_of as recorded_leaves
 from runner.replay.recorded import RecordedReset
 from runner.replay.redone import Frame, Values
 from runner.util.arrays import Array
+from runner.util.extras import missing
 from runner.util.processes import raise_if_out_of_memory
 
 _MAX_TEXT: Final = 300
@@ -163,6 +164,9 @@ class Stepper(ABC):
         except (MemoryError, CannotRedo):
             raise
         except Exception as error:  # foreign code raises anything
+            if getattr(error.__cause__ or error, "name", "") == "pygame":  # of its ImportError
+                needed = missing("pygame", "film", "Drawing this environment")
+                raise CannotRedo(str(needed)) from error
             raise CannotRedo(
                 f"The environment cannot draw itself here: {type(error).__name__}: {error}. "
                 "Where there is no display, drawing may need a library such as EGL or OSMesa."

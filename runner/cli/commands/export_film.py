@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING
 
 import click
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from runner.export.pictures import Pictures
     from runner.recording.reader import Recording
 
+GRID_LENGTHS = 2
+"""A grid ends after this many times the median length of its episodes; a failed trial is far longer."""
 _SCENE_FPS = 4.0
 """Frames per second of a drawn scene, whose steps are large."""
 _FPS = 30.0
@@ -47,6 +50,11 @@ def command(
         type=GRID,
         metavar="RxC",
         help="Several episodes side by side, evenly from the best to the worst, such as 3x3.",
+    ),
+    whole: bool = option(
+        "--whole",
+        is_flag=True,
+        help=f"Show a grid until all episodes end.  [default: {GRID_LENGTHS} times the median length]",
     ),
     fps: float | None = option(
         "--fps",
@@ -81,6 +89,8 @@ def command(
       dualtaxi export film k3v9m2xq --grid 3x3 -o nine.webm --fps 60
     """
     choice.require_one(grid=grid)
+    if whole and not grid:
+        raise click.UsageError("--whole is for a grid: the film of one episode is always whole.")
     from runner.export import film
     from runner.export.encoder import format_of
     from runner.export.pictures import Source, pictures, source_of
@@ -101,13 +111,17 @@ def command(
                 opened.append(pictures(recording, one.phase, one.number, trust))
                 yield film.Shot(f"{run.title}: {one.title}", opened[-1])
 
-        steps = sum(len(recording.episode_span(one.phase, one.number)) for one in shown)
+        lengths = [len(recording.episode_span(one.phase, one.number)) for one in shown]
+        longest = (
+            max(lengths) if whole or not grid else min(max(lengths), int(GRID_LENGTHS * median(lengths)))
+        )
+        cut = sum(length > longest for length in lengths)
         made: list[film.Film] = []
-        with count_line("frames", steps + len(shown)) as progress:
+        with count_line("frames", sum(min(length, longest) + 1 for length in lengths)) as progress:
 
             def write(path: Path) -> None:
                 if grid:
-                    made.append(film.write_grid(path, shots(), grid[1], speed, width, progress))
+                    made.append(film.write_grid(path, shots(), grid[1], speed, width, progress, longest + 1))
                 else:
                     made.append(film.write_film(path, next(shots()), speed, width, progress))
 
@@ -116,6 +130,8 @@ def command(
         say(f"The film shows {opened[0].source}: {note}")
     for note in made[0].notes:
         say(note)
+    if cut:
+        say(f"{cut} of {len(shown)} episodes are longer than the film, {longest:,} steps; --whole shows all.")
     what = shown[0].title if len(shown) == 1 else f"{len(shown)} episodes"
     facts = f"{made[0].frames:,} frames of {made[0].width}x{made[0].height}, {size(path.stat().st_size)}"
     to.report(

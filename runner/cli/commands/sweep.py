@@ -25,7 +25,7 @@ from runner.cli.options import (
 )
 from runner.cli.output import console, draw, echo, facts, print_json, print_sections, require_one_form, say
 from runner.cli.parameter_types import ConfigName
-from runner.cli.progress import stage_line
+from runner.cli.progress import seldom, stage_line
 from runner.errors import ExitCode, RunnerError
 from runner.export.places import require_new, write_text_new
 from runner.runs.run import recordings_folder
@@ -207,9 +207,9 @@ def ls(recordings: Path | None = recordings_option, as_json: bool = json_option)
 
 @contextlib.contextmanager
 def _live_status(sweep: Sweep) -> Iterator[Callable[[SweepStatus], None]]:
-    """Yield a function that shows the status on a terminal's stderr."""
+    """Yield a function that shows the status on a terminal's stderr; elsewhere a line a minute."""
     if not sys.stderr.isatty():
-        yield lambda _: None
+        yield seldom(lambda status: say(", ".join(_status_rows(sweep, status).values())))
         return
     from rich.live import Live
 

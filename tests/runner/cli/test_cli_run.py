@@ -1,11 +1,13 @@
 """`dualtaxi run`."""
 
 import json
+import re
 import subprocess
 import sys
 
 import pytest
 
+from runner.cli import progress
 from runner.cli.commands import run as run_command
 from runner.execution import estimate
 from runner.runs.listing import list_runs
@@ -183,3 +185,26 @@ def test_a_run_is_on_disk_before_heavy_imports(tiny, tmp_path):
     )
     assert done.returncode == 5, done.stderr
     assert not {"numpy", "numba", "gymnasium", "rich"} & set(done.stderr.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (("run", "{tiny}"), r"\d+/30  +.*steps/s"),
+        (("sweep", "run", "{sweep}", "--workers", "1"), r"\d of 2 runs, \d running, .*so far"),
+        (("export", "film", "{run}", "-o", "{folder}/film.gif", "--width", "160"), r"\d of \d+ frames"),
+    ],
+)
+def test_without_a_terminal_a_line_now_and_then_shows_that_work_goes_on(
+    recorded, recorded_run, tmp_path, tiny, monkeypatch, words, line
+):
+    sweep = tmp_path / "small.yaml"
+    sweep.write_text("base: tiny.yaml\nstrategy: grid\nseeds: [0]\nparameters: {discount: [0.5, 0.9]}\n")
+    typed = [word.format(tiny=tiny, sweep=sweep, run=recorded_run.folder, folder=tmp_path) for word in words]
+    into = [] if words[0] == "export" else ["--recordings", tmp_path / "recordings"]
+    assert not re.search(line, recorded(*typed, *into).stderr)  # a minute has not passed
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0)
+    into = ["--force"] if words[0] == "export" else ["--recordings", tmp_path / "others"]
+    done = recorded(*typed, *into)
+    assert done.exit_code == 0, done.output
+    assert re.search(line, done.stderr), done.stderr

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import av
 import gymnasium
@@ -231,7 +235,7 @@ def test_without_evaluations_training_episodes_are_ranked(pole, tmp_path):
 def test_a_grid_shows_episodes_from_best_to_worst_side_by_side(pole, tmp_path):
     run, drawn = pole
     path = tmp_path / "grid.mp4"
-    result = film(run.recording, "--grid", "2x2", "-o", path, "--width", 1200)
+    result = film(run.recording, "--grid", "2x2", "-o", path, "--width", 1200, "--whole")
     assert result.exit_code == 0, result.output
     with open_recording(run.recording) as recording:
         _, ranked = ranked_episodes(recording)
@@ -245,6 +249,39 @@ def test_a_grid_shows_episodes_from_best_to_worst_side_by_side(pole, tmp_path):
         cell = frames[-1][row * height : (row + 1) * height, column * width : (column + 1) * width]
         assert_shows(cell, episode[-1])
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(("words", "frames"), [((), 8), (("--whole",), 60)])
+def test_a_grid_ends_after_twice_the_median_length(tmp_path, words, frames):
+    with runner.record(gymnasium.make("CliffWalking-v1"), tmp_path / "runs") as rec:
+        for episode, length in enumerate((3, 3, 59, 4)):
+            rec.reset(seed=episode)
+            for _ in range(length):
+                rec.step(0)
+            rec.reset(seed=episode)
+    path = tmp_path / "grid.mp4"
+    result = film(rec.run.recording, "--grid", "2x2", "--width", 320, "-o", path, *words)
+    assert result.exit_code == 0, result.output
+    assert len(frames_of(path)) == frames
+    assert ("1 of 4 episodes are longer than the film, 7 steps; --whole" in result.stderr) == (not words)
+
+
+def test_a_film_names_the_extra_where_the_environment_needs_pygame(tmp_path):
+    (tmp_path / "pygame.py").write_text("raise ModuleNotFoundError('hidden', name='pygame')")
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path / "runs") as rec:
+        rec.reset(seed=0)
+        rec.step(0)
+    words = [sys.executable, "-m", "runner", "export", "film", str(rec.run.recording), "-o", "film.gif"]
+    done = subprocess.run(
+        words,
+        env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{Path.cwd()}"},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "The film shows values: Drawing this environment needs pygame" in done.stderr
+    assert "[film]" in done.stderr
 
 
 def test_a_grid_larger_than_the_run_has_empty_cells(pictured, tmp_path):
