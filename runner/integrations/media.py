@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import ConfigError
+from runner.integrations.shapes import WithoutEffect, without_effect
 from runner.loops.options import pillow
 from runner.loops.pictures import Picture
 from runner.loops.values import numbers_of
@@ -132,15 +133,38 @@ def _pixels(array: NDArray[Any], layout: str) -> NDArray[np.uint8]:
 # --- as wandb names them ------------------------------------------------------------------------------
 
 
-class Image:
+class _Media:
+    """What was made of a script's data; if nothing could be, the error comes when it is logged."""
+
+    def __init__(self, convert: Callable[..., Any], *arguments: object) -> None:
+        self._error: Exception | None = None
+        try:
+            self._content = convert(*arguments)
+        except Exception as error:
+            self._error = error
+
+    @property
+    def content(self) -> Any:
+        """A `Picture`, or arrays by name.
+
+        Raises:
+            ConfigError: the data cannot be recorded.
+        """
+        if self._error is not None:
+            raise self._error
+        return self._content
+
+
+class Image(_Media):
     """A picture: an array [height, width] or [height, width, channels], Pillow's, Matplotlib's, or a file."""
 
     def __init__(self, data_or_path: Any, *_: object, caption: str | None = None, **__: object) -> None:
-        layout = "CHW" if hasattr(data_or_path, "detach") and np.ndim(data_or_path) == 3 else "HWC"
-        self.picture, self.caption = picture_of(data_or_path, layout), caption
+        is_tensor = hasattr(data_or_path, "detach") and np.ndim(data_or_path) == 3
+        super().__init__(picture_of, data_or_path, "CHW" if is_tensor else "HWC")
+        self.caption = caption
 
 
-class Video:
+class Video(_Media):
     """A film: an array [frames, channels, height, width], or a batch of them; or a file."""
 
     def __init__(
@@ -148,28 +172,35 @@ class Video:
         data_or_path: Any,
         caption: str | None = None,
         fps: float | None = None,
-        format: str | None = None,  # noqa: A002, ARG002
+        *_: object,
+        **__: object,
     ) -> None:
-        layout = "NTCHW" if np.ndim(data_or_path) == 5 else "TCHW"
-        self.picture, self.caption = film_of(data_or_path, layout, fps), caption
+        super().__init__(film_of, data_or_path, "NTCHW" if np.ndim(data_or_path) == 5 else "TCHW", fps)
+        self.caption = caption
 
 
-class Histogram:
+class Histogram(_Media):
     """A histogram: of numbers, or counts and edges as `numpy.histogram` returns them."""
 
     def __init__(self, sequence: Any = None, np_histogram: Any = None, num_bins: int = 64) -> None:  # noqa: ARG002
         if np_histogram is None:
-            self.arrays = histogram_of(sequence)
+            super().__init__(histogram_of, sequence)
         else:
-            self.arrays = dict(zip(("counts", "edges"), map(np.asarray, np_histogram), strict=True))
+            arrays = zip(("counts", "edges"), np_histogram, strict=False)
+            super().__init__(lambda: {name: np.asarray(values) for name, values in arrays})
 
 
 class Table:
     """Rows, recorded as a text."""
 
-    def __init__(self, columns: Sequence[object] | None = None, data: Any = None, **_: object) -> None:
-        self.columns = list(columns or ())
-        self.data = [list(row) for row in (() if data is None else data)]
+    def __init__(
+        self, columns: Any = None, data: Any = None, rows: Any = None, dataframe: Any = None, **_: object
+    ) -> None:
+        if dataframe is not None:
+            columns, data = dataframe.columns, dataframe.to_numpy()
+        data = rows if data is None else data
+        self.columns = list(() if columns is None else columns)
+        self.data = list(() if data is None else data)
 
     def add_data(self, *row: object) -> None:
         """Add a row."""
@@ -181,3 +212,6 @@ class Table:
         if len(text) > _MAX_TABLE:
             raise ConfigError(f"log: found a table of {len(text):,} bytes, expected at most {_MAX_TABLE:,}")
         return text
+
+    def __getattr__(self, name: str) -> WithoutEffect:
+        return without_effect("wandb.Table", name)

@@ -3,36 +3,39 @@
 A script with a `SummaryWriter`, or with the shape of `wandb`, does not hand over its environment. So its
 values wait until it resets one: the first environment that is reset while such a run waits, at the outermost
 wrapper, is recorded from then on as `runner.record` and `runner.record_vector` do, and the values go into
-that recording. If the script records a loop itself, they go there. If it resets no environment, they become
-a run of their own, without steps.
+that recording. If the script records a loop itself, they go there. If it resets no environment, or one that
+cannot be recorded, they become a run of their own, without steps.
+
+A script that was written for another tracker never ends because of this one: what cannot be recorded gives a
+warning, unless the script asks for an error with `on_error="raise"`.
 """
 
 from __future__ import annotations
 
 import atexit
+import json
 import os
 import sys
 import time
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
-from gymnasium.spaces import Discrete
 from gymnasium.vector import VectorEnv
 
 from runner.errors import ConfigError, nearest
 from runner.integrations.hooks import WatchedEnvironment, hook_environments, open_runs
-from runner.loops.description import Described
+from runner.integrations.values import ValueRows, begin_values
 from runner.loops.env import record
 from runner.loops.flushing import open_loops
 from runner.loops.loop import Loop
-from runner.loops.options import PACKING, CallbackOptions, options_of
+from runner.loops.options import CallbackOptions
 from runner.loops.pictures import Picture
 from runner.loops.recorded import ending_of
 from runner.loops.values import arrays_of, warn_user
 from runner.loops.vector import record_vector
 from runner.recording.labels import MAX_NOTE, is_tag
-from runner.recording.maker import EnvironmentMaker
 from runner.runs.run import Run, label, new_run_id, recordings_folder
+from runner.util.jsonable import as_json
 from runner.util.values import Json, JsonView, is_whole
 
 STEP_NAME: Final = "global_step"
@@ -40,39 +43,19 @@ STEP_NAME: Final = "global_step"
 MAX_NAMES: Final = 10_000
 OPTIONS: Final = CallbackOptions.__annotations__.keys() - {"config", "name", "run_id", "seed"}
 """The arguments of `runner.record` and `record_vector` that a script may add."""
-_NO_ENVIRONMENT: Final = Described("step", Discrete(1), Discrete(1), env_id="none")
-_NOT_MADE: Final = EnvironmentMaker("gymnasium", reason="values were logged, and no environment was recorded")
 _MAX_WAITING: Final = 10_000
 """The most values that wait for an environment."""
 _MAX_WAITING_BYTES: Final = 1 << 28
+_MAX_STEP: Final = 2**62
 _WAITING_SECONDS: Final = 10.0
 """How long they do, at most; looked at when another value is logged."""
 
 
-class ValueRows:
-    """The place of values in a run without an environment: the script's own step."""
+class Watched(Protocol):
+    """What records the environments of a script."""
 
-    off_table = 0
-    is_any_over = False
-
-    def __init__(self) -> None:
-        self.place = (0, 0)
-        self.filled = 0
-        """The largest step so far, which orders the messages in time."""
-
-    def move(self, step: int) -> None:
-        """Let the next values have this step."""
-        self.place = (step, 0)
-        self.filled = max(self.filled, step)
-
-    def open(self) -> None:
-        """Do nothing: there are no steps."""
-
-    def commit(self) -> None:
-        """Do nothing: there are no steps."""
-
-    def reshape(self, described: Described) -> None:
-        """Do nothing: there are no actions."""
+    def release(self) -> None:
+        """Record nothing more."""
 
 
 class ScriptRun:
@@ -86,10 +69,8 @@ class ScriptRun:
         note: a note.
         has_environment: whether to wait for an environment, and to record it.
         takes_writers: whether a `SummaryWriter` made meanwhile logs into this run.
-        options: further arguments of `runner.record`, such as `steps`, `frames_every` and `on_error`.
-
-    Raises:
-        ConfigError: `runner.record` has no such argument.
+        options: further arguments of `runner.record`, such as `steps`, `frames_every` and `on_error`, by
+            default "warn"; others are ignored, with a warning.
     """
 
     def __init__(
@@ -103,11 +84,11 @@ class ScriptRun:
         takes_writers: bool = False,
         **options: Any,
     ) -> None:
-        if unknown := sorted(options.keys() - OPTIONS):
-            expected = ", ".join(sorted(OPTIONS))
-            hint = nearest(unknown[0], {*OPTIONS, "monitor_gym", "recordings"})
-            raise ConfigError(f"found the argument {unknown[0]!r}, expected one of {expected}.{hint}")
-        self._options = options
+        self._warnings: set[str] = set()
+        for unknown in sorted(options.keys() - OPTIONS):
+            hint = nearest(unknown, {*OPTIONS, "monitor_gym", "recordings"})
+            self.warn_once(f"the argument {unknown}={options.pop(unknown)!r} has no effect here.{hint}")
+        self._options = {"on_error": "warn"} | options
         self.settings: Json = dict(settings or {})
         self.name, self.takes_writers = name, takes_writers
         self.closed = self.has_writer = False
@@ -118,9 +99,10 @@ class ScriptRun:
         if left_out := [tag for tag in tags if not is_tag(tag)]:
             warn_user(f"tags: {', '.join(map(repr, left_out))} cannot be tags of a run, and are left out.")
         self._note = note[:MAX_NOTE]
-        is_folder = "://" not in str(recordings or "")
-        self.run_id = new_run_id(recordings_folder(recordings if is_folder else None))
-        self._waiting: list[tuple[str, tuple[object, ...], int | None]] = []
+        self.run_id = self._new_run_id()
+        self.calls: int | None = None
+        """The number of calls so far, where the script's tracker counts them; None where it does not."""
+        self._waiting: list[tuple[str, str, object, int | None, int | None]] = []
         self._since, self._waiting_bytes = 0.0, 0
         self._loop: Loop[Any] | None = None
         self._is_own = False
@@ -128,77 +110,132 @@ class ScriptRun:
         self._has_joined = False
         """Whether values went into a loop that is closed."""
         self._values: ValueRows | None = None
-        self._watched: WatchedEnvironment | None = None
-        self._names: set[str] = set()
+        self._watched: Watched | None = None
+        self._names: dict[str, int] = {}
+        """Name to the number of its values without a step."""
         self._step: int | None = None
-        self._warnings: set[str] = set()
         self._is_foreign = False
         hook_environments()
         atexit.register(self._close_at_exit)
         open_runs.append(self)
 
+    def _new_run_id(self) -> str:
+        is_folder = "://" not in str(self._recordings or "")
+        return new_run_id(recordings_folder(self._recordings if is_folder else None))
+
     # --- what is logged -----------------------------------------------------------------------------------
 
-    def log(self, name: str, value: object, step: int | None = None) -> None:
+    def log(self, name: str, value: object, step: object = None) -> None:
         """Log a number or a text, with the script's own step."""
-        if name not in self._names:
-            if not isinstance(name, str):
-                raise ConfigError(f"log: found the name {name!r}, expected text")
-            if len(self._names) == MAX_NAMES:
-                self.warn_once(
-                    f"log: found more than {MAX_NAMES:,} names: values under further names are not recorded. "
-                    "Do names contain a number that should be the step?"
-                )
-                return
-            self._names.add(name)
-        self._do("log", (name, value), step)
+        self._do("log", name, value, step)
 
-    def snapshot(self, name: str, array: object, step: int | None = None) -> None:
+    def snapshot(self, name: str, array: object, step: object = None) -> None:
         """Record an array of numbers, or each of a mapping of arrays."""
         for own_name, values in arrays_of(name, array):
             self._waiting_bytes += values.nbytes
-            self._do("snapshot", (own_name, values.copy() if self._loop is None else values), step)
+            self._do("snapshot", own_name, values.copy() if self._loop is None else values, step)
 
-    def picture(self, name: str, picture: Picture, step: int | None = None) -> None:
+    def picture(self, name: str, picture: Picture, step: object = None) -> None:
         """Record a picture or a film under a name."""
         self._waiting_bytes += picture.frames.nbytes
-        self._do("picture", (name, picture), step)
+        self._do("picture", name, picture, step)
 
-    def _do(self, method: str, arguments: tuple[object, ...], step: int | None) -> None:
+    def _do(self, method: str, name: str, value: object, step: object) -> None:
         """Call a method of the recording's `Messages`, now or when there is a recording."""
+        if (self.closed or self._is_foreign or name not in self._names) and self._refuses(name):
+            return
+        own = step if step.__class__ is int and 0 <= step < _MAX_STEP else self.step_of(step)
+        if (call := self.calls) is None and own is None:
+            call = self._names[name]
+            self._names[name] = call + 1
+        loop = self._loop
+        if loop is not None and loop.closed:
+            if self._values is not None:
+                return  # recording failed, and gave a warning
+            self._leave_loop()
+            loop = None
+        if loop is not None:
+            self._record(loop, method, name, value, own, call)
+            return
+        self._waiting.append((method, name, value, own, call))
+        self._since = self._since or time.monotonic()
+        has_room = len(self._waiting) < _MAX_WAITING and self._waiting_bytes < _MAX_WAITING_BYTES
+        is_early = has_room and time.monotonic() - self._since < _WAITING_SECONDS
+        if not self._join_loop() and not (is_early and self._has_environment):
+            self._begin_values()
+
+    def _refuses(self, name: str) -> bool:
+        """Return whether a value is not recorded, with a warning; take note of a new name."""
         if self.closed:
             self.warn_once(f"run {self.run_id} is closed: values that are logged now are not recorded.")
-            return
-        if self._is_foreign:
+        elif self._is_foreign:
             self.warn_once(f"run {self.run_id} belongs to the process that this one was forked from.")
-            return
-        if self._loop is not None and self._loop.closed and not self._is_own:
-            self._loop = self._step = None  # what the script recorded is over; there may be more
-            self._has_joined, self._since, self._waiting_bytes = True, 0.0, 0
-        if self._loop is None:
-            self._waiting.append((method, arguments, step))
-            self._since = self._since or time.monotonic()
-            has_room = len(self._waiting) < _MAX_WAITING and self._waiting_bytes < _MAX_WAITING_BYTES
-            is_early = has_room and time.monotonic() - self._since < _WAITING_SECONDS
-            if not self._join_loop() and not (is_early and self._has_environment):
-                self._begin_values()
-            return
-        try:
-            self._move(self._loop, step)
-            phase = () if method == "picture" else (self._loop.active_phase,)
-            getattr(self._loop.messages, method)(*phase, *arguments)
-        except Exception as error:
-            self._loop.leave_out(error)
-
-    def _move(self, loop: Loop[Any], step: int | None) -> None:
-        """Record the script's own step, if it is another than before."""
-        if step is None or step == self._step:
-            return
-        self._step = step
-        if self._values is not None:
-            self._values.move(step)
+        elif not isinstance(name, str):
+            raise ConfigError(f"log: found the name {name!r}, expected text")
+        elif len(self._names) == MAX_NAMES:
+            self.warn_once(
+                f"log: found more than {MAX_NAMES:,} names: values under further names are not recorded. "
+                "Do names contain a number that should be the step?"
+            )
         else:
-            loop.messages.log(loop.active_phase, STEP_NAME, step)
+            self._names[name] = 0
+            return False
+        return True
+
+    def step_of(self, step: Any) -> int | None:
+        """Return a script's own step as a whole number; None if it gave none that can be recorded."""
+        if step is None:
+            return None
+        try:
+            whole = int(step)
+            if 0 <= whole < _MAX_STEP:
+                return whole
+        except (TypeError, ValueError, OverflowError):
+            pass
+        self.leave_out(
+            ConfigError(f"found the step {step!r}, expected a whole number from 0."), "step", "a step"
+        )
+        return None
+
+    def _leave_loop(self) -> None:
+        """Let values wait for the next recording: this one failed, or the script ended its own."""
+        self._loop = self._step = None
+        self._has_joined, self._since, self._waiting_bytes = not self._is_own, 0.0, 0
+        if self._is_own:
+            self._release()
+            self._is_own, self._has_environment = False, False
+            self.run_id, before = self._new_run_id(), self.run_id
+            self.warn_once(f"run {before} has ended: further values go into run {self.run_id}.")
+
+    def _record(
+        self, loop: Loop[Any], method: str, name: str, value: Any, step: int | None, call: int | None
+    ) -> None:
+        """Record a value in the recording, at the script's own step, or its number where it gave none."""
+        try:
+            if self._values is not None:
+                self._values.move((call or 0) if step is None else step)
+            elif step is not None and step != self._step:
+                self._step = step
+                loop.messages.log(loop.active_phase, STEP_NAME, step)
+            if method == "picture":
+                loop.messages.picture(name, value)
+            else:
+                getattr(loop.messages, method)(loop.active_phase, name, value)
+        except ConfigError as error:
+            self.leave_out(error, method)
+        except Exception as error:
+            loop.fail(error)
+
+    def leave_out(self, error: Exception, about: str, what: str = "a value") -> None:
+        """Warn of what cannot be recorded, once for each method that it is about; or raise the error.
+
+        It is called where the error is handled.
+        """
+        if self._options["on_error"] == "raise":
+            raise error
+        self.warn_once(
+            f"run {self.run_id}: {what} was left out: {error} (This warning is given once.)", about
+        )
 
     def warn_once(self, message: str, about: str = "") -> None:
         """Warn the user of something once: of this message, or of what it is about."""
@@ -245,8 +282,8 @@ class ScriptRun:
     def _begin(self, loop: Loop[Any]) -> None:
         self._loop = loop
         waiting, self._waiting = self._waiting, []
-        for method, arguments, step in waiting:
-            self._do(method, arguments, step)
+        for each in waiting:
+            self._record(loop, *each)
 
     def _begin_own(self, loop: Loop[Any]) -> None:
         self._is_own = True
@@ -257,44 +294,71 @@ class ScriptRun:
         atexit.register(self._close_at_exit)  # before what the loop registered closes it as interrupted
         self._begin(loop)
 
-    def _arguments(self) -> dict[str, Any]:
-        """Return the arguments of `record` that do not depend on the environment."""
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The arguments of `record` that do not depend on the environment."""
         seed = self.settings.get("seed")
-        return {
+        return self._options | {
+            "recordings": self._recordings,
             "name": self.name,
             "seed": seed if is_whole(seed, 0, 2**64 - 1) else None,
-            "config": self.settings,
+            "config": self._recordable_settings(),
+            "run_id": self.run_id,
         }
+
+    def _recordable_settings(self) -> Json:
+        settings = {}
+        for key, value in self.settings.items():
+            try:
+                json.dumps(as_json(value), ensure_ascii=False).encode()
+                settings[key] = value
+            except (ValueError, RecursionError) as error:
+                self.leave_out(ConfigError(f"config: {key!r}: {error}."), "config", "a setting")
+        return settings
 
     def _begin_values(self) -> None:
         """Begin a recording without an environment."""
-        packing: Any = {key: self._options[key] for key in (*PACKING, "on_error") if key in self._options}
-        given = self._arguments() | {"name": self.name or script_name(), "run_id": self.run_id}
-        options = options_of(self._recordings, given | packing)
-        self._values = rows = ValueRows()
-        loop: Loop[Any] = Loop(_NO_ENVIRONMENT, options, _NOT_MADE, lambda *_: rows)
-        loop.activate(loop.rows("train"))
+        try:
+            loop, self._values = begin_values(**self.arguments | {"name": self.name or script_name()})
+        except Exception as error:
+            self.discard()
+            self.leave_out(error, "run", "all that is logged")
+            return
         self._begin_own(loop)
 
     def begin_with(self, env: Any) -> None:
         """Begin to record an environment that is about to be reset, unless the script records one itself.
 
-        Raises:
-            EnvironmentNotUsable: it cannot be recorded.
+        One that cannot be recorded is left out, with a warning.
         """
         if self._join_loop():
             return
         recorder: Any = record_vector if isinstance(env, VectorEnv) else record
-        given = self._arguments()
         missed = 0 if isinstance(env, VectorEnv) else _elapsed_steps(env)
         if missed:
             self.warn_once(
                 f"run {self.run_id} records {env} from this reset on. It was stepped before the run began: "
                 f"{missed:,} steps of its last episode, and any earlier episodes, are not in this run."
             )
-        recorded = recorder(env, self._recordings, run_id=self.run_id, **given, **self._options)
-        self._watched = WatchedEnvironment(env, recorded)
-        self._begin_own(recorded._loop)
+        try:
+            recorded = recorder(env, **self.arguments)
+        except Exception as error:
+            self.record_values(error)
+            return
+        self.begin_recorded(recorded._loop, WatchedEnvironment(env, recorded))
+
+    def begin_recorded(self, loop: Loop[Any], watched: Watched) -> None:
+        """Log into the recording of the script's environments, which ends with this run."""
+        self._watched = watched
+        self._begin_own(loop)
+
+    def record_values(self, error: Exception) -> None:
+        """Record values only, because the environment cannot be recorded; or raise the error.
+
+        It is called where the error is handled.
+        """
+        self._has_environment = False
+        self.leave_out(error, "environment", "the environment")
 
     # --- the end ------------------------------------------------------------------------------------------
 
@@ -313,12 +377,18 @@ class ScriptRun:
                 return self._loop.close(status, error)
             return self.run
         finally:
-            if self._watched is not None:
-                self._watched.release()
+            self._release()
             self.discard()
+
+    def _release(self) -> None:
+        if self._watched is not None:
+            self._watched.release()
+            self._watched = None
 
     def discard(self) -> None:
         """Record nothing more."""
+        if self.closed:
+            return
         self.closed = True
         open_runs.remove(self)
         atexit.unregister(self._close_at_exit)

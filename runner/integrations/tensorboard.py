@@ -26,16 +26,12 @@ from runner.errors import ConfigError
 from runner.integrations.hooks import hook_environments, open_runs
 from runner.integrations.media import film_of, grid_of, histogram_of, picture_of
 from runner.integrations.script import ScriptRun
+from runner.integrations.shapes import WithoutEffect, forgiving, without_effect
 from runner.loops.recorded import ending_of
 from runner.loops.values import as_array
 from runner.runs.run import Run
 from runner.util.values import RUN_NAME_PATTERN
 
-_NOT_RECORDED: Final = (
-    *("add_audio", "add_custom_scalars", "add_custom_scalars_marginchart"),
-    *("add_custom_scalars_multilinechart", "add_embedding", "add_graph", "add_histogram_raw"),
-    *("add_image_with_boxes", "add_mesh", "add_onnx_graph", "add_pr_curve", "add_pr_curve_raw"),
-)
 _HYPERPARAMETERS: Final = re.compile(r"\|param\|value\|\n\|-\|-\|\n", re.ASCII)
 """How the tables begin in which CleanRL's scripts write their settings."""
 _WRITERS: Final = ("torch.utils.tensorboard.writer", "tensorboardX.writer")
@@ -58,10 +54,10 @@ class SummaryWriter:
         recordings: the recordings folder or a server, as for `runner.record`.
         monitor_gym: whether to record an environment.
         **options: further arguments of `runner.record`, such as `steps`, `frames_every` and `on_error`;
-            what only the writer of tensorboardX takes is ignored.
+            others are ignored, with a warning.
 
-    Raises:
-        ConfigError: an argument is unknown.
+    What cannot be recorded gives a warning for each method, and no error unless `on_error="raise"`. Methods
+    that TensorBoard's writer may have and this one has not do nothing, with a warning.
     """
 
     def __init__(
@@ -88,16 +84,16 @@ class SummaryWriter:
         tracked = [run for run in open_runs if isinstance(run, ScriptRun) and run.takes_writers]
         self._is_own = not tracked
         if tracked:
-            self._run = tracked[-1]
-            self._run.has_writer = True
+            self.script = tracked[-1]
+            self.script.has_writer = True
         else:
             name = None if log_dir is None else run_name(self.log_dir)
-            self._run = ScriptRun(recordings, name, has_environment=monitor_gym, **options)
+            self.script = ScriptRun(recordings, name, has_environment=monitor_gym, **options)
 
     @property
     def run(self) -> Run | None:
         """The run, as soon as it is recorded: from the first reset of its environment on."""
-        return self._run.run
+        return self.script.run
 
     def get_logdir(self) -> str:
         """Return the folder that the script named."""
@@ -114,8 +110,12 @@ class SummaryWriter:
         **__: object,
     ) -> None:
         """Log a number."""
-        self._run.log(tag, as_number(tag, scalar_value), step_of(global_step))
+        try:
+            self.script.log(tag, as_number(tag, scalar_value), global_step)
+        except Exception as error:  # as `forgiving` does, which would take a tenth of the time
+            self.script.leave_out(error, "add_scalar")
 
+    @forgiving
     def add_scalars(
         self,
         main_tag: str,
@@ -128,6 +128,7 @@ class SummaryWriter:
         for name, value in tag_scalar_dict.items():
             self.add_scalar(f"{main_tag}/{name}", value, global_step)
 
+    @forgiving
     def add_text(
         self,
         tag: str,
@@ -137,10 +138,11 @@ class SummaryWriter:
         **__: object,
     ) -> None:
         """Log a text; a table of hyperparameters, as CleanRL writes it, also becomes the settings."""
-        if self._run.is_waiting and (match := _HYPERPARAMETERS.search(str(text_string))):
-            self._run.settings = _settings(text_string[match.end() :]) | self._run.settings
-        self._run.log(tag, str(text_string), step_of(global_step))
+        if self.script.is_waiting and (match := _HYPERPARAMETERS.search(str(text_string))):
+            self.script.settings = _settings(text_string[match.end() :]) | self.script.settings
+        self.script.log(tag, str(text_string), global_step)
 
+    @forgiving
     def add_histogram(
         self,
         tag: str,
@@ -150,8 +152,9 @@ class SummaryWriter:
         **__: object,
     ) -> None:
         """Record a histogram of 64 bins: the arrays `tag/counts` and `tag/edges`."""
-        self._run.snapshot(tag, histogram_of(values), step_of(global_step))
+        self.script.snapshot(tag, histogram_of(values), global_step)
 
+    @forgiving
     def add_tensor(
         self,
         tag: str,
@@ -161,8 +164,9 @@ class SummaryWriter:
         **__: object,
     ) -> None:
         """Record an array."""
-        self._run.snapshot(tag, tensor, step_of(global_step))
+        self.script.snapshot(tag, tensor, global_step)
 
+    @forgiving
     def add_image(
         self,
         tag: str,
@@ -172,8 +176,9 @@ class SummaryWriter:
         **_: object,
     ) -> None:
         """Record a picture."""
-        self._run.picture(tag, picture_of(img_tensor, dataformats.upper()), step_of(global_step))
+        self.script.picture(tag, picture_of(img_tensor, dataformats.upper()), global_step)
 
+    @forgiving
     def add_images(
         self,
         tag: str,
@@ -183,8 +188,9 @@ class SummaryWriter:
         **_: object,
     ) -> None:
         """Record several pictures as one."""
-        self._run.picture(tag, picture_of(grid_of(img_tensor, dataformats.upper())), step_of(global_step))
+        self.script.picture(tag, picture_of(grid_of(img_tensor, dataformats.upper())), global_step)
 
+    @forgiving
     def add_figure(
         self,
         tag: str,
@@ -195,10 +201,11 @@ class SummaryWriter:
     ) -> None:
         """Record a figure of Matplotlib, or a list of them, as pictures."""
         for each in figure if isinstance(figure, list) else [figure]:
-            self._run.picture(tag, picture_of(each), step_of(global_step))
+            self.script.picture(tag, picture_of(each), global_step)
             if close and (pyplot := sys.modules.get("matplotlib.pyplot")):
                 pyplot.close(each)
 
+    @forgiving
     def add_video(
         self,
         tag: str,
@@ -209,8 +216,9 @@ class SummaryWriter:
         **_: object,
     ) -> None:
         """Record a film."""
-        self._run.picture(tag, film_of(vid_tensor, dataformats.upper(), fps), step_of(global_step))
+        self.script.picture(tag, film_of(vid_tensor, dataformats.upper(), fps), global_step)
 
+    @forgiving
     def add_hparams(
         self,
         hparam_dict: Mapping[str, object],
@@ -220,22 +228,15 @@ class SummaryWriter:
         global_step: object = None,
     ) -> None:
         """Take settings, and log metrics; settings that come after the recording began are logged too."""
-        if self._run.is_waiting:
-            self._run.settings |= dict(hparam_dict)
+        if self.script.is_waiting:
+            self.script.settings |= dict(hparam_dict)
         else:
-            self._run.log("hparams", str(dict(hparam_dict)), step_of(global_step))
+            self.script.log("hparams", str(dict(hparam_dict)), global_step)
         for name, value in metric_dict.items():
             self.add_scalar(name, value, global_step)
 
-    def __getattr__(self, name: str) -> Callable[..., None]:
-        if name not in _NOT_RECORDED:
-            supported = ", ".join(method for method in vars(SummaryWriter) if method.startswith("add_"))
-            raise AttributeError(f"SummaryWriter has no {name!r}, but {supported}")
-
-        def not_recorded(*_: object, **__: object) -> None:
-            self._run.warn_once(f"SummaryWriter.{name} does nothing: a recording has no place for it.")
-
-        return not_recorded
+    def __getattr__(self, name: str) -> WithoutEffect:
+        return without_effect("SummaryWriter", name)
 
     # --- the end ------------------------------------------------------------------------------------------
 
@@ -245,14 +246,14 @@ class SummaryWriter:
     def close(self) -> None:
         """End the run as finished, unless something else does."""
         if self._is_own:
-            self._run.close()
+            self.script.close()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *raised: Any) -> Literal[False]:
         if self._is_own:
-            self._run.close(*ending_of(raised[1]))
+            self.script.close(*ending_of(raised[1]))
         return False
 
 
@@ -262,23 +263,6 @@ def run_name(log_dir: str) -> str | None:
     inside = parts[parts.index("runs") + 1 :] if "runs" in parts[:-1] else parts[-1:]
     name = re.sub(r"[^A-Za-z0-9_.+/-]", "-", "/".join(inside))[:100].lstrip(".-+/")
     return name if re.fullmatch(RUN_NAME_PATTERN, name) else None
-
-
-def step_of(step: Any) -> int | None:
-    """Return a script's own step as a whole number; None if it gave none.
-
-    Raises:
-        ConfigError: it is no number, or negative.
-    """
-    if step is None or (step.__class__ is int and step >= 0):
-        return step
-    try:
-        whole = int(step)
-        if 0 <= whole < 2**62:
-            return whole
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ConfigError(f"global_step: found {step!r}, expected a whole number from 0") from error
-    raise ConfigError(f"global_step: found {step!r}, expected a whole number from 0")
 
 
 def as_number(name: str, value: object) -> object:
@@ -339,7 +323,7 @@ def forward() -> bool:
 def _forwarding(name: str, method: Callable[..., object]) -> Callable[..., object]:
     @wraps(method)
     def both(self: object, *arguments: object, **named: object) -> object:
-        if _forwarded is not None and not _forwarded._run.closed:
+        if _forwarded is not None and not _forwarded.script.closed:
             getattr(_forwarded, name)(*arguments, **named)
         return method(self, *arguments, **named)
 

@@ -242,7 +242,7 @@ class Logger(_Logger):  # type: ignore[misc]
 
     def _create_experiment(self) -> SummaryWriter:
         writer = SummaryWriter(recordings=self.log_dir)
-        writer._run.name = self.exp_name
+        writer.script.name = self.exp_name
         return writer
 
     def log_scalar(self, name: str, value: object, step: int | None = None) -> None:

@@ -15,7 +15,7 @@ from scripts import SETTINGS, TABLE, learn, make, scalars, texts, the_run
 
 import runner
 from runner.analysis.series import points_of, read_series
-from runner.errors import ConfigError
+from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.execution.redo import verify_by_redoing
 from runner.integrations import wandb
 from runner.integrations.tensorboard import SummaryWriter
@@ -145,8 +145,8 @@ def test_the_summary_of_wandb_is_recorded_without_finish(folder):
 def test_the_nearest_of_all_arguments_is_suggested():
     with pytest.raises(ConfigError, match=r"found the argument 'seeds'.* Did you mean 'seed'\?"):
         runner.record(make(), seeds=1)
-    with pytest.raises(ConfigError, match=r"Did you mean 'recordings'\?"):
-        SummaryWriter(recording="here")
+    with pytest.warns(RuntimeWarning, match=r"'here' has no effect here. Did you mean 'recordings'\?"):
+        SummaryWriter(recording="here").close()
     with pytest.raises(ConfigError, match=r"found the argument 'frames_of', expected one of [^?]*\.$"):
         runner.record(make(), frames_of=0)
 
@@ -214,8 +214,8 @@ def test_options_of_recording_can_be_given():
     with runner.open_recording(the_run().recording) as recording:
         assert recording.count(recording.topic("/train/frame")) == 1
         assert recording.config["recording"]["steps"] == "actions"
-    with pytest.raises(ConfigError, match="found the argument 'step', expected one of chunk_steps"):
-        SummaryWriter(step="actions")
+    with pytest.warns(RuntimeWarning, match="the argument step='actions' has no effect here"):
+        SummaryWriter(step="actions").close()
 
 
 def test_many_values_do_not_wait_for_an_environment_for_ever():
@@ -232,3 +232,57 @@ def test_an_environment_is_not_recorded_if_the_script_says_so():
         writer.add_scalar("loss", 0.5, 1)
         make().reset(seed=1)
     assert the_run().summary["train_steps"] == 0
+
+
+class Several(gymnasium.Env):
+    """Pays several rewards at once, which no recording holds."""
+
+    observation_space = action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+    def step(self, action):
+        return 0, np.array([1.0, 2.0]), False, False, {}
+
+
+class Worded(Several):
+    """Has a mission of words, whose sizes vary."""
+
+    observation_space = gymnasium.spaces.Text(9)
+
+    def reset(self, *, seed=None, options=None):
+        return "go", super().reset(seed=seed)[1]
+
+
+def test_an_environment_that_cannot_be_recorded_leaves_the_values():
+    envs = SyncVectorEnv([Worded] * 2)
+    with SummaryWriter("runs/missions") as writer:
+        with pytest.warns(RuntimeWarning, match="the environment was left out: found a space"):
+            envs.reset(seed=1)
+        for step in range(20):
+            writer.add_scalar("loss", 0.5, step)
+        envs.reset(seed=1)  # a second warning would be an error
+    assert [step for *_, step in scalars(the_run())] == list(range(20))
+
+
+def test_a_step_that_cannot_be_recorded_leaves_the_values():
+    env = Several()
+    wandb.init(project="several")
+    env.reset(seed=1)
+    wandb.log({"before": 1.0})
+    with pytest.warns(RuntimeWarning, match="recording stopped at step 0, and the loop went on without it"):
+        env.step(0)
+    with pytest.warns(RuntimeWarning, match="has ended: further values go into run"):
+        wandb.log({"reward": env.step(0)[1][0]})
+    for _ in range(9):
+        wandb.log({"reward": env.step(0)[1][0]})
+    wandb.finish()
+    assert {run.status: len(scalars(run)) for run in runner.list_runs()} == {"failed": 1, "finished": 10}
+
+
+def test_an_error_is_raised_only_if_the_script_asks_for_it():
+    envs = SyncVectorEnv([Worded] * 2)
+    with SummaryWriter(on_error="raise"), pytest.raises(EnvironmentNotUsable, match="found a space"):
+        envs.reset()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -16,9 +17,9 @@ from scripts import SETTINGS, arrays, images, learn, make, scalars, texts, the_r
 
 import runner
 from runner.cli import cli
-from runner.errors import ConfigError, RunnerError
+from runner.errors import RunnerError
 from runner.execution.redo import verify_by_redoing
-from runner.integrations import wandb
+from runner.integrations import shapes, wandb
 from runner.integrations.tensorboard import SummaryWriter
 
 
@@ -148,19 +149,73 @@ def test_a_summary_has_the_last_values_and_what_the_script_puts_there():
     assert the_run().summary["logged"] == {"loss": 0.5, "summary/best": 3.0}
 
 
-def test_calls_without_effect_say_so_once_and_unknown_names_what_there_is(monkeypatch):
-    monkeypatch.setattr(wandb, "_warned", set())
-    wandb.init()
+def test_what_a_recording_has_no_place_for_does_nothing_with_one_warning_each(monkeypatch):
+    monkeypatch.setattr(shapes, "_warned", set())
+    run = wandb.init(monitor_gym=False)
     with pytest.warns(RuntimeWarning, match="wandb.watch does nothing"):
         wandb.watch(None)
-    wandb.run.watch(None, log="all")  # a second warning would be an error
-    with pytest.raises(AttributeError, match="does not have 'sweep'"):
-        wandb.sweep  # noqa: B018
-    with pytest.raises(AttributeError, match="has no 'log_artifact', but config"):
-        wandb.run.log_artifact  # noqa: B018
+    run.watch(None, log="all")  # a second warning would be an error
+
+    def train():
+        artifact = wandb.Artifact("policy", type="model")
+        artifact.add_file("policy.pt")
+        artifact.metadata["score"] = 1.0
+        run.log_artifact(artifact).wait()
+        wandb.alert(title="done", text="done")
+        wandb.agent(wandb.sweep({}), function=print)
+        wandb.log({"curve": wandb.plot.line(None, "x", "y"), "loss": 1.0})
+        assert not isinstance(artifact, wandb.Audio)
+
+    with pytest.warns(RuntimeWarning) as found:
+        train()
+    kinds = ("Artifact", "log_artifact", "alert", "sweep", "agent", "plot does", "plot is not recorded")
+    assert len(found) == len(kinds)
+    assert all(kind in str(each.message) for kind, each in zip(kinds, found, strict=True))
     wandb.finish()
-    with pytest.raises(ConfigError, match="found the argument 'projekt', expected one of"):
-        wandb.init(projekt="x")
+    assert scalars(the_run()) == [("loss", 1.0, 0)]
+
+
+def test_values_that_cannot_be_recorded_lose_no_others():
+    wandb.init(monitor_gym=False, config={"lr": 0.1, "text": "\ud800"})
+    with pytest.warns(RuntimeWarning, match="a setting was left out: config: 'text': 'utf-8' codec"):
+        wandb.log({"loss": 0.75})
+    with pytest.warns(RuntimeWarning, match="a value was left out: film: none.mp4 cannot be read"):
+        wandb.log({"film": wandb.Video("none.mp4"), "image": wandb.Image(3), "loss": 0.5})
+    with pytest.warns(RuntimeWarning, match="a step was left out: found the step -1"):
+        wandb.log({"loss": 0.25}, step=-1)
+    with pytest.warns(RuntimeWarning, match="found str, expected a mapping of names"):
+        wandb.log("loss")
+    wandb.log({"loss": 0.125}, step=2**61)
+    wandb.finish()
+    assert [value for _, value, _ in scalars(the_run())] == [0.75, 0.5, 0.25, 0.125]
+    assert the_run().facts["config"]["config"] == {"lr": 0.1}
+
+
+@pytest.mark.parametrize("has_environment", [True, False])
+def test_each_call_is_a_step_also_while_an_environment_is_awaited(has_environment):
+    wandb.init(monitor_gym=None if has_environment else False)
+    for number in range(200):
+        wandb.log({"loss": 1 / (number + 1)}, commit=False)
+        wandb.log({"accuracy": number / 200})
+    wandb.finish()
+    found = scalars(the_run())
+    assert [step for name, _, step in found if name == "loss"] == list(range(200))
+    assert [step for name, _, step in found if name == "accuracy"] == list(range(200))
+
+
+def test_a_run_that_is_resumed_is_followed_by_one_that_names_it(monkeypatch):
+    monkeypatch.setattr(shapes, "_warned", set())
+    for value in (1.0, 2.0):
+        with contextlib.ExitStack() as stack:
+            if value == 2.0:
+                stack.enter_context(pytest.warns(RuntimeWarning, match="with this id is not continued"))
+            run = wandb.init(id="mine", resume="allow", notes="longer", monitor_gym=False)
+            assert (run.id, run.resumed) == ("mine", False)
+            run.log({"loss": value})
+            run.finish()
+    second, first = sorted(runner.list_runs(), key=lambda run: run.created, reverse=True)
+    assert (first.note, second.note) == ("longer", f"Follows run {first.run_id}.\nlonger")
+    assert scalars(first) == [("loss", 1.0, 0)]
 
 
 def test_there_must_be_a_run():

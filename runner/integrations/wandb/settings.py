@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Iterator, MutableMapping
 from typing import Any
 
 from runner.errors import RunnerError
 from runner.integrations.script import ScriptRun
-from runner.loops.options import settings_in
 from runner.util.values import Json
 
 
@@ -15,9 +14,9 @@ class Config(MutableMapping[str, Any]):
     """The settings of a run: `config["lr"]`, `config.lr`, `config.update({...})`."""
 
     _script: ScriptRun
-    _configure: Callable[[Mapping[str, object]], None]
+    _configure: Callable[..., None]
 
-    def __init__(self, script: ScriptRun, configure: Callable[[Mapping[str, object]], None]) -> None:
+    def __init__(self, script: ScriptRun, configure: Callable[..., None]) -> None:
         object.__setattr__(self, "_script", script)
         object.__setattr__(self, "_configure", configure)
 
@@ -25,12 +24,12 @@ class Config(MutableMapping[str, Any]):
         """Take the settings of a mapping, dataclass or namespace."""
         more.pop("allow_val_change", None)
         for each in settings:
-            self._configure(settings_in(each))
+            self._configure(each)
         self._configure(more)
 
     def setdefaults(self, settings: Any) -> None:
         """Take the settings that are not there yet."""
-        self._configure({key: value for key, value in settings_in(settings).items() if key not in self})
+        self._configure(settings, is_default=True)
 
     def as_dict(self) -> Json:
         """Return the settings."""

@@ -8,7 +8,8 @@
 
 The import is the whole change of a script. The environment that it resets first after `init` is recorded,
 every step of it, and what is logged goes into that recording. `runner.integrations.script` has the rules.
-Nothing is sent to Weights & Biases, and its package is not needed.
+What wandb has and this module has not does nothing, with one warning: no script ends because of it. Nothing
+is sent to Weights & Biases, and its package is not needed.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, Self
 
@@ -26,32 +27,22 @@ from runner.errors import ConfigError, RunnerError
 from runner.integrations.hooks import hook_environments
 from runner.integrations.media import Histogram, Image, Table, Video
 from runner.integrations.script import ScriptRun
-from runner.integrations.tensorboard import as_number, forward, step_of
-from runner.integrations.wandb_settings import Config, Summary
+from runner.integrations.shapes import WithoutEffect, forgiving, warn_once, without_effect
+from runner.integrations.tensorboard import as_number, forward
+from runner.integrations.wandb.settings import Config, Summary
 from runner.loops.options import settings_in
 from runner.loops.recorded import ending_of
-from runner.loops.values import warn_user
+from runner.runs.listing import list_runs
 from runner.util.jsonable import as_json
 from runner.util.values import RUN_NAME_PATTERN, flatten
 
-_SUPPORTED: Final = (
-    *("Histogram", "Image", "Settings", "Table", "Video", "config", "define_metric", "finish", "init", "log"),
-    *("login", "run", "save", "setup", "summary", "unwatch", "watch"),
-)
-_NO_EFFECT: Final = ("define_metric", "login", "log_code", "save", "setup", "unwatch", "watch")
 _IGNORED: Final = frozenset(
     {
         *("allow_val_change", "anonymous", "config_exclude_keys", "config_include_keys", "dir", "entity"),
-        *("force", "fork_from", "id", "magic", "resume", "resume_from", "save_code", "settings"),
+        *("force", "magic", "save_code", "settings"),
     }
 )
 """Arguments of `init` that change nothing in a recording."""
-
-
-class Settings:
-    """Settings of wandb itself, which change nothing here."""
-
-    def __init__(self, *_: object, **__: object) -> None: ...
 
 
 # --- a run --------------------------------------------------------------------------------------------------
@@ -71,8 +62,9 @@ class Tracked:
         job_type: str,
         tags: Sequence[str],
         is_disabled: bool,
+        own_id: str | None,
     ) -> None:
-        self.script = script
+        self.script, self._id = script, own_id
         self.project, self.group, self.job_type, self.tags = project, group, job_type, tuple(tags)
         self.disabled = is_disabled
         self.config, self.summary = Config(script, self.configure), Summary()
@@ -84,8 +76,8 @@ class Tracked:
 
     @property
     def id(self) -> str:
-        """The id of the run."""
-        return self.script.run_id
+        """The id that the script gave the run, or that of the recording."""
+        return self._id or self.script.run_id
 
     @property
     def name(self) -> str:
@@ -94,9 +86,9 @@ class Tracked:
 
     @name.setter
     def name(self, name: str) -> None:
-        if not self.script.is_waiting:
-            raise RunnerError(f"name: run {self.id} is being recorded; rename it by `dualtaxi label`")
         self.script.name = _name(name)
+        if not self.script.is_waiting:
+            self.script.warn_once(f"name: run {self.id} is being recorded; rename it by `dualtaxi label`.")
 
     @property
     def dir(self) -> str:
@@ -105,6 +97,7 @@ class Tracked:
         folder.mkdir(parents=True, exist_ok=True)
         return str(folder.absolute())
 
+    @forgiving
     def log(
         self, data: Mapping[str, object], step: object = None, commit: bool | None = None, **_: object
     ) -> None:
@@ -114,50 +107,41 @@ class Tracked:
             data: the values by name.
             step: the script's own step; without it calls are counted, where no environment is recorded.
             commit: False if the next call logs values of the same step.
-
-        Raises:
-            ConfigError: the data are no mapping.
         """
         if not isinstance(data, Mapping):
             raise ConfigError(f"log: found {type(data).__name__}, expected a mapping of names to values")
         if self.disabled:
             return
-        at = step_of(step)
-        if at is None and not self.script.has_steps:
-            at = self.step
+        at = self.script.step_of(step)
+        self.step = self.step if at is None else max(self.step, at)
+        self.script.calls = self.step
         for name, value in data.items():
             self._log(str(name), value, at)
-        if at is not None:
-            self.step = max(self.step, at)
-        if commit or (commit is None and step is None):
+        if commit or (commit is None and at is None):
             self.step += 1
 
+    @forgiving
     def _log(self, name: str, value: Any, step: int | None) -> None:
+        if isinstance(value, list | tuple) and any(isinstance(each, Image | Video) for each in value):
+            value = dict(enumerate(value))
         if isinstance(value, Mapping):
             for key, inner in value.items():
                 self._log(f"{name}/{key}", inner, step)
-            return
-        if (
-            isinstance(value, list | tuple)
-            and value
-            and all(isinstance(each, Image | Video) for each in value)
-        ):
-            for number, each in enumerate(value):
-                self._log(f"{name}/{number}", each, step)
-            return
-        if isinstance(value, Image | Video):
-            self.script.picture(name, value.picture, step)
+        elif isinstance(value, Image | Video):
+            self.script.picture(name, value.content, step)
             if value.caption:
                 self.script.log(f"{name}/caption", str(value.caption), step)
         elif isinstance(value, Histogram):
-            self.script.snapshot(name, value.arrays, step)
+            self.script.snapshot(name, value.content, step)
         elif isinstance(value, Table):
             self.script.log(name, value.text(), step)
         elif isinstance(value, str):
             self.script.log(name, value, step)
             self.summary.seen(name, value)
-        elif value is None:
-            self.script.warn_once(f"log: None is not recorded, first found for {name!r}.")
+        elif value is None or isinstance(value, WithoutEffect):
+            self.script.warn_once(
+                f"log: {value} is not recorded, first found for {name!r}.", about=str(value)
+            )
         elif np.ndim(value) and np.size(value) != 1:
             self.script.snapshot(name, value, step)
         else:
@@ -177,9 +161,17 @@ class Tracked:
         self.script.log(name, number, step)
         self.summary.seen(name, number)
 
-    def configure(self, settings: Mapping[str, object]) -> None:
-        """Take settings; those that come after the recording began are logged as text."""
-        settings = {str(key): value for key, value in settings.items()}
+    @forgiving
+    def configure(self, config: object, is_default: bool = False) -> None:
+        """Take settings; those that come after the recording began are logged as text.
+
+        Args:
+            config: a mapping, dataclass or namespace, or nothing.
+            is_default: whether they count only where there is no such setting yet.
+        """
+        taken = {str(key): value for key, value in settings_in(config).items()}
+        settings = {key: value for key, value in taken.items() if not is_default or key not in self.config}
+        self.script.settings |= settings
         as_text = [
             key
             for key, value in flatten(settings).items()
@@ -187,7 +179,6 @@ class Tracked:
         ]
         if as_text:
             self.script.warn_once(f"config: {', '.join(as_text)} are recorded as text.")
-        self.script.settings |= settings
         if not self.script.is_waiting and settings and not self.disabled:
             self.script.warn_once(
                 "config: found settings after the recording began, which are logged as a text, `config`: set "
@@ -215,13 +206,8 @@ class Tracked:
             for name, value in self.summary.own.items():
                 self._log(f"summary/{name}", value, None)
 
-    def __getattr__(self, name: str) -> Any:
-        if name in _NO_EFFECT:
-            return globals()[name]
-        raise AttributeError(
-            f"a run of runner.integrations.wandb has no {name!r}, but config, dir, finish, group, id, "
-            "job_type, log, name, project, step, summary, tags, url"
-        )
+    def __getattr__(self, name: str) -> WithoutEffect:
+        return without_effect("wandb", name)
 
     def __enter__(self) -> Self:
         return self
@@ -249,6 +235,8 @@ def init(
     tensorboard: bool | None = None,
     monitor_gym: bool | None = None,
     recordings: str | os.PathLike[str] | None = None,
+    id: str | None = None,  # noqa: A002
+    resume: bool | str | None = None,
     **more: Any,
 ) -> Tracked:
     """Begin a run.
@@ -267,37 +255,41 @@ def init(
         tensorboard: the same.
         monitor_gym: False records values only, and not the environment.
         recordings: the recordings folder, or the address of a server, as for `runner.record`.
-        **more: further arguments of `runner.record`, such as `steps`, `frames_every` and `on_error`; other
-            arguments of wandb's have no effect.
-
-    Raises:
-        ConfigError: an argument is unknown or cannot be used.
+        id: the script's own id, the tag `id=...` of the run.
+        resume: whether the script continues the run of this id. That run stays as it is: this one is new, and
+            its note names the other.
+        **more: further arguments of `runner.record`, such as `steps`, `frames_every` and `on_error`; others
+            have no effect.
     """
     global run  # noqa: PLW0603 - wandb.run is part of the shape
     if run is not None and not run.script.closed:
         if not reinit or reinit == "return_previous":
-            warn_user(
+            warn_once(
                 f"init: run {run.id} is still open, and is returned: call finish(), or use reinit=True."
             )
             run.config.update(config or {})
             return run
         run.finish()
-    labels = {"project": project, "group": group, "job_type": job_type}
-    own_tags = tuple(f"{key}={_tag(value)}" for key, value in labels.items() if value)
+    labels = {"project": project, "group": group, "job_type": job_type, "id": id}
+    own_tags = tuple(f"{key}={_tag(str(value))}" for key, value in labels.items() if value)
+    tags = [tags] if isinstance(tags, str) else list(map(str, tags or ()))
+    note = str(notes or "")
+    if id and resume and resume != "never":
+        note = f"{_predecessor(own_tags[-1], recordings)}{note}"
     is_disabled = (mode or os.environ.get("WANDB_MODE")) == "disabled"
     script = ScriptRun(
         recordings,
         _name(name or project),
-        tags=(*(tags or ()), *own_tags),
-        note=notes or "",
+        tags=(*tags, *own_tags),
+        note=note,
         has_environment=monitor_gym is not False,
         takes_writers=True,
         **{key: value for key, value in more.items() if key not in _IGNORED},
     )
     if is_disabled:
         script.discard()
-    run = Tracked(script, project or "", group or "", job_type or "", tags or (), is_disabled)
-    run.configure(settings_in(config))
+    run = Tracked(script, project or "", group or "", job_type or "", tags, is_disabled, id)
+    run.configure(config)
     if (sync_tensorboard or tensorboard) and not is_disabled:
         script.has_writer, run.expects_writer = forward(), True
     return run
@@ -320,9 +312,23 @@ def _open_run(what: str) -> Tracked:
     return run
 
 
+def _predecessor(tag: str, recordings: str | os.PathLike[str] | None) -> str:
+    """Warn that the last run with a tag is not continued, and return a line of the note that names it."""
+    is_folder = "://" not in str(recordings or "")
+    earlier = [run for run in list_runs(recordings if is_folder else None) if tag in run.tags]
+    if not earlier:
+        return ""
+    last = max(earlier, key=lambda run: run.created)
+    warn_once(
+        f"init: run {last.run_id} with this id is not continued, as recordings stay as they are: a new run "
+        "follows it, and names it in its note."
+    )
+    return f"Follows run {last.run_id}.\n"
+
+
 def _name(name: str | None) -> str | None:
     """Return a name as a run can have it."""
-    text = re.sub(r"[^A-Za-z0-9_.+/-]", "-", name or "")[:100].lstrip(".-+/")
+    text = re.sub(r"[^A-Za-z0-9_.+/-]", "-", str(name or ""))[:100].lstrip(".-+/")
     return text if re.fullmatch(RUN_NAME_PATTERN, text) else None
 
 
@@ -330,28 +336,8 @@ def _tag(text: str) -> str:
     return re.sub(r"[^\w.=+/@-]", "-", text)
 
 
-_warned: set[str] = set()
-
-
-def _without_effect(name: str) -> Callable[..., None]:
-    def do_nothing(*_: object, **__: object) -> None:
-        if name not in _warned:
-            _warned.add(name)
-            warn_user(f"wandb.{name} does nothing: a recording needs no such call, or has no place for it.")
-
-    return do_nothing
-
-
-define_metric, login, log_code, save, setup, unwatch, watch = map(_without_effect, _NO_EFFECT)
-
-
 def __getattr__(name: str) -> Any:
-    if name in ("config", "summary"):
-        return getattr(_open_run(name), name)
-    raise AttributeError(
-        f"runner.integrations.wandb does not have {name!r}. It has {', '.join(_SUPPORTED)}. "
-        "To use more of wandb, import the package itself next to it."
-    )
+    return getattr(_open_run(name), name) if name in ("config", "summary") else without_effect("wandb", name)
 
 
 hook_environments()
