@@ -12,12 +12,13 @@ from typing import Any, Final
 
 from benchmarks.bench_catalogue import LISTED, many, one_run
 from benchmarks.figures import Figure, figure
-from benchmarks.serving import memory_of, response_times, serving
+from benchmarks.serving import memory_of, percentile, response_times, serving
 from runner.service.pictures import IDLE_SECONDS
 from runner.util.files import CACHE_VARIABLE
 
 COLD: Final = (1000, 300)
 """Targets in milliseconds: at least, and aim."""
+RUN_PAGE: Final = (50, 20)
 CARTPOLE: Final = (1000, 400)
 PONG: Final = (2000, 1000)
 MEMORY: Final = (500, 300)
@@ -35,13 +36,30 @@ def measure(quick: bool) -> list[Figure]:
     """Return the milliseconds until a page is loaded, or its first picture shown, each in a new browser."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {CACHE_VARIABLE: f"{folder}/cache"}
-        recordings = many(one_run(Path(folder, "one")), Path(folder, "many"), LISTED, recordings=False)
+        job = one_run(Path(folder, "one"))
+        recordings = many(job, Path(folder, "many"), LISTED, recordings=False)
         with serving(recordings, environment=environment) as service:
             response_times(service, ["/api/v1/runs"], clients=1, seconds=0.5)
             times = [_loaded(f"{service.url}/runs") for _ in range(3 if quick else 7)]
         detail = f"{LISTED:,} runs; Chromium with an empty cache, until completely loaded"
         found = [figure("first page, cold", times, "ms", COLD, higher_is_better=False, detail=detail)]
+        found += _pages_of_runs(job.parent, [job.name, "loop"], environment, 1 if quick else 5)
         return found + _pictures(Path(folder, "loops"), environment, range(1 if quick else 5))
+
+
+def _pages_of_runs(
+    recordings: Path, runs: list[str], environment: dict[str, str], seconds: float
+) -> list[Figure]:
+    """Return the milliseconds until a client has the page of a run, of a job and of a loop."""
+    _record(recordings, "loop", _cartpole, 60)
+    with serving(recordings, environment=environment) as service:
+        times = response_times(service, [f"/runs/{run}" for run in runs], clients=1, seconds=seconds)
+    milliseconds = [1000 * taken for taken in times]
+    detail = "a job and a loop in turn, one client"
+    return [
+        figure("page of a run", milliseconds, "ms", RUN_PAGE, higher_is_better=False, detail=detail),
+        figure("  99th percentile", [percentile(milliseconds, 99)], "ms", RUN_PAGE, higher_is_better=False),
+    ]
 
 
 def _pictures(recordings: Path, environment: dict[str, str], repetitions: range) -> list[Figure]:

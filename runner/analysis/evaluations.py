@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +13,12 @@ from runner.environments.naming import event_in_words, spoken
 from runner.errors import NotInRecording
 from runner.recording import schema
 from runner.recording.messages import Message
-from runner.recording.metrics import METRICS, defined_metrics, finite_mean, is_usable
+from runner.recording.metrics import METRICS, defined_metrics, is_usable
 from runner.recording.reader import Recording
-from runner.recording.run_file import EvaluationMetrics, RecentTraining, Summary
+from runner.recording.run_file import EvaluationMetrics, Summary
 from runner.util import humanize
 from runner.util.values import finite
 
-RECENT_EPISODES: Final = 100
 """Training episodes that the summary of a loop averages, the last ones."""
 
 
@@ -252,20 +250,13 @@ def _training_record(metrics: Message, agents: Sequence[str]) -> TrainingRecord:
     )
 
 
-def recent_episodes(recording: Recording) -> NDArray[np.void]:
-    """Return the records of the last `RECENT_EPISODES` training episodes."""
-    total = recording.count(schema.TRAIN_EPISODE)
-    return recording.episodes("train", max(0, total - RECENT_EPISODES), total)
-
-
 def loop_summary(recording: Recording) -> Summary:
     """Return the last results of a loop, computed from its recording.
 
-    It has `last_evaluation` (None without one), `recent_training`, over the last `RECENT_EPISODES`, and
-    `logged`, the last value logged under each name. A value that is unknown or not finite is None.
+    It has `last_evaluation` (None without one), `recent_training`, and `logged`, the last value logged under
+    each name. A value that is unknown or not finite is None.
     """
-    evaluations, recent = evaluations_of(recording), recent_episodes(recording)
-    last = None
+    evaluations, last = evaluations_of(recording), None
     if evaluations:
         trials = recording.episodes("eval", evaluations[-1].start, evaluations[-1].stop)
         last = _loop_record(recording, evaluations[-1], trials).summary()
@@ -274,13 +265,7 @@ def loop_summary(recording: Recording) -> Summary:
         if "logged" in recording.result
         else {one["name"]: finite(one["value"]) for one in recording.decoded(schema.SCALAR_TOPIC)}
     )
-    return Summary(
-        last_evaluation=last,
-        recent_training=RecentTraining(
-            len(recent), finite_mean(recent["length"]), finite_mean(recent["returns"].sum(axis=1))
-        ),
-        logged=logged,
-    )
+    return Summary(last_evaluation=last, recent_training=recording.recent_training(), logged=logged)
 
 
 def metric_columns(records: Sequence[EvaluationRecord], is_narrow: bool = False) -> dict[str, list[str]]:

@@ -17,7 +17,6 @@ from runner.analysis.evaluations import (
     EvaluationRecord,
     TrainingRecord,
     evaluation_records,
-    recent_episodes,
     training_records,
 )
 from runner.environments.naming import event_in_words, spoken
@@ -335,7 +334,7 @@ def _mean_episodes(
 
 def _recent_training(recording: Recording) -> tuple[Readings, int]:
     """Return mean length and return of the last training episodes of a loop, and how many these are."""
-    episodes, agents = recent_episodes(recording), recording.agents
+    episodes, agents = recording.recent_episodes(), recording.agents
     if not len(episodes):
         return {}, 0
     lines = agents if len(agents) > 1 else [""]

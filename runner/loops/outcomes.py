@@ -8,10 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.evaluations import RECENT_EPISODES
 from runner.environments.mdp import Mdp
 from runner.recording import schema
-from runner.recording.metrics import METRICS, defined_metrics, finite_mean
+from runner.recording.metrics import METRICS, RECENT_EPISODES, defined_metrics, finite_mean
 from runner.recording.schema import Topic
 
 MAX_NAMES: Final = 64

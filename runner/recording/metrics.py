@@ -178,6 +178,10 @@ def defined_metrics(has_success: bool, has_penalties: bool) -> tuple[EvaluationM
     return tuple(metric for metric in METRICS if defined[metric.requires])
 
 
+RECENT_EPISODES: Final = 100
+"""Training episodes that the summary of a loop averages, the last ones."""
+
+
 def is_usable(values: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which values are finite and small enough that sums of them stay finite."""
     return abs(values) <= LARGEST  # false for NaN

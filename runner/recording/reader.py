@@ -33,9 +33,10 @@ from runner.recording.messages import (
     decode_q_table,
     unknown_measures,
 )
+from runner.recording.metrics import RECENT_EPISODES, finite_mean
 from runner.recording.reset_states import ResetState, decode_reset_state
 from runner.recording.row_reader import RowReader
-from runner.recording.run_file import run_title
+from runner.recording.run_file import RecentTraining, run_title
 from runner.recording.schema import Topic
 from runner.recording.spaces import decode as decode_value
 from runner.recording.topic_chunks import TopicChunks
@@ -90,6 +91,17 @@ class Recording(RowReader):
         }
         recorded = {key: getattr(self.result, key) for key in counts}
         return {key: count() if recorded[key] is None else recorded[key] for key, count in counts.items()}
+
+    def recent_episodes(self) -> NDArray[np.void]:
+        """Return the records of the last `RECENT_EPISODES` training episodes."""
+        total = self.count(schema.TRAIN_EPISODE)
+        return self.episodes("train", max(0, total - RECENT_EPISODES), total)
+
+    def recent_training(self) -> RecentTraining:
+        """Return the means of the last training episodes; None where no value is finite."""
+        recent = self.recent_episodes()
+        length, total = finite_mean(recent["length"]), finite_mean(recent["returns"].sum(axis=1))
+        return RecentTraining(len(recent), length, total)
 
     def count(self, topic: Topic) -> int:
         """Return the number after that of a topic's last message: how many there are, if none was lost.

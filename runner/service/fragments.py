@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from runner.analysis.axes import axis_of
 from runner.analysis.compare.score_table import parse_table
@@ -187,9 +187,9 @@ def _branch_part(recording: Recording, at: StepRef, action: str, start: int, ste
 
 
 def random_policy(path: Path) -> bytes:
-    """Return a sentence on what a random policy achieves in a recording's environment; empty if unknown."""
+    """Return what a random policy achieves in a recording's environment, as HTML; empty if unknown."""
     with open_recording(path) as recording:
-        return random_policy_sentence(recording).encode()
+        return str(escape(random_policy_sentence(recording))).encode()
 
 
 def typical_episode(path: Path) -> bytes:

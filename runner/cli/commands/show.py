@@ -81,6 +81,8 @@ def show_command(
         )
     else:
         draw(*_parts(details, branches))
+        if details.evaluations:
+            _draw_random_policy(run)
 
 
 def _print_code(run: Run, as_json: bool) -> None:
@@ -112,7 +114,7 @@ def _print_code(run: Run, as_json: bool) -> None:
 
 
 def _parts(details: RunDetails, branches: Mapping[str, Origin]) -> list[RenderableType]:
-    from runner.analysis.summary import brief_provenance, random_policy_sentence
+    from runner.analysis.summary import brief_provenance
     from runner.cli.evaluations import evaluation_table
     from runner.recording.reader import open_recording
 
@@ -121,9 +123,6 @@ def _parts(details: RunDetails, branches: Mapping[str, Origin]) -> list[Renderab
     if details.evaluations:
         table = evaluation_table(details.evaluations, details.success_events, console())
         parts += [title("Evaluations"), table]
-        with stage_line("evaluating a random policy"), open_recording(run.recording) as recording:
-            sentence = random_policy_sentence(recording)
-        parts += [sentence] if sentence else []
     if details.loop is not None:
         parts += [title("Last results"), facts(_loop_results(details.loop))]
     if details.extras:
@@ -159,6 +158,17 @@ def _parts(details: RunDetails, branches: Mapping[str, Origin]) -> list[Renderab
     if details.provenance:
         parts += [title("Provenance"), facts(brief_provenance(details.provenance))]
     return parts
+
+
+def _draw_random_policy(run: Run) -> None:
+    """Print the baseline of the evaluations, after all else: it may take seconds to compute."""
+    from runner.analysis.summary import random_policy_sentence
+    from runner.recording.reader import open_recording
+
+    with stage_line("evaluating a random policy"), open_recording(run.recording) as recording:
+        sentence = random_policy_sentence(recording)
+    if sentence:
+        draw(title("Baseline"), sentence)
 
 
 def _head(details: RunDetails) -> dict[str, str]:

@@ -22,7 +22,7 @@ Report = Callable[[str], None]
 
 INDEX_FILE: Final = "catalogue.sqlite"
 _APPLICATION: Final = 0x44546178  # "DTax"
-_VERSION: Final = zlib.crc32(",".join(["8", *Row._meta.sorted_field_names]).encode()) >> 1
+_VERSION: Final = zlib.crc32(",".join(["9", *Row._meta.sorted_field_names]).encode()) >> 1
 """Identifies the columns, and by the number indexes and contents; an index of another version is replaced."""
 _HEAD_BYTES: Final = 100
 """The header of an SQLite file; at 24 it has the number of changes."""

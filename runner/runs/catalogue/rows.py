@@ -88,6 +88,7 @@ class Row(Model):
         without_rowid = True
         indexes = (
             (("root", "entry", "fingerprint", "mark", "stable", "status"), False),
+            (("id",), False),
             (("digest",), False),
             (("parent",), False),
             (("root", "created", "id", "name", "seed"), False),
@@ -112,8 +113,9 @@ def row_of(run: Run, size: int | None) -> dict[str, object]:
         size: bytes of its recording; None if there is none.
     """
     config, summary = run.file.config, run.summary
-    last, recent = summary.last_evaluation or EvaluationMetrics(), summary.recent_training
-    done = summary if summary.episodes is not None else {**_recorded(run), **summary}
+    recorded = {} if summary.episodes is not None else _recorded(run)
+    last, done = summary.last_evaluation or EvaluationMetrics(), {**recorded, **summary}
+    recent = summary.recent_training or recorded.get("recent_training")
     episodes, train, evaluation = (done.get(key) for key in ("episodes", "train_steps", "eval_steps"))
     logged = islice(summary.logged.items(), _LOGGED)
     config_name, environment, origin = text(config.get("name")), config.get("env"), origin_in(config)
@@ -150,15 +152,20 @@ def row_of(run: Run, size: int | None) -> dict[str, object]:
     }
 
 
-def _recorded(run: Run) -> Mapping[str, object]:
-    """Return the progress of a run that was killed, from its recording; empty if unknown or still running."""
+def _recorded(run: Run) -> Mapping[str, Any]:
+    """Return the progress of a run that is running or was killed, from its recording; empty if unknown.
+
+    A loop that has not been evaluated also has its `recent_training`.
+    """
     from runner.recording.reader import open_recording
 
     if run.status == "archived":
         return run.archive.done
-    if run.status in ("interrupted", "failed") and run.recording.exists():
+    if run.status in ("running", "interrupted", "failed") and run.recording.exists():
         with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
-            return recording.done()
+            done = recording.done()
+            is_loop = not run.can_train_again and not done["eval_steps"]
+            return {**done, "recent_training": recording.recent_training()} if is_loop else done
     return {}
 
 

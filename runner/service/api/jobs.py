@@ -235,7 +235,7 @@ async def watch(
     `state`, `run` and `log` have ids; `progress` has none, because only the latest counts.
     """
     last = int(last_event_id) if last_event_id.isdecimal() and len(last_event_id) < 16 else after
-    if jobs.store.job(number).is_over and last and not jobs.store.events(number, last)[0]:
+    if jobs.store.job(number).is_over and last and not (await run_sync(jobs.store.events, number, last))[0]:
         return Response(status_code=HTTPStatus.NO_CONTENT)  # which stops a browser from reconnecting
     if jobs.watchers >= MAX_WATCHERS:
         raise Refused(
@@ -252,11 +252,13 @@ async def _events(jobs: JobQueue, number: int, last: int, stopping: asyncio.Even
     jobs.watchers += 1
     try:
         yield f"retry: {RETRY_MILLISECONDS}\n\n"
-        progress, sent = None, time.monotonic()
+        progress, sent, all_read, events = None, time.monotonic(), -1, list[JobEvent]()
         while not stopping.is_set():
-            job = jobs.store.job(number)  # before its events, so that none is missed
+            job, count = jobs.store.job(number), jobs.store.event_count(number)  # before it reads its events
             before, progress = progress, jobs.pool.progress(number)
-            events, last = await run_sync(jobs.store.events, number, last)
+            if count != all_read:
+                events, last = await run_sync(jobs.store.events, number, last)
+                all_read = all_read if events else count
             has_moved = progress is not None and progress is not before
             if progress is not None and has_moved:
                 yield _as_text(JobEvent(progress))

@@ -10,12 +10,12 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, Self
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
 
 from peewee import (
     AutoField,
@@ -80,6 +80,11 @@ class Job:
         return self.state in OVER
 
 
+class _RunOfJob(NamedTuple):
+    run_id: str
+    is_started: bool
+
+
 class _JobRow(Model):
     number = IntegerField(primary_key=True)
     kind = TextField()
@@ -128,15 +133,17 @@ _TABLES: Final = (_JobRow, _RunRow, _EventRow)
 class JobStore:
     """The jobs of a recordings folder; thread-safe. One process at a time has it.
 
-    The jobs themselves are held in memory too: the scheduler reads them several times a second, and a full
-    disk does not stop it. Of jobs that are over, `max_over` are remembered.
+    The jobs and their run ids are held in memory too: the scheduler and every page that follows a run read
+    them several times a second, without lock or disk, and a full disk does not stop them. Of jobs that are
+    over, `max_over` are remembered.
     """
 
     def __init__(self, recordings: Path, max_unfinished: int = 1000, max_over: int = 1000) -> None:
         self.recordings, self.path = recordings, recordings / FOLDER / DATABASE_FILE
         self._max_unfinished, self._max_over = max_unfinished, max_over
         self.lock = threading.RLock()
-        """Held by the methods; to be held by callers over several calls that belong together."""
+        """Held by methods that use the database, and by callers over several calls that belong together; not
+        by methods that copy a dictionary, which no other thread changes meanwhile."""
         self._file_lock = lock_folder(recordings, LOCK_FILE)
         # With exclusive locking the write-ahead log needs no shared memory, so network disks will do.
         pragmas = {"locking_mode": "exclusive", "journal_mode": "wal", "synchronous": "full"}
@@ -151,6 +158,9 @@ class JobStore:
                 columns = [getattr(_JobRow, field.name) for field in fields(Job)]
                 rows = self._tuples(_JobRow.select(*columns).order_by(_JobRow.number))
                 self._jobs = {row[0]: Job(*row) for row in rows}
+                self._runs: defaultdict[int, dict[int, _RunOfJob]] = defaultdict(dict)
+                for job, seed, *run in self._tuples(_RunRow.select()):
+                    self._runs[job][int(seed)] = _RunOfJob(*run)
                 self._event_counts = Counter(job for (job,) in self._tuples(_EventRow.select(_EventRow.job)))
         except BaseException:
             self.close()
@@ -170,8 +180,7 @@ class JobStore:
 
     def jobs(self) -> list[Job]:
         """Return all jobs, in the order of submission."""
-        with self.lock:
-            return list(self._jobs.values())
+        return list(self._jobs.values())
 
     def job(self, number: int) -> Job:
         """Return a job.
@@ -179,10 +188,10 @@ class JobStore:
         Raises:
             JobNotFound: there is none.
         """
-        with self.lock:
-            if number not in self._jobs:
-                raise JobNotFound(f"no job {number}; `dualtaxi remote jobs` and the page /queue list them.")
-            return self._jobs[number]
+        job = self._jobs.get(number)
+        if job is None:
+            raise JobNotFound(f"no job {number}; `dualtaxi remote jobs` and the page /queue list them.")
+        return job
 
     def add(
         self, kind: Kind, name: str, runs: int, submitted: str, values: JsonView, keep: Container[int] = ()
@@ -216,6 +225,7 @@ class JobStore:
                     table.delete().where(column.in_(forgotten)).execute(self._database)
             for number in forgotten:
                 del self._jobs[number], self._event_counts[number]
+                self._runs.pop(number, None)
             self._jobs[job.number] = job
             return job
 
@@ -247,6 +257,10 @@ class JobStore:
             limit = max(0, MAX_EVENTS - self._event_counts[number])
             self._insert_events(number, [replace(line, time=now()) for line in lines[:limit]])
 
+    def event_count(self, number: int) -> int:
+        """Return what grows with each event of a job, so that nobody reads the events in vain."""
+        return self._event_counts[number]
+
     def events(self, number: int, after: int = 0) -> tuple[list[JobEvent], int]:
         """Return a job's next events, not all if there are many, and the id of the last one.
 
@@ -273,22 +287,18 @@ class JobStore:
 
     def run_ids(self, number: int, started: bool = True) -> dict[int, str]:
         """Return the run ids of a configuration's job by seed: of started runs, or all reserved ones."""
-        with self.lock:
-            query = _RunRow.select(_RunRow.seed, _RunRow.run_id).where(_RunRow.job == number)
-            query = query.where(_RunRow.started) if started else query
-            return dict(sorted((int(seed), run_id) for seed, run_id in self._tuples(query)))
+        runs = self._runs.get(number, {}).copy()
+        return {seed: run.run_id for seed, run in sorted(runs.items()) if run.is_started or not started}
 
     def reserve_runs(self, number: int, run_ids: Mapping[int, str]) -> None:
         """Store the ids of runs by seed before they are made, so that no run is started twice."""
-        with self.lock, self._transaction("free some disk"):
-            for seed, run_id in run_ids.items():
-                self._insert_run(number, seed, run_id, started=False)
+        with self.lock:
+            self._store_runs(number, {seed: _RunOfJob(run_id, False) for seed, run_id in run_ids.items()})
 
     def start_run(self, number: int, seed: int, run_id: str) -> None:
         """Store that a run was started, as an event too."""
-        with self.lock, contextlib.suppress(StorageError), self._transaction():
-            self._insert_run(number, seed, run_id, started=True)
-            self._insert_events(number, [RunEvent(run_id, seed, now())])
+        with self.lock, contextlib.suppress(StorageError):
+            self._store_runs(number, {seed: _RunOfJob(run_id, True)}, [RunEvent(run_id, seed, now())])
 
     def submitted(self, number: int) -> str:
         """Return the text of a job as it was submitted."""
@@ -310,9 +320,15 @@ class JobStore:
     def _insert_state(self, job: Job) -> None:
         self._insert_events(job.number, [StateEvent(job.state, job.error or None, now())])
 
-    def _insert_run(self, number: int, seed: int, run_id: str, started: bool) -> None:
-        row = {"job": number, "seed": str(seed), "run_id": run_id, "started": started}
-        _RunRow.insert(row).on_conflict_replace().execute(self._database)
+    def _store_runs(
+        self, number: int, runs: Mapping[int, _RunOfJob], events: Sequence[EventData] = ()
+    ) -> None:
+        with self._transaction():
+            for seed, run in runs.items():
+                row = {"job": number, "seed": str(seed), "run_id": run.run_id, "started": run.is_started}
+                _RunRow.insert(row).on_conflict_replace().execute(self._database)
+            self._insert_events(number, events)
+        self._runs[number].update(runs)
 
     def _insert_events(self, number: int, data: Sequence[EventData]) -> None:
         events = map(JobEvent, data)

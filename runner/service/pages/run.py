@@ -31,7 +31,6 @@ from runner.runs.shards import shards_in_words
 from runner.service import fragments
 from runner.service.api.reading import AxisName
 from runner.service.api.runs import LabelChanges, relabelled
-from runner.service.catalogue import Catalogue
 from runner.service.dependencies import (
     CatalogueOf,
     ComputationOf,
@@ -77,11 +76,8 @@ class Status:
 class _OverviewView(RunView):
     TEMPLATE: ClassVar = "run_overview.html"
     status: Status
-    random_policy: str
     problem: str
     """Why labels were refused."""
-    branches: BranchNode
-    """The tree that the run belongs to; the run alone if it is no branch and has none."""
     max_note: int = MAX_NOTE
 
 
@@ -89,6 +85,14 @@ class _OverviewView(RunView):
 class _StatusView(View):
     TEMPLATE: ClassVar = "run_status.html"
     status: Status
+
+
+@dataclass(frozen=True)
+class _BranchesView(View):
+    TEMPLATE: ClassVar = "run_branches.html"
+    run: str
+    branches: BranchNode
+    """The tree that the run belongs to; the run alone if it is no branch and has none."""
 
 
 @dataclass(frozen=True)
@@ -107,21 +111,9 @@ class _LearnedView(RunView):
 
 
 @router.get("")
-async def overview(
-    request: Request,
-    run: FoundRun,
-    jobs: JobsOf,
-    settings: SettingsOf,
-    catalogue: CatalogueOf,
-    compute: ComputationOf,
-) -> Response:
-    """Show the status of a run, its metrics, and the tree of branches that it belongs to."""
-    try:
-        random = (await compute(fragments.random_policy, run.recording)).decode()
-    except (OSError, RunnerError):
-        random = ""  # the page itself shows the problem of the recording
-    view = await run_in_threadpool(_overview, run, jobs, settings, catalogue, random)
-    return await run_in_threadpool(page, request, view)
+def overview(request: Request, run: FoundRun, jobs: JobsOf, settings: SettingsOf) -> Response:
+    """Show the status of a run and its metrics; what may take longer is loaded by the page."""
+    return page(request, _overview(run, jobs, settings))
 
 
 @router.post("/labels")
@@ -139,20 +131,18 @@ def label(
     try:
         relabelled(run, changed, catalogue)
     except RunnerError as error:
-        view = _overview(run, jobs, settings, catalogue, problem=message_of(error, request))
+        view = _overview(run, jobs, settings, problem=message_of(error, request))
         return page(request, view, HTTPStatus.BAD_REQUEST)
     return RedirectResponse(f"/runs/{run.run_id}#labels-title", HTTPStatus.SEE_OTHER)
 
 
 @router.post("/stop")
-def stop(
-    request: Request, run: FoundRun, jobs: JobsOf, settings: SettingsOf, catalogue: CatalogueOf
-) -> Response:
+def stop(request: Request, run: FoundRun, jobs: JobsOf, settings: SettingsOf) -> Response:
     """Request that the loop which records the run stops."""
     try:
         run.request_stop()
     except RunnerError as error:
-        view = _overview(run, jobs, settings, catalogue, problem=message_of(error, request))
+        view = _overview(run, jobs, settings, problem=message_of(error, request))
         return page(request, view, HTTPStatus.BAD_REQUEST)
     return RedirectResponse(f"/runs/{run.run_id}", HTTPStatus.SEE_OTHER)
 
@@ -173,6 +163,22 @@ def status(
     if run.status != status or not now.is_live:
         return Response(status_code=HTTPStatus.NO_CONTENT)
     return page(request, _StatusView(now))
+
+
+@router.get("/branches")
+def branches(request: Request, run: FoundRun, catalogue: CatalogueOf) -> Response:
+    """Return the tree of branches that a run belongs to, as a part of its page; empty without any."""
+    tree = catalogue.read(lambda index: index.branch_tree(run.run_id))
+    return page(request, _BranchesView(run.run_id, tree))
+
+
+@router.get("/random-policy")
+async def random_policy(run: FoundRun, compute: ComputationOf) -> Response:
+    """Return what a random policy achieves, as a part of the run's page."""
+    try:
+        return HTMLResponse(await compute(fragments.random_policy, run.recording))
+    except (OSError, RunnerError):
+        return HTMLResponse("")  # the page itself shows the problem of the recording
 
 
 @router.get("/distributions")
@@ -204,16 +210,8 @@ async def learned(request: Request, run: RecordedRun, compute: ComputationOf) ->
     return await run_in_threadpool(page, request, _LearnedView(head_of(run), "learned", maps))
 
 
-def _overview(
-    run: Run,
-    jobs: JobQueue,
-    settings: Settings,
-    catalogue: Catalogue,
-    random_policy: str = "",
-    problem: str = "",
-) -> _OverviewView:
-    tree = catalogue.read(lambda index: index.branch_tree(run.run_id))
-    return _OverviewView(head_of(run), "", _status(run, jobs, settings), random_policy, problem, tree)
+def _overview(run: Run, jobs: JobQueue, settings: Settings, problem: str = "") -> _OverviewView:
+    return _OverviewView(head_of(run), "", _status(run, jobs, settings), problem)
 
 
 def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:

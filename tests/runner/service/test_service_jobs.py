@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import errno
 import json
 import time
@@ -13,8 +14,10 @@ from submitted import ENDLESS, ICY
 import runner
 from runner.config import from_mapping
 from runner.runs.listing import list_runs
+from runner.service.api.jobs import POLL_SECONDS
 from runner.service.jobs import queue, workers
 from runner.service.jobs.queue import JobQueue
+from runner.service.jobs.store import JobStore
 from tests.waiting import until
 
 CONFIG = ICY | {"episodes": 200, "evaluation": {"every": 100, "trials": 5}}
@@ -92,6 +95,38 @@ def test_a_watcher_continues_after_the_last_event(client, submit):
     assert [event for event in watched(client, number, last="nonsense") if event[0]] == seen
     end = client.get(f"/api/v1/jobs/{number}/events", headers={"Last-Event-ID": seen[-1][0]})
     assert end.status_code == 204
+
+
+def test_a_busy_store_blocks_neither_the_pages_nor_the_event_loop(client, submit):
+    number = submit(CONFIG)
+    job_until(client, number, lambda job: job["state"] == "finished")
+    with concurrent.futures.ThreadPoolExecutor(2) as threads:
+        with client.app.state.jobs.store.lock:  # as while a process is started and the database is synced
+            watcher = threads.submit(client.get, f"/api/v1/jobs/{number}/events")
+            for path in ("/api/v1/jobs", f"/api/v1/jobs/{number}", "/runs/first", "/runs/first/status"):
+                assert threads.submit(client.get, path).result(30).is_success
+            assert not watcher.done()
+        assert "event: state" in watcher.result(30).text
+
+
+def test_watchers_read_the_database_only_for_new_events(client, submit, monkeypatch):
+    *running, queued = [submit(ENDLESS) for _ in range(3)]
+    read, counts = JobStore.events, []
+
+    def counted(*args):
+        events, last = read(*args)
+        counts.append(len(events))
+        return events, last
+
+    with concurrent.futures.ThreadPoolExecutor(1) as threads:
+        monkeypatch.setattr(JobStore, "events", counted)
+        watcher = threads.submit(watched, client, queued)
+        until(lambda counts: 0 in counts, lambda: counts)
+        time.sleep(4 * POLL_SECONDS)
+        for number in (queued, *running):
+            client.post(f"/api/v1/jobs/{number}/cancel")
+        assert [data["state"] for _, _, data in watcher.result(30)] == ["queued", "cancelled"]
+    assert counts.count(0) <= 2, "once after each event"
 
 
 def test_a_late_watcher_receives_the_last_progress(client, submit):

@@ -76,6 +76,26 @@ def test_a_loop_that_is_pushed_is_listed_at_once_and_stopped_from_its_page(serve
     assert (again.status_code, "is finished" in message(again)) == (400, True)
 
 
+def test_the_row_of_a_running_loop_has_its_episodes_and_return(connect, settings, recordings):
+    client = connect(settings)
+
+    def row():
+        found = client.get("/api/v1/runs", params={"filter": "name:growing"}).json()["runs"]
+        return found[0] if found else {"episodes": None}
+
+    with runner.record(make("CartPole-v1"), recordings, name="growing") as env:
+        lengths = [0]
+        for what, *step in play(env, 200):
+            if what == "step":
+                lengths[-1] += 1
+                if any(step[3:5]):
+                    lengths.append(0)
+        ended = lengths[:-1]
+        shown = until(lambda row: row["episodes"] == len(ended), row)
+        assert shown["status"] == "running"
+        assert shown["mean_return"] == sum(ended) / len(ended), "each step is rewarded by 1"
+
+
 def test_the_latest_whole_episode_is_sent_until_the_run_is_over(connect, settings, recordings):
     client = connect(settings)
     latest = "/runs/growing/replay/latest"

@@ -20,6 +20,7 @@ from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import reader
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
+from runner.service.processes import ProcessPool
 from tests.runner.loops.making import make, play
 from tests.waiting import until
 
@@ -130,10 +131,20 @@ PAGES = (
 
 
 def test_the_page_of_a_run_shows_what_a_random_policy_achieves(client):
-    page = page_of(client, "/runs/first")
+    (address,) = re.findall(r'data-later="(\S+/random-policy)"', page_of(client, "/runs/first"))
     assert re.search(
-        r"A random policy succeeds in [\d.]+ % of episodes within the limit of 1,500 steps", page
+        r"A random policy succeeds in [\d.]+ % of episodes within the limit of 1,500 steps",
+        client.get(address).text,
     )
+
+
+def test_the_page_of_a_run_waits_for_no_child_process(client, monkeypatch):
+    def hang(*_, **__):
+        raise AssertionError("a child process is called")
+
+    monkeypatch.setattr(ProcessPool, "submit_within", hang)
+    for name in ("first", "second"):
+        assert client.get(f"/runs/{name}").status_code == 200
 
 
 def test_every_page_is_well_formed_and_has_nothing_inline(client):
@@ -310,9 +321,14 @@ def test_pages_link_a_run_with_its_branches(client, recordings):
         parent, at="2:1", overrides=["epsilon=0.5"], name="curious", recordings=recordings
     )
     own = branch.run.run_id
-    until(lambda page: "branches-title" in page, lambda: page_of(client, f"/runs/{parent.run_id}"))
-    assert f'<a href="/runs/{own}">curious</a>' in page_of(client, f"/runs/{parent.run_id}")
-    page = page_of(client, f"/runs/{own}")
+
+    def tree(run_id):
+        (address,) = re.findall(r'data-later="(\S+/branches)"', page_of(client, f"/runs/{run_id}"))
+        return client.get(address).text
+
+    until(lambda part: "branches-title" in part, lambda: tree(parent.run_id))
+    assert f'<a href="/runs/{own}">curious</a>' in tree(parent.run_id)
+    page = tree(own)
     assert f'<a href="/runs/{parent.run_id}">first</a>' in page
     assert '<strong aria-current="true">curious</strong>' in page
     assert str(branch.origin) in page
@@ -321,7 +337,7 @@ def test_pages_link_a_run_with_its_branches(client, recordings):
         assert f"Branch {name} {branch.origin}" in page
         assert f'href="/compare/replay?run={parent.run_id}&amp;run={own}&amp;at=2%3A1"' in page
     shutil.rmtree(parent.folder)
-    until(lambda page: "a run that was removed" in page, lambda: page_of(client, f"/runs/{own}"))
+    until(lambda page: "a run that was removed" in page, lambda: tree(own))
 
 
 def test_some_of_the_runs_are_counted_in_the_plural(client):
