@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
+from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from dualtaxi.encoding import AGENTS
@@ -23,7 +25,7 @@ except ImportError as error:
     ) from error
 
 
-class DualTaxiParallelEnv(ParallelEnv):  # type: ignore[misc]
+class DualTaxiParallelEnv(ParallelEnv, RecordConstructorArgs):  # type: ignore[misc]
     """Two taxis, each for itself; the rules are those of the competitive `dualtaxi.DualTaxiEnv`.
 
     Both agents, `taxi_1` and `taxi_2`, see the whole state (`Discrete(6144)`, see `DualTaxiEnv`), choose
@@ -54,6 +56,8 @@ class DualTaxiParallelEnv(ParallelEnv):  # type: ignore[misc]
         if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
             raise ValueError(f"max_steps is {max_steps!r}, expected a whole number of at least 1")
         self.game = DualTaxiEnv(render_mode, competitive=True, rewards=rewards, map=map, slip=slip)
+        named = asdict(rewards) if isinstance(rewards, Rewards) else rewards and dict(rewards)
+        RecordConstructorArgs.__init__(self, max_steps=max_steps, rewards=named, map=map, slip=slip)
         self.render_mode = render_mode
         self.max_steps = max_steps
         self.possible_agents = list(AGENTS)

@@ -23,7 +23,7 @@ from runner.recording.reader import Recording, open_recording
 from runner.replay.differences import Difference
 from runner.replay.engine import Replay
 from runner.replay.environment import redo, stream_from_child
-from runner.replay.makers import why_not_redone
+from runner.replay.makers import why_not_redone, why_uncertain
 from runner.runs.provenance import Differences
 from runner.util.processes import report_progress
 
@@ -58,7 +58,8 @@ class Redone:
     tolerance: float = 0.0
     """Absolute and relative, for floating-point values; 0 if bytes were compared."""
     assumed: tuple[str, ...] = ()
-    """The wrappers whose arguments were not recorded: their default values were taken."""
+    """The classes whose arguments are not known for certain: those of their attributes, or the defaults, were
+    taken."""
     versions: Differences = field(default_factory=dict)
     """The packages, and the platform, that are others than recorded."""
 
@@ -102,7 +103,9 @@ def _compare(path: Path, sample: int | None, tolerance: float, trust: bool) -> N
             outcome = _compare_all(recording, tolerance, trust)
         else:
             outcome = _compare_sample(recording, sample, tolerance, trust)
-        if outcome.difference is not None and not _is_repeatable(recording, outcome, trust):
+        if outcome.difference is not None and (reason := why_uncertain(recording, trust)):
+            outcome = replace(outcome, verdict="impossible", reason=reason)
+        elif outcome.difference is not None and not _is_repeatable(recording, outcome, trust):
             outcome = replace(outcome, verdict="impossible", reason=_OUTSIDE)
     report_progress(outcome)
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import inspect
 import json
 import platform
 import sys
@@ -18,6 +17,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
+import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorActionWrapper
 from gymnasium.wrappers import OrderEnforcing
@@ -25,25 +25,23 @@ from gymnasium.wrappers import OrderEnforcing
 from runner.environments.gym_types import AnyVectorEnv
 from runner.errors import ConfigError
 from runner.loops.actions import action_names
+from runner.loops.arguments import CannotBeMade, arguments_of, plain_kwargs, plain_number
 from runner.loops.vec_env import LIBRARY, VecEnvVector, mode_of
 from runner.loops.wrappers import (
     OBSERVERS,
-    CannotBeMade,
-    class_name,
     declared_wrapper_fields,
-    default_arguments,
     entry_point_of,
-    layers_of,
+    game_wrapper_fields,
     only_observes,
-    plain_kwargs,
-    plain_number,
     top_package,
     wrapper_fields,
     wrappers_as_fields,
 )
 from runner.recording.maker import FUNCTION_NAME, MAX_SPEC, EnvironmentMaker, VectorMaker
 from runner.replay.games import MultiAgent, Turns
+from runner.replay.makers import class_name, layers_of
 from runner.replay.stepping_vector import spaces_of_one
+from runner.replay.trust import name_of
 from runner.util.values import MAX_TEXT
 
 NAME_MAKE: Final = 'name a function that makes it: make="module:function"'
@@ -60,8 +58,8 @@ def maker_of(env: Any, make: str = "") -> EnvironmentMaker:
     actions = action_names(env, env.action_space)
     maker = EnvironmentMaker("gymnasium", make=make, wrappers=names, action_names=actions)
     wrappers = [layer for layer in reversed(layers[:-1]) if not only_observes(layer)]
-    top = top_package(type(layers[-1]).__module__)
-    return _with_spec(maker, getattr(layers[-1], "spec", None), partial(wrappers_as_fields, wrappers), top)
+    spec = getattr(layers[-1], "spec", None)
+    return _with_spec(maker, spec, partial(wrappers_as_fields, wrappers, spec), layers[-1])
 
 
 def _maker_of_spec(spec: object) -> EnvironmentMaker:
@@ -76,38 +74,85 @@ def _maker_of_spec(spec: object) -> EnvironmentMaker:
             "additional_wrappers": [declared_wrapper_fields(wrapper, assumed) for wrapper in left]
         }
 
-    return _with_spec(EnvironmentMaker("gymnasium", wrappers=names), spec, wrapping, "")
+    return _with_spec(EnvironmentMaker("gymnasium", wrappers=names), spec, wrapping)
 
 
 def _with_spec(
-    maker: EnvironmentMaker, spec: object, wrapping: Callable[[list[str]], dict[str, object]], top: str
+    maker: EnvironmentMaker,
+    spec: object,
+    wrapping: Callable[[list[str]], dict[str, object]],
+    base: object = None,
 ) -> EnvironmentMaker:
     """Return a maker with a specification.
 
     Args:
+        spec: of Gymnasium; None if the environment's class was called.
         wrapping: returns the fields that describe the wrappers; appends those whose arguments are unknown.
-        top: the top package of the environment, for versions where there is no specification.
+        base: the environment inside of all wrappers; None if it is in another process.
     """
-    if not isinstance(spec, EnvSpec):
-        return _with_versions(maker, [top] if top else [], "it was not made by gymnasium.make")
     assumed: list[str] = []
     try:
-        entry_point = entry_point_of(spec.entry_point)
-        fields = {
-            "id": spec.id,
-            "entry_point": entry_point,
-            "reward_threshold": spec.reward_threshold,
-            "nondeterministic": spec.nondeterministic,
-            "kwargs": plain_kwargs(spec.kwargs, spec.id),
-        }
-        text = json.dumps(fields | wrapping(assumed), default=plain_number)
+        fields, registered_by = (
+            _spec_fields(spec) if isinstance(spec, EnvSpec) else _own_fields(base, assumed)
+        )
+        fields |= wrapping(assumed)
+        inner: Any = fields.pop("inner_wrappers", 0)
+        text = json.dumps(fields, default=plain_number)
     except CannotBeMade as reason:
-        return _with_versions(maker, [top] if top else [], reason)
-    top = top_package(entry_point)
-    maker = replace(maker, spec=text, registered_by="" if top == "gymnasium" else top, assumed=tuple(assumed))
+        tops = [] if base is None else [top_package(type(base).__module__)]
+        return _with_versions(maker, tops, reason)
+    top = top_package(str(fields["entry_point"]))
+    maker = replace(
+        maker,
+        spec=text,
+        registered_by="" if top == "gymnasium" else registered_by,
+        assumed=tuple(assumed),
+        inner_wrappers=inner,
+    )
     return _with_versions(
         maker, [top, *(top_package(name) for name in maker.wrappers if name not in OBSERVERS)]
     )
+
+
+def _spec_fields(spec: EnvSpec) -> tuple[dict[str, object], str]:
+    """Return what is recorded of a specification without wrappers, and the module that registers it."""
+    registered = gymnasium.registry.get(spec.id)
+    try:
+        entry_point = entry_point_of(spec.entry_point)
+        registered_by = top_package(entry_point)
+    except CannotBeMade:  # a function without a name of its own, which its module registers under the id
+        entry_point = name_of(spec.entry_point)
+        registered_by = entry_point.partition(":")[0]
+        if (
+            registered is None
+            or name_of(registered.entry_point) != entry_point
+            or registered_by == "__main__"
+        ):
+            raise
+    fields: dict[str, object] = {
+        "id": spec.id,
+        "entry_point": entry_point,
+        "reward_threshold": spec.reward_threshold,
+        "nondeterministic": spec.nondeterministic,
+        "kwargs": plain_kwargs(spec.kwargs, spec.id),
+    }
+    return fields, registered_by
+
+
+def _own_fields(base: object, assumed: list[str]) -> tuple[dict[str, object], str]:
+    """Return the same of an environment whose class was called."""
+    if base is None:
+        raise CannotBeMade("it was not made by gymnasium.make, and is in another process")
+    kwargs, is_certain = arguments_of(base)
+    if not is_certain:
+        assumed.append(class_name(base))
+    entry_point = entry_point_of(type(base))
+    fields: dict[str, object] = {
+        "id": type(base).__name__,
+        "entry_point": entry_point,
+        "kwargs": plain_kwargs(kwargs, class_name(base)),
+    }
+    return fields, top_package(entry_point)
 
 
 def vector_maker_of(
@@ -202,32 +247,33 @@ def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
         agent_action_names={agent: names for agent, names in named.items() if names},
     )
     top, assumed = top_package(module), []
+    has_function = callable(getattr(sys.modules.get(module), function, None))
+    wrappers = [
+        layer for layer in reversed(layers[:-1]) if not type(layer).__module__.startswith("pettingzoo.")
+    ]
     try:
-        has_function = callable(getattr(sys.modules.get(module), function, None))
-        foreign = [layer for layer in layers[:-1] if not type(layer).__module__.startswith("pettingzoo.")]
-        is_converted = getattr(outer, "env", None) is None and hasattr(outer, "aec_env")
-        if outer is not base and not (has_function and (is_converted or is_in_turns)):
-            foreign.append(outer)
-        if foreign and not is_of_rllib:
-            raise CannotBeMade(f"the wrapper {class_name(foreign[0])} does not record its arguments")
-        arguments = env.arguments if is_of_rllib else getattr(base, "_ezpickle_kwargs", None)
-        if is_of_rllib and env.creator is None:
-            raise CannotBeMade("it is not known what made it")
-        if arguments is None:
-            assumed = default_arguments(type(base), ())
-        elif getattr(base, "_ezpickle_args", ()):
-            arguments = inspect.signature(type(base)).bind(*base._ezpickle_args, **arguments).arguments
         if is_of_rllib:
-            entry_point = entry_point_of(env.creator)
+            if env.creator is None:
+                raise CannotBeMade("it is not known what made it")
+            entry_point, arguments, wrappers = entry_point_of(env.creator), env.arguments, []
             top = top_package(entry_point)
         else:
+            is_converted = getattr(outer, "env", None) is None and hasattr(outer, "aec_env")
+            if outer not in (base, *wrappers) and not (has_function and (is_converted or is_in_turns)):
+                raise CannotBeMade(f"the wrapper {class_name(outer)} does not record its arguments")
             entry_point = f"{module}:{function}" if has_function else entry_point_of(type(base))
-        kwargs = plain_kwargs(arguments or {}, f"the game {class_name(base)}")
+            arguments, is_certain = arguments_of(base)
+            assumed += [] if is_certain else [class_name(base)]
+        fields: dict[str, object] = {
+            "entry_point": entry_point,
+            "kwargs": plain_kwargs(arguments, f"the game {class_name(base)}"),
+        }
+        if wrappers:
+            fields["wrappers"] = [game_wrapper_fields(wrapper, assumed) for wrapper in wrappers]
     except CannotBeMade as reason:
         return _with_versions(maker, [top], reason)
-    spec = json.dumps({"entry_point": entry_point, "kwargs": kwargs}, default=plain_number)
-    maker = replace(maker, spec=spec, registered_by=top, assumed=(class_name(base),) if assumed else ())
-    return _with_versions(maker, [top])
+    spec = json.dumps(fields, default=plain_number)
+    return _with_versions(replace(maker, spec=spec, registered_by=top, assumed=tuple(assumed)), [top])
 
 
 def checked_make(make: object) -> str:

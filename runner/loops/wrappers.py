@@ -5,17 +5,18 @@ from __future__ import annotations
 import importlib
 import inspect
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
-import numpy as np
-from gymnasium.envs.registration import WrapperSpec
-from gymnasium.utils import RecordConstructorArgs
+from gymnasium.envs.registration import EnvSpec, WrapperSpec, load_env_creator
 from gymnasium.wrappers import HumanRendering, OrderEnforcing, PassiveEnvChecker, RecordVideo, TimeLimit
 from gymnasium.wrappers.vector import HumanRendering as VectorHumanRendering
 from gymnasium.wrappers.vector import RecordVideo as VectorRecordVideo
 
+from runner.loops.arguments import VARIABLE, CannotBeMade, arguments_of, factory_of, plain_kwargs
 from runner.recording.maker import FUNCTION_NAME
+from runner.replay.makers import class_name
+from runner.replay.trust import name_of
 from runner.util.values import MAX_TEXT
 
 _SHOWS_ONLY: Final = (RecordVideo, HumanRendering, VectorRecordVideo, VectorHumanRendering)
@@ -31,35 +32,35 @@ OBSERVERS: Final = frozenset(
 """Wrappers of Stable-Baselines3 that themselves change no observation, reward or end: left out, too."""
 
 
-class CannotBeMade(Exception):
-    """Why a part of the environment cannot be made again."""
-
-
-def layers_of(env: object) -> Iterator[Any]:
-    """Yield an environment's wrappers from the outermost in, and the environment inside of them."""
-    innermost = getattr(env, "unwrapped", env)
-    while env is not innermost and env is not None:
-        yield env
-        # PettingZoo's wrappers look up what they do not have inside: `env` comes first.
-        env = getattr(env, "env", None) or getattr(env, "aec_env", None)
-    yield innermost
-
-
-def wrappers_as_fields(wrappers: Sequence[Any], assumed: list[str]) -> dict[str, object]:
+def wrappers_as_fields(wrappers: Sequence[Any], spec: object, assumed: list[str]) -> dict[str, object]:
     """Return the fields of an `EnvSpec` that describe wrappers, given from the innermost out.
 
-    The innermost three are fields of their own if they are those of `gymnasium.make`.
+    Those that the entry point itself puts around its environment are only counted: it does so again. The
+    next three are fields of their own if they are those of `gymnasium.make`.
     """
     left = list(wrappers)
+    inner = 0
+    if isinstance(spec, EnvSpec) and not isinstance(_creator_of(spec), type):
+        firsts = [at for at, each in enumerate(left) if type(each) in (PassiveEnvChecker, OrderEnforcing)]
+        inner = next(iter(firsts), 0)
+        if not firsts:  # `gymnasium.make` was told to leave both out, or only what is inside was taken
+            assumed.append(name_of(spec.entry_point))
+    del left[:inner]
     checker = left.pop(0) if left and type(left[0]) is PassiveEnvChecker else None
     order = left.pop(0) if left and type(left[0]) is OrderEnforcing else None
     limit = left.pop(0) if left and type(left[0]) is TimeLimit else None
     return {
+        "inner_wrappers": inner,
         "disable_env_checker": checker is None,
         "order_enforce": order is not None,
         "max_episode_steps": None if limit is None else limit._max_episode_steps,
         "additional_wrappers": [wrapper_fields(wrapper, assumed) for wrapper in left],
     }
+
+
+def _creator_of(spec: EnvSpec) -> object:
+    """Return the class or function that makes the environment of a specification."""
+    return load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
 
 
 def only_observes(wrapper: object) -> bool:
@@ -71,7 +72,11 @@ def declared_wrapper_fields(spec: WrapperSpec, assumed: list[str]) -> dict[str, 
     """Return the fields of a wrapper's specification, which has no arguments if it does not record them."""
     if spec.kwargs is None:
         module, _, name = spec.entry_point.partition(":")
-        if default_arguments(getattr(importlib.import_module(module), name), ("env",)):
+        parameters = inspect.signature(getattr(importlib.import_module(module), name)).parameters.values()
+        others = [each for each in parameters if each.name != "env"]
+        if any(each.default is each.empty for each in others if each.kind not in VARIABLE):
+            raise CannotBeMade(f"the wrapper {spec.entry_point} does not record its arguments")
+        if others:
             assumed.append(spec.entry_point)
     kwargs = plain_kwargs(spec.kwargs or {}, f"the wrapper {spec.entry_point}")
     return {"name": spec.name, "entry_point": spec.entry_point, "kwargs": kwargs}
@@ -79,74 +84,29 @@ def declared_wrapper_fields(spec: WrapperSpec, assumed: list[str]) -> dict[str, 
 
 def wrapper_fields(wrapper: object, assumed: list[str]) -> dict[str, object]:
     """Return the fields of a `WrapperSpec`; add the wrapper to `assumed` if its arguments are unknown."""
-    kind, name = type(wrapper), class_name(wrapper)
-    parameters = inspect.signature(kind).parameters
-    kwargs = getattr(wrapper, "_saved_kwargs", None) if isinstance(wrapper, RecordConstructorArgs) else None
-    kwargs = None if kwargs is None else {key: value for key, value in kwargs.items() if key != "env"}
-    if kind.__module__ == _SB3_ATARI:  # they keep their arguments under their names
-        fields = {key: getattr(wrapper, key, getattr(wrapper, f"_{key}", None)) for key in parameters}
-        kwargs = {key: value for key, value in fields.items() if key != "env" and value is not None}
-    # A class that inherits from one that records its arguments may have others.
-    if kwargs is None or not kwargs.keys() <= parameters.keys():
-        kwargs = {}
-        if default_arguments(kind, ("env",)):
-            assumed.append(name)
-    spec = WrapperSpec(kind.__name__, entry_point_of(kind), plain_kwargs(kwargs, f"the wrapper {name}"))
-    return {"name": spec.name, "entry_point": spec.entry_point, "kwargs": spec.kwargs}
+    name = class_name(wrapper)
+    kwargs, is_certain = arguments_of(wrapper, "env")
+    if not is_certain:
+        assumed.append(name)
+    kwargs = plain_kwargs(kwargs, f"the wrapper {name}")
+    return {"name": type(wrapper).__name__, "entry_point": entry_point_of(type(wrapper)), "kwargs": kwargs}
 
 
-def default_arguments(kind: type, given: Sequence[str]) -> list[str]:
-    """Return the parameters of a class that have default values, if all have but `given`.
-
-    Raises:
-        CannotBeMade: another one has none.
-    """
-    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    parameters = [one for one in inspect.signature(kind).parameters.values() if one.kind not in variable]
-    others = [one for one in parameters if one.name not in given]
-    if len(parameters) - len(others) < len(given) or any(one.default is one.empty for one in others):
-        raise CannotBeMade(f"{kind.__module__}:{kind.__qualname__} does not record its arguments")
-    return [one.name for one in others]
-
-
-def plain_kwargs(kwargs: Mapping[str, object], owner: str) -> dict[str, object]:
-    """Return keyword arguments that JSON can hold.
-
-    Raises:
-        CannotBeMade: it cannot hold one.
-    """
-    for name, value in kwargs.items():
-        try:
-            is_plain = _is_plain(value)
-        except RecursionError:
-            is_plain = False
-        if not is_plain:
-            type_name = f"{type(value).__module__}:{type(value).__qualname__}"
-            raise CannotBeMade(f"{owner} has the argument {name}, of {type_name}, which JSON cannot hold")
-    return dict(kwargs)
-
-
-def _is_plain(value: object) -> bool:
-    if isinstance(value, list | tuple):
-        return all(map(_is_plain, value))
-    if isinstance(value, dict):
-        return all(isinstance(key, str) and _is_plain(part) for key, part in value.items())
-    return value is None or isinstance(value, str | int | float | np.number | np.bool_)
-
-
-def plain_number(value: np.generic) -> object:
-    """Return a number of NumPy as JSON holds it."""
-    return value.item()
+def game_wrapper_fields(wrapper: object, assumed: list[str]) -> dict[str, object]:
+    """Return what makes a wrapper around a game: a class, or a function as SuperSuit has them."""
+    name = class_name(wrapper)
+    try:
+        kwargs, is_certain = arguments_of(wrapper, "env")
+        entry_point, kwargs = entry_point_of(type(wrapper)), plain_kwargs(kwargs, f"the wrapper {name}")
+    except CannotBeMade:
+        entry_point, kwargs, is_certain = factory_of(wrapper)
+    assumed += [] if is_certain else [name]
+    return {"entry_point": entry_point, "kwargs": kwargs}
 
 
 def top_package(module: str) -> str:
     """Return the top package of a module, or of `module:class`."""
     return module.partition(":")[0].partition(".")[0]
-
-
-def class_name(instance: object) -> str:
-    """Return `module:class` of an instance, cut at the length that a recording holds."""
-    return f"{type(instance).__module__}:{type(instance).__qualname__}"[:MAX_TEXT]
 
 
 def entry_point_of(value: object) -> str:
@@ -163,7 +123,7 @@ def entry_point_of(value: object) -> str:
         if getattr(sys.modules.get(str(module)), name, None) is value:
             text = f"{module}:{name}"
     if not FUNCTION_NAME.fullmatch(text) or "." in text.partition(":")[2]:
-        raise CannotBeMade(f"{value!r} cannot be imported by name"[:MAX_TEXT])
+        raise CannotBeMade(f"{name_of(value)} cannot be imported by name"[:MAX_TEXT])
     if text.startswith("__main__:"):
         raise CannotBeMade(f"{text} is defined in the script that was run")
     return text

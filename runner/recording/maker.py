@@ -80,7 +80,10 @@ class EnvironmentMaker:
     wrappers: tuple[str, ...] = ()
     """The wrappers of an environment, `module:class`, from the outermost in."""
     assumed: tuple[str, ...] = ()
-    """The wrappers, `module:class`, whose arguments are unknown: `spec` has their default values."""
+    """The wrappers, environments or games, `module:class`, whose arguments are not known for certain: `spec`
+    has those of their attributes, or the default values."""
+    inner_wrappers: int = 0
+    """How many wrappers the registered function adds itself, which are not in `spec`."""
     vector: VectorMaker | None = None
     packages: Mapping[str, str] = field(default_factory=dict)
     """The versions of the distributions that determine what the environment does, by name."""
@@ -93,7 +96,7 @@ class EnvironmentMaker:
 
     def is_like(self, other: EnvironmentMaker) -> bool:
         """Return whether another maker makes the environment, or each of a vector, in the same way."""
-        names = ("spec", "registered_by", "make", "reason", "wrappers", "assumed")
+        names = ("spec", "registered_by", "make", "reason", "wrappers", "assumed", "inner_wrappers")
         return all(getattr(self, name) == getattr(other, name) for name in names)
 
     def to_metadata(self) -> dict[str, str]:
@@ -114,6 +117,7 @@ def parse_maker(values: Mapping[str, object], where: str) -> EnvironmentMaker:
         reason=check.text("reason", _MAX_REASON),
         wrappers=check.names("wrappers"),
         assumed=check.names("assumed"),
+        inner_wrappers=check.whole("inner_wrappers"),
         vector=None if vector is None else _parse_vector(vector, f"{where}: the vector's {MAKER_RECORD}"),
         packages=check.versions("packages"),
         platform=check.text("platform", MAX_TEXT),
@@ -166,6 +170,12 @@ class _Check:
             value = None
         self.require(key, isinstance(value, kind) and not is_too_deep(value))
         return text
+
+    def whole(self, key: str) -> int:
+        """Return a number from 0; 0 if it is missing, as in earlier recordings."""
+        value = self.values.get(key, 0)
+        self.require(key, is_whole(value, 0, MAX_NAMES))
+        return int(value)
 
     def choice(self, key: str, choices: tuple[str, ...]) -> str:
         self.require(key, self.values.get(key) in choices)

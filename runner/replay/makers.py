@@ -8,6 +8,7 @@ import importlib
 import importlib.metadata
 import importlib.util
 import inspect
+import itertools
 import os
 import sys
 from collections.abc import Iterator, Mapping
@@ -36,7 +37,9 @@ from runner.replay.trust import (
     trusting,
     why_not_imported,
 )
+from runner.runs.marks import own_mark
 from runner.util.processes import raise_if_out_of_memory
+from runner.util.values import MAX_TEXT
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
@@ -158,7 +161,9 @@ def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Env:
     spec, registered = _registered(maker, trust)
     kwargs = {key: value for key, value in spec.kwargs.items() if key not in _OF_VECTORS}
     if render:
-        creator = gymnasium.envs.registration.load_env_creator(spec.entry_point)
+        creator: Any = registered.entry_point
+        if isinstance(creator, str):
+            creator = gymnasium.envs.registration.load_env_creator(creator)
         modes = (getattr(creator, "metadata", None) or {}).get("render_modes", ())
         if "rgb_array" not in modes:
             names = ", ".join(map(str, modes)) or "none"
@@ -168,13 +173,11 @@ def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Env:
         kwargs["render_mode"] = "rgb_array"
     elif kwargs.get("render_mode") not in (None, "rgb_array"):
         kwargs["render_mode"] = None
-    wrappers = tuple(
-        gymnasium.envs.registration.WrapperSpec(name, entry_point, own)
+    wrappers = [
+        (_wrapper(entry_point, gymnasium.Wrapper, own, trust), own)
         for name, entry_point, own in spec.wrappers
         if not is_left_out(entry_point)
-    )
-    for wrapper in wrappers:
-        _wrapper(wrapper.entry_point, gymnasium.Wrapper, wrapper.kwargs or {}, trust)
+    ]
     made: Env = gymnasium.make(
         dataclasses.replace(
             registered,
@@ -182,9 +185,13 @@ def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Env:
             max_episode_steps=spec.max_episode_steps,
             order_enforce=False,  # it changes nothing for a loop that was in order
             disable_env_checker=True,
-            additional_wrappers=wrappers,
+            additional_wrappers=(),
         )
     )
+    # Without their number, wrappers that the entry point adds are the first of the recorded ones.
+    inside = () if maker.inner_wrappers or made.spec is None else made.spec.additional_wrappers
+    for wrapper, own in wrappers[len(inside) :]:
+        made = wrapper(env=made, **own)
     return made
 
 
@@ -204,6 +211,8 @@ def _registered(maker: EnvironmentMaker, trust: bool) -> tuple[EnvironmentSpec, 
     registered = gymnasium.registry.get(spec.id)
     if registered is None and trust and spec.entry_point:
         registered = gymnasium.envs.registration.EnvSpec(spec.id, entry_point=spec.entry_point)
+    if registered is None and spec.id == spec.entry_point.partition(":")[2]:
+        raise CannotRedo(f"The environment is made by {spec.entry_point}. {TRUST}")
     if registered is None:
         raise CannotRedo(
             f"{spec.id} is not registered with Gymnasium {gymnasium.__version__} here, by "
@@ -224,12 +233,20 @@ def _registered(maker: EnvironmentMaker, trust: bool) -> tuple[EnvironmentSpec, 
 
 
 def _made_game(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
-    module, function, kwargs = parse_game(maker.spec)
+    module, function, kwargs, wrappers = parse_game(maker.spec)
     if not trust:
+        if wrappers:
+            raise CannotRedo(f"The environment is wrapped by {wrappers[0][1]}. {TRUST}")
         require_listed_game(f"{module}:{function}", kwargs)
     make = _attribute(f"{module}:{function}")
     kwargs = {key: value for key, value in kwargs.items() if key != "render_mode"}
-    return make(**kwargs, **({"render_mode": "rgb_array"} if render else {}))
+    game = make(**kwargs, **({"render_mode": "rgb_array"} if render else {}))
+    for _, entry_point, arguments in wrappers:
+        game = _attribute(entry_point)(game, **arguments)
+    names = tuple(map(class_name, layers_of(game)))[:-1]
+    if wrappers and names != maker.wrappers:
+        raise CannotRedo(f"The environment has the wrappers {names} here, recorded {maker.wrappers}.")
+    return game
 
 
 def _made_by_function(name: str, render: bool) -> Any:
@@ -276,6 +293,21 @@ def _attribute(name: str) -> Any:
     return value
 
 
+def layers_of(env: object) -> Iterator[Any]:
+    """Yield an environment's wrappers from the outermost in, and the environment inside of them."""
+    innermost = getattr(env, "unwrapped", env)
+    while env is not innermost and env is not None:
+        yield env
+        # PettingZoo's wrappers look up what they do not have inside: `env` comes first.
+        env = getattr(env, "env", None) or getattr(env, "aec_env", None)
+    yield innermost
+
+
+def class_name(instance: object) -> str:
+    """Return `module:class` of an instance, cut at the length that a recording holds."""
+    return f"{type(instance).__module__}:{type(instance).__qualname__}"[:MAX_TEXT]
+
+
 def _without_display() -> None:
     """Make libraries draw without a display, where there is none."""
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
@@ -317,3 +349,16 @@ def _why_not_made_of(recording: Recording, maker: EnvironmentMaker | None, trust
             return why_not_made(maker, is_trusted)
     except CannotRedo as error:
         return str(error)
+
+
+def why_uncertain(recording: Recording, trust: bool = False) -> str:
+    """Return why a difference shows nothing, as some arguments are not known; empty if all are."""
+    firsts = itertools.accumulate((shard.environments for shard in recording.shards), initial=0)
+    makers = [recording.maker_of(phase, first) for first in firsts for phase in schema.PHASES]
+    known = [maker for maker in makers if maker is not None and maker.assumed]
+    made = [one for one in known if not (one.make and (trust or own_mark(recording.path, one)))]
+    names = ", ".join(dict.fromkeys(name for maker in made for name in maker.assumed))
+    return names and (
+        f"The arguments of {names} could not be recorded, and with those that were assumed it is another "
+        'environment. Runs recorded with a function that makes it, make="module:function", can be verified.'
+    )

@@ -41,7 +41,8 @@ def modules_of(maker: EnvironmentMaker) -> list[str]:
         CannotRedo: it is no specification.
     """
     if maker.kind == "pettingzoo":
-        return [parse_game(maker.spec)[0]]
+        module, _, _, around = parse_game(maker.spec)
+        return [module, *(entry_point.partition(":")[0] for _, entry_point, _ in around)]
     spec = parse_spec(maker.spec)
     wrappers = [*spec.wrappers, *(vector_wrappers(maker.vector) if maker.vector else ())]
     names = [maker.registered_by, spec.entry_point, *(entry_point for _, entry_point, _ in wrappers)]
@@ -74,21 +75,22 @@ def _wrappers_of(values: object, owner: str) -> tuple[Wrapper, ...]:
     wrappers = []
     for value in values if isinstance(values, list) else [None]:
         own = value if isinstance(value, Mapping) else {}
-        name, entry_point, kwargs = own.get("name"), own.get("entry_point"), own.get("kwargs")
+        entry_point, kwargs = own.get("entry_point"), own.get("kwargs")
+        name = own.get("name", entry_point)
         if not isinstance(name, str) or not isinstance(entry_point, str) or not isinstance(kwargs, dict):
             raise CannotRedo(f"A wrapper of {owner} does not state its class and arguments.")
         wrappers.append((name, entry_point, kwargs))
     return tuple(wrappers)
 
 
-def parse_game(text: str) -> tuple[str, str, dict[str, object]]:
-    """Return module, function and keyword arguments of a PettingZoo environment."""
+def parse_game(text: str) -> tuple[str, str, dict[str, object], tuple[Wrapper, ...]]:
+    """Return module, function, keyword arguments and wrappers of a PettingZoo environment."""
     values = _json_of(text)
     entry_point, kwargs = values.get("entry_point"), values.get("kwargs") or {}
     module, _, function = entry_point.partition(":") if isinstance(entry_point, str) else ("", "", "")
     if not module or not function or not isinstance(kwargs, dict):
         raise CannotRedo("The specification of the recorded environment has no entry point.")
-    return module, function, kwargs
+    return module, function, kwargs, _wrappers_of(values.get("wrappers") or [], "the game")
 
 
 def _json_of(text: str) -> dict[str, object]:

@@ -9,6 +9,7 @@ and wrappers of `WRAPPERS`. A process in which `OWN_ONLY` is set makes nothing o
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import importlib.util
 import json
@@ -311,9 +312,11 @@ def why_not_imported(module: str, trust: bool) -> str:
 
 
 def name_of(entry_point: Any) -> str:
-    """Return `module:name` of an entry point; empty if there is none."""
+    """Return `module:name` of an entry point, of the function in a partial; empty if there is none."""
     if entry_point is None or isinstance(entry_point, str):
         return entry_point or ""
+    while isinstance(entry_point, functools.partial):
+        entry_point = entry_point.func
     return f"{getattr(entry_point, '__module__', '')}:{getattr(entry_point, '__qualname__', '')}"
 
 

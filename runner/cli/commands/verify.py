@@ -114,7 +114,7 @@ def _redone(redone: Redone) -> dict[str, str]:
     elif redone.verdict == "impossible":
         rows = {"verdict": "sound; it cannot be reproduced here", "reason": redone.reason}
         rows["first"] = str(redone.difference or "")
-    notes = [f"{wrapper}: made with default arguments, as its own were unknown" for wrapper in redone.assumed]
+    notes = [f"{name}: its arguments were assumed, as they could not be recorded" for name in redone.assumed]
     if redone.left_out:
         notes.append(
             f"{redone.left_out:,} steps were left out: the random generators before them are not known"

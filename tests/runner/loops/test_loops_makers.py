@@ -4,27 +4,33 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from types import ModuleType
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium import wrappers
+from gymnasium import spaces, wrappers
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
 from runner.cli.episode import Episode
 from runner.errors import ConfigError, RecordingError
+from runner.execution.redo import verify_by_redoing
 from runner.export.episodes import named_episode
 from runner.export.pictures import describer
 from runner.recording.maker import EnvironmentMaker, VectorMaker, parse_maker
 from runner.recording.metadata import json_object
 from runner.recording.reader import open_recording
 from runner.recording.reset_states import ResetState, decode_reset_state
+from runner.replay.environment import redo
+from runner.replay.trust import name_of
 from tests.runner.loops.making import Leaving
 
 
@@ -36,11 +42,11 @@ class Doubled(gymnasium.RewardWrapper):
 
 
 class Scaled(gymnasium.RewardWrapper):
-    """Does not record its argument, which has a default."""
+    """Keeps its argument, as it is, in an attribute of another name."""
 
-    def __init__(self, env: Any, factor: float = 2.0) -> None:
+    def __init__(self, env: Any, by: float = 2.0) -> None:
         super().__init__(env)
-        self.factor = factor
+        self.factor = by
 
     def reward(self, reward: Any) -> Any:
         return reward * self.factor
@@ -51,6 +57,35 @@ class Shifted(Scaled):
 
     def __init__(self, env: Any, by: float) -> None:
         super().__init__(env, by)
+
+
+class Rounded(Doubled):
+    """Does not keep its argument as it is."""
+
+    def __init__(self, env: Any, digits: int = 2) -> None:
+        super().__init__(env)
+        self.digits = max(digits, 1)
+
+
+class Padded(gymnasium.RewardWrapper):
+    """Keeps no argument."""
+
+    def __init__(self, env: Any, by: float = 2.0) -> None:
+        super().__init__(env)
+        self.reward = lambda reward: reward + by
+
+
+class Counted(Doubled):
+    """Changes what it keeps of its arguments, all but the first."""
+
+    def __init__(self, env: Any, seeds: Sequence[int] = (0,), index: int = 0) -> None:
+        super().__init__(env)
+        self.seeds = list(seeds)
+        self.index = index
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.index += 1
+        return super().reset(**kwargs)
 
 
 class Halved(wrappers.TransformReward):
@@ -92,23 +127,112 @@ def test_the_reason_is_recorded_where_wrappers_cannot_be_made_again(wrap, reason
     assert maker.wrappers[0].endswith(type(env).__qualname__)
 
 
-@pytest.mark.parametrize(("wrapper", "is_assumed"), [(Doubled, False), (Scaled, True), (Halved, False)])
-def test_wrappers_without_arguments_are_made_again(wrapper, is_assumed, tmp_path):
-    maker = maker_of(runner.record(wrapper(make_pole()), tmp_path))
+@pytest.mark.parametrize(
+    ("wrap", "is_assumed", "kwargs"),
+    [
+        (Doubled, False, {}),
+        (Halved, False, {}),
+        (Scaled, False, {"by": 2.0}),
+        (lambda env: Scaled(env, 3), False, {"by": 3}),
+        (lambda env: Rounded(env, 0), True, {"digits": 1}),
+        (lambda env: Counted(env, seeds=(3, 4)), True, {"seeds": [3, 4], "index": 0}),
+    ],
+)
+def test_the_arguments_of_wrappers_are_read_from_their_attributes(wrap, is_assumed, kwargs, tmp_path):
+    env = wrap(make_pole())
+    maker = maker_of(runner.record(env, tmp_path))
     assert not maker.reason
-    assert maker.assumed == ((f"{__name__}:{wrapper.__name__}",) if is_assumed else ())
+    name = type(env).__name__
+    assert maker.assumed == ((f"{__name__}:{name}",) if is_assumed else ())
     spec = json.loads(maker.spec)
-    assert spec["additional_wrappers"] == [
-        {"name": wrapper.__name__, "entry_point": f"{__name__}:{wrapper.__name__}", "kwargs": {}}
-    ]
+    wrapper = {"name": name, "entry_point": f"{__name__}:{name}", "kwargs": kwargs}
+    assert spec["additional_wrappers"] == [wrapper]
 
 
-def test_an_environment_that_was_not_made_by_gymnasium_has_a_reason(tmp_path):
-    from gymnasium.envs.classic_control import CartPoleEnv
+class Walk(gymnasium.Env[Any, Any]):
+    """An own class with arguments."""
 
-    maker = maker_of(runner.record(CartPoleEnv(), tmp_path))
-    assert "not made by gymnasium.make" in maker.reason
-    assert maker.wrappers == ()
+    observation_space = spaces.Discrete(50)
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, length: int, *, reward: float = 1.0) -> None:
+        self._length = length
+        self.reward = reward
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.place = 0
+        return self.place, {}
+
+    def step(self, action: Any) -> Any:
+        self.place += int(action)
+        return self.place, self.reward, self.place >= self._length, False, {}
+
+
+def record_steps(env: Any, steps: int = 60) -> Any:
+    """Return what records some random steps, closed."""
+    env.action_space.seed(1)
+    with env:
+        env.reset(seed=1)
+        for _ in range(steps):
+            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            if terminated or truncated:
+                env.reset()
+    return env
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, lambda env: wrappers.TimeLimit(Scaled(env, 3), 5)])
+def test_an_environment_of_an_own_class_is_made_with_its_arguments(wrap, tmp_path):
+    rec = record_steps(runner.record(wrap(Walk(7, reward=0.5)), tmp_path))
+    maker = maker_of(rec)
+    assert (maker.reason, maker.assumed) == ("", ())
+    assert json.loads(maker.spec)["kwargs"] == {"length": 7, "reward": 0.5}
+    assert verify_by_redoing(rec.run.recording).verdict == "reproduced"
+    copied = shutil.copy(rec.run.recording, tmp_path / "copied.mcap")
+    assert verify_by_redoing(copied, trust=True).verdict == "reproduced"
+    untrusted = verify_by_redoing(copied)
+    assert untrusted.verdict == "impossible"
+    assert "--trust" in untrusted.reason
+
+
+def make_clipped(high: float = 0.5) -> Any:
+    return Rounded(wrappers.ClipReward(make_pole().unwrapped, 0, high), 3)
+
+
+@pytest.mark.parametrize(
+    "entry_point", [make_clipped, partial(make_clipped), lambda high: make_clipped(high * 1)]
+)
+def test_wrappers_that_a_registered_function_adds_are_not_added_again(entry_point, tmp_path, monkeypatch):
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", gymnasium.registry.copy())
+    monkeypatch.setattr(gymnasium, "registry", gymnasium.envs.registration.registry)
+    gymnasium.register("Clipped-v0", entry_point=entry_point, max_episode_steps=9)
+    env = Scaled(gymnasium.make("Clipped-v0", high=0.25), 3)
+    rec = record_steps(runner.record(env, tmp_path))
+    maker = maker_of(rec)
+    assert (maker.reason, maker.assumed, maker.inner_wrappers) == ("", (), 2)
+    assert [one["name"] for one in json.loads(maker.spec)["additional_wrappers"]] == ["Scaled"]
+    with open_recording(rec.run.recording) as recording:
+        assert not any(steps.difference for steps in redo(recording, trust=True))
+    bare = maker_of(record_steps(runner.record(gymnasium.make("Clipped-v0", high=1).unwrapped, tmp_path)))
+    assert bare.assumed == (name_of(entry_point),)  # whether the wrappers were left out is not known
+
+
+def test_no_reason_holds_an_address_of_memory(tmp_path):
+    env = make_pole()
+    env.unwrapped.spec = replace(env.unwrapped.spec, entry_point=lambda: None)
+    assert re.search(
+        r"test_no_.*lambda> cannot be imported by name", maker_of(runner.record(env, tmp_path)).reason
+    )
+
+
+def test_assumed_arguments_never_make_a_difference(tmp_path):
+    same = record_steps(runner.record(Rounded(make_pole(), 3), tmp_path))
+    assert verify_by_redoing(same.run.recording, trust=True).verdict == "reproduced"
+    other = record_steps(runner.record(Padded(make_pole(), 3), tmp_path))
+    outcome = verify_by_redoing(other.run.recording, trust=True)
+    assert (outcome.verdict, outcome.difference is None) == ("impossible", False)
+    assert "Padded could not be recorded" in outcome.reason
+    assert 'make="module:function"' in outcome.reason
 
 
 def test_videos_are_not_made_again(tmp_path, monkeypatch):
@@ -154,6 +278,7 @@ def test_a_game_is_made_by_the_function_of_its_module(tmp_path):
     assert (maker.kind, maker.reason, maker.registered_by) == ("pettingzoo", "", "mpe2")
     assert spec["entry_point"] == "mpe2.simple_spread.simple_spread:parallel_env"
     assert spec["kwargs"]["N"] == 2
+    assert maker.assumed == ()
     own = maker_of(runner.record_parallel(Leaving(), tmp_path))
     assert json.loads(own.spec) == {"entry_point": "tests.runner.loops.making:Leaving", "kwargs": {}}
 

@@ -12,8 +12,10 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
+from dualtaxi import Rewards
 from dualtaxi.parallel import DualTaxiParallelEnv
 from runner.errors import EnvironmentNotUsable
+from runner.execution.redo import verify_by_redoing
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import Recording, open_recording
@@ -315,3 +317,12 @@ def test_options_are_recorded_as_they_were_before_a_game_took_them(tmp_path):
     with open_recording(rec.run.recording) as recording:
         (info,) = recording.decoded(schema.TRAIN_INFO)
     assert json.loads(info["json"])["reset"] == {"options": {"map": "small"}}
+
+
+def test_a_game_is_made_with_the_arguments_it_had(tmp_path):
+    rewards = Rewards(step=-3.0)
+    game = DualTaxiParallelEnv(max_steps=30, rewards=rewards, slip=0.25)
+    with runner.record_parallel(game, tmp_path) as rec:
+        parallel(rec, 2)
+    outcome = verify_by_redoing(rec.run.recording, trust=True)
+    assert (outcome.verdict, outcome.steps, outcome.assumed) == ("reproduced", 60, ())

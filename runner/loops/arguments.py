@@ -1,0 +1,187 @@
+"""The arguments with which an environment, a game or a wrapper was made, read from the object."""
+
+from __future__ import annotations
+
+import ast
+import dis
+import inspect
+import sys
+import textwrap
+from collections import Counter
+from collections.abc import Mapping
+from functools import cache
+from typing import Any, Final
+
+import numpy as np
+from gymnasium.utils import EzPickle, RecordConstructorArgs
+
+from runner.replay.makers import class_name
+
+_SHOWN: Final = "render_mode"
+"""A parameter that changes no step."""
+_COPIES: Final = frozenset({"bool", "dict", "float", "int", "list", "str", "tuple"})
+"""Functions whose result makes the same object as their argument."""
+VARIABLE: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+_UNKNOWN: Final = object()
+
+
+class CannotBeMade(Exception):
+    """Why a part of the environment cannot be made again."""
+
+
+def arguments_of(made: object, inner: str = "") -> tuple[dict[str, object], bool]:
+    """Return the keyword arguments with which an object was made, and whether all are certain.
+
+    They are certain where the constructor records them, by `RecordConstructorArgs` or `EzPickle`, or keeps
+    each unchanged in an attribute that nothing else in the class sets. An attribute with the name of a
+    parameter, or else the default, is likely, but not certain.
+
+    Args:
+        inner: the parameter for the wrapped environment, which is left out; empty if there is none.
+
+    Raises:
+        CannotBeMade: an argument is unknown and has no default.
+    """
+    kind: Any = type(made)
+    parameters = inspect.signature(kind).parameters
+    recorded, kept = _recorded(made, parameters), _kept(kind)
+    kwargs, is_certain = dict(recorded), True
+    if inner and inner not in parameters:
+        raise CannotBeMade(f"{class_name(made)} does not record its arguments: it has no parameter {inner}")
+    for name, parameter in parameters.items():
+        if name in (inner, _SHOWN) or name in recorded:
+            continue
+        if parameter.kind in VARIABLE:
+            is_certain = is_certain and bool(recorded)
+            continue
+        names = (kept[name],) if name in kept else (name, f"_{name}")
+        values = (getattr(made, attribute, _UNKNOWN) for attribute in names)
+        value = next((value for value in values if name in kept or is_plain(value)), _UNKNOWN)
+        if value is parameter.default and not is_plain(value):
+            continue
+        is_certain = is_certain and name in kept
+        if value is not _UNKNOWN:
+            kwargs[name] = value
+        elif parameter.default is parameter.empty:
+            raise CannotBeMade(f"{class_name(made)} does not record its arguments: {name} is unknown")
+    return {name: value for name, value in kwargs.items() if name not in (inner, _SHOWN)}, is_certain
+
+
+def _recorded(made: Any, parameters: Mapping[str, inspect.Parameter]) -> dict[str, object]:
+    """Return the arguments that an object's own constructor records, not only that of a base class."""
+    names = getattr(getattr(inspect.unwrap(type(made).__init__), "__code__", None), "co_names", ())
+    arguments: dict[str, object] = {}
+    if "RecordConstructorArgs" in names and isinstance(made, RecordConstructorArgs):
+        arguments = made._saved_kwargs
+    elif "EzPickle" in names and isinstance(made, EzPickle):
+        arguments = dict(zip(parameters, made._ezpickle_args, strict=False)) | made._ezpickle_kwargs
+    kinds = {parameter.kind for parameter in parameters.values()}
+    is_complete = inspect.Parameter.VAR_KEYWORD in kinds or arguments.keys() <= parameters.keys()
+    return arguments if is_complete and inspect.Parameter.VAR_POSITIONAL not in kinds else {}
+
+
+@cache
+def _kept(kind: type[Any]) -> dict[str, str]:
+    """Return the attribute in which a constructor keeps a parameter unchanged, by parameter."""
+    constructor = kind.__init__
+    try:
+        function = ast.parse(textwrap.dedent(inspect.getsource(constructor))).body[0]
+    except (OSError, TypeError, SyntaxError):  # it is in no file, or not written in Python
+        return {}
+    if not isinstance(function, ast.FunctionDef) or function.decorator_list or not function.args.args:
+        return {}
+    own = function.args.args[0].arg
+    stored = Counter(
+        node.id if isinstance(node, ast.Name) else f".{node.attr}"
+        for node in ast.walk(function)
+        if isinstance(node, ast.Name | ast.Attribute) and not isinstance(node.ctx, ast.Load)
+    )
+    kept: dict[str, str] = {}
+    for statement in function.body:
+        if not isinstance(statement, ast.Assign | ast.AnnAssign):
+            continue
+        value = statement.value
+        if isinstance(value, ast.Call) and ast.unparse(value.func) in _COPIES and len(value.args) == 1:
+            value = value.args[0]
+        for target in statement.targets if isinstance(statement, ast.Assign) else [statement.target]:
+            if isinstance(value, ast.Name) and isinstance(target, ast.Attribute):
+                is_own = ast.unparse(target.value) == own and stored[f".{target.attr}"] == 1
+                kept |= {value.id: target.attr} if is_own and not stored[value.id] else {}
+    others = (method for base in kind.__mro__ for method in vars(base).values() if method is not constructor)
+    changed = {
+        instruction.argval
+        for method in others
+        if inspect.isfunction(method) and not set(kept.values()).isdisjoint(method.__code__.co_names)
+        for instruction in dis.get_instructions(method)
+        if instruction.opname == "STORE_ATTR"
+    }
+    return {name: attribute for name, attribute in kept.items() if attribute not in changed}
+
+
+def plain_kwargs(kwargs: Mapping[str, object], owner: str) -> dict[str, object]:
+    """Return keyword arguments that JSON can hold.
+
+    Raises:
+        CannotBeMade: it cannot hold one.
+    """
+    for name, value in kwargs.items():
+        if not is_plain(value):
+            raise CannotBeMade(
+                f"{owner} has the argument {name}, of {class_name(value)}, which JSON cannot hold"
+            )
+    return dict(kwargs)
+
+
+def is_plain(value: object) -> bool:
+    """Return whether JSON can hold a value, with `plain_number` for the numbers of NumPy."""
+    try:
+        return _is_plain(value)
+    except RecursionError:
+        return False
+
+
+def _is_plain(value: object) -> bool:
+    if isinstance(value, list | tuple):
+        return all(map(_is_plain, value))
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and _is_plain(part) for key, part in value.items())
+    return value is None or isinstance(value, str | int | float | np.number | np.bool_)
+
+
+def plain_number(value: np.generic) -> object:
+    """Return a number of NumPy as JSON holds it."""
+    return value.item()
+
+
+def factory_of(made: Any) -> tuple[str, dict[str, object], bool]:
+    """Return the function of a module that made an object, with its arguments, as those of `arguments_of`.
+
+    It is known by a function or class that was defined in it and given to the object, and its arguments by
+    the variables which that uses.
+
+    Raises:
+        CannotBeMade: there is none, or an argument is unknown and has no default.
+    """
+    kind: Any = type(made)
+    given = (getattr(made, attribute, None) for attribute in _kept(kind).values())
+    for local in given:
+        name, is_local, _ = getattr(local, "__qualname__", "").partition(".<locals>")
+        function = getattr(sys.modules.get(getattr(local, "__module__", "")), name, None)
+        if is_local and inspect.isfunction(function):
+            break
+    else:
+        raise CannotBeMade(f"the wrapper {class_name(made)} does not record its arguments")
+    _, *parameters = inspect.signature(function).parameters.values()
+    methods = vars(local).values() if isinstance(local, type) else [local]
+    cells = {
+        variable: cell
+        for method in filter(inspect.isfunction, methods)
+        for variable, cell in zip(method.__code__.co_freevars, method.__closure__ or (), strict=True)
+    }
+    kwargs = {each.name: cells[each.name].cell_contents for each in parameters if each.name in cells}
+    if any(each.default is each.empty for each in parameters if each.name not in cells):
+        raise CannotBeMade(f"{function.__module__}:{name} does not record its arguments")
+    changed = {each.argval for each in dis.get_instructions(function) if each.opname == "STORE_DEREF"}
+    is_certain = len(kwargs) == len(parameters) and changed.isdisjoint(kwargs)
+    path = f"{function.__module__}:{name}"
+    return path, plain_kwargs(kwargs, path), is_certain
