@@ -43,7 +43,7 @@ def wrappers_as_fields(wrappers: Sequence[Any], spec: object, assumed: list[str]
     if isinstance(spec, EnvSpec) and not isinstance(_creator_of(spec), type):
         firsts = [at for at, each in enumerate(left) if type(each) in (PassiveEnvChecker, OrderEnforcing)]
         inner = next(iter(firsts), 0)
-        if not firsts:  # `gymnasium.make` was told to leave both out, or only what is inside was taken
+        if not firsts:  # both were left out, or only an inner environment is recorded
             assumed.append(name_of(spec.entry_point))
     del left[:inner]
     checker = left.pop(0) if left and type(left[0]) is PassiveEnvChecker else None
