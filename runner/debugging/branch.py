@@ -14,7 +14,7 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -267,6 +267,7 @@ class _Player:
             task.seed,
             action_in_words(self._space, self._action, names),
         )
+        settings = recording.config.get("config")
         wrap: Callable[..., Any] = record_parallel if self._is_game else record
         with trusting(recording.path, maker, task.trust) as is_trusted, marking_nothing(not is_trusted):
             self.rec = stepper.env = wrap(
@@ -274,7 +275,7 @@ class _Player:
                 self._folder,
                 name=task.name or f"{recording.name[:90]}.branch",
                 seed=recording.seed,
-                config={"origin": self.origin},
+                config={**(settings if isinstance(settings, Mapping) else {}), "origin": self.origin},
                 make=maker.make if is_trusted and maker.make else None,
             )
         self.rec._enter(self.phase)

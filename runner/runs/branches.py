@@ -9,8 +9,8 @@ from typing import Final
 from runner.util.humanize import counted, setting
 from runner.util.values import Json, flatten, is_whole
 
-PATHS: Final = ("config.origin.", "branches")
-"""What the paths of origins in configurations begin with."""
+PATHS: Final = ("config.origin", "branches")
+"""The paths of origins in configurations."""
 _MAX_NUMBER: Final = 2**62
 
 
@@ -75,10 +75,20 @@ Origin = BranchOrigin | TrainingOrigin
 
 
 def training_branches(config: Mapping[str, object]) -> list[TrainingOrigin]:
-    """Return the branches that led to the job with this configuration, the first one first."""
-    branches = config.get("branches")
-    origins = map(parse_origin, branches) if isinstance(branches, list) else ()
-    return [origin for origin in origins if isinstance(origin, TrainingOrigin)]
+    """Return the branches that led to the job with this configuration, the first one first.
+
+    A branch stores whole sections, such as `quirks`; the origin has the settings that it changed.
+    """
+    branches, origins = config.get("branches"), []
+    for origin in map(parse_origin, branches if isinstance(branches, list) else ()):
+        if isinstance(origin, TrainingOrigin):
+            held = flatten(config)
+            for earlier in sorted(origins, key=lambda other: other.step):
+                held |= earlier.settings if earlier.step <= origin.step else {}
+            settings = flatten(origin.settings).items()
+            changed = {path: value for path, value in settings if path not in held or held[path] != value}
+            origins.append(replace(origin, settings=changed))
+    return origins
 
 
 def origin_in(config: Mapping[str, object]) -> Origin | None:

@@ -37,7 +37,9 @@ from runner.analysis.diff.tables import TableDiff, table_diffs
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.runs.branches import BranchOrigin, origin_in, training_branches
+from runner.runs.checkpoints import read_checkpoints
 from runner.runs.run import Run
+from runner.util.humanize import counted
 
 NOT_CONTENT: Final = ("name", "recording")
 """Keys of the configuration whose difference alone leaves the content the same."""
@@ -178,6 +180,7 @@ def _diff_loops(difference: RunDiff, a: Recording, b: Recording) -> RunDiff:
         notes.append("the environments have other spaces: no steps are compared")
     elif not difference.same_content:
         notes += [_left_out(name, one) for name, one in (("A", a), ("B", b)) if one.leaves_out_steps]
+        notes += _differing_checkpoints(a, b)
         train, evaluation = (loop_divergence(a, b, phase) for phase in ("train", "eval"))
         digests = [recording.result.topic_digests for recording in (a, b)]
         if train is evaluation is None and all(digests):
@@ -193,6 +196,23 @@ def _diff_loops(difference: RunDiff, a: Recording, b: Recording) -> RunDiff:
         if (train or evaluation) and not explained:
             notes.append("how a loop learns is not recorded, so only where they diverge is known, not why")
     return replace(difference, divergence=train, evaluation_divergence=evaluation, notes=notes)
+
+
+def _differing_checkpoints(a: Recording, b: Recording) -> list[str]:
+    """Return which checkpoint of both runs is the first whose content differs, as a note; none if none is."""
+    ours, theirs = (
+        {
+            (checkpoint.phase, checkpoint.reference): checkpoint.digest
+            for checkpoint in read_checkpoints(recording, recording.path.parent)
+        }
+        for recording in (a, b)
+    )
+    shared = [key for key in ours if key in theirs]
+    differing = [key for key in shared if ours[key] != theirs[key]]
+    if not differing:
+        return []
+    count = f"{len(differing):,} of {counted(len(shared), 'checkpoint')}"
+    return [f"{count} of both runs differ, the first of them {differing[0][1]}"]
 
 
 def _left_out(name: str, recording: Recording) -> str:
@@ -279,18 +299,24 @@ def _values_by_path(
     """Return what differs in these fields of a `RunDiff`, nothing for the others, and what is alike."""
     jobs = a.has_tables and b.has_tables
     values = {
-        "config": [
-            {key: value for key, value in one.config.items() if key != "seeds"}
-            | {"seed": one.seed}
-            | ({"branches": ", then ".join(f"{each.run} {each}" for each in branches)} if branches else {})
-            for one in (a, b)
-            for branches in [training_branches(one.config)]
-        ],
+        "config": [_settings(one) for one in (a, b)],
         "provenance": [one.provenance for one in (a, b)],
         "costs": [_costs(one) | ({} if jobs else loop_means(one)) for one in (a, b)],
     }
     changes = {name: changes_in(*values[name]) if name in names else [] for name in _BY_PATH}
     return changes, {name: equal_values(*values[name]) for name in names}
+
+
+def _settings(recording: Recording) -> dict[str, object]:
+    """Return the configuration of a run, in which a branch has its origin as one text."""
+    config = {key: value for key, value in recording.config.items() if key != "seeds"}
+    config["seed"] = recording.seed
+    origin, loop = origin_in(recording.config), config.get("config")
+    if branches := training_branches(recording.config):
+        config["branches"] = ", then ".join(f"{branch.run} {branch}" for branch in branches)
+    elif origin is not None and isinstance(loop, Mapping):
+        config["config"] = {**loop, "origin": f"{origin.run} {origin}"}
+    return config
 
 
 def _costs(recording: Recording) -> dict[str, object]:

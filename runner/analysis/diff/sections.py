@@ -73,7 +73,7 @@ def summary(difference: RunDiff) -> str:
     settings = [
         change
         for change in difference.config
-        if change.path.split(".")[0] not in NOT_CONTENT and not (is_branch and change.path.startswith(PATHS))
+        if change.path.split(".")[0] not in NOT_CONTENT and not (is_branch and change.path in PATHS)
     ]
     if settings:
         named = [f"{c.path} ({setting(c.a)} in A, {setting(c.b)} in B)" for c in settings]

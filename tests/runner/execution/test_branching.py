@@ -209,6 +209,19 @@ def test_a_branch_of_a_branch_names_both(parent, tmp_path):
     )
 
 
+def test_a_branch_names_the_settings_that_changed_alone(parent, tmp_path):
+    late, early = middle_of(parent, 0.7), middle_of(parent, 0.3)
+    first = branch_training(
+        parent, at=late, overrides=["quirks.second_table_uses_first_action=true"], recordings=tmp_path
+    )
+    second = branch_training(
+        first.run, at=early, overrides=["quirks.bootstrap_after_termination=true"], recordings=tmp_path
+    )
+    assert first.origin.changes.startswith("quirks.second_table_uses_first_action true")
+    assert second.origin.changes.startswith("quirks.bootstrap_after_termination true")
+    assert "epsilon_exploits" not in first.origin.changes + second.origin.changes
+
+
 def test_an_interrupted_branch_is_resumed(parent, tmp_path):
     step, options = middle_of(parent, 0.2), {"overrides": ["epsilon=0.8"], "recordings": tmp_path}
     whole = branch_training(parent, at=step, **options).run

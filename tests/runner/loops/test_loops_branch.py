@@ -164,6 +164,17 @@ def test_the_difference_of_parent_and_branch_is_the_branch(runs, tmp_path):
             assert diff(a, c).divergence is None
 
 
+def test_a_branch_carries_the_settings_of_its_parent_and_its_origin_is_one_row(tmp_path):
+    with runner.record(make("CartPole-v1"), tmp_path, name="pole", config={"lr": 3e-4}) as env:
+        list(play(env, 50, 0))
+    branch = runner.branch(env.run, at="0:5", action=0, policy="random", recordings=tmp_path)
+    again = runner.branch(branch.run, at="0:5", action=1, policy="random", recordings=tmp_path)
+    assert branch.run.file.config["config"]["lr"] == again.run.file.config["config"]["lr"] == 3e-4
+    with open_recording(env.run.recording) as a, open_recording(branch.run.recording) as b:
+        changes = {change.path: change.b for change in diff(a, b).config}
+    assert changes == {"config.origin": f"{env.run.run_id} {branch.origin}", "name": "pole.branch"}
+
+
 def test_the_command_and_what_show_lists(runs, tmp_path):
     run = recorded(tmp_path, make("CartPole-v1"), 40)
 

@@ -221,3 +221,13 @@ def test_a_loop_that_goes_on_longer_is_named_as_such(tmp_path):
         in text
     )
     assert "Note: how a loop learns is not recorded" in text
+
+
+def test_diff_compares_checkpoints_which_part_before_the_steps_do(tmp_path):
+    for name, weights in (("one", [1, 2, 3]), ("two", [1, 5, 6])):
+        with runner.record(make("CartPole-v1"), tmp_path, name=name) as env:
+            for number in range(3):
+                list(play(env, 20, 0))
+                env.checkpoint("agent", bytes([weights[number]]))
+    text = dualtaxi(tmp_path, "diff", "one", "two").stdout
+    assert "2 of 3 checkpoints of both runs differ, the first of them agent@40" in text
