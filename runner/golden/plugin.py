@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 FOLDER = "golden"
 """The folder of golden runs, next to the file of the test."""
+_PROPERTY = "golden"
+"""The name of the property of a test's report that has what the test tells."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -45,7 +47,21 @@ def golden(request: pytest.FixtureRequest, tmp_path: Path) -> Golden:
         recordings=tmp_path / "recordings",
         pages=pages if pages.is_absolute() else config.rootpath / pages,
         is_update=config.getoption("--golden-update"),
+        tell=lambda text: request.node.user_properties.append((_PROPERTY, text)),
     )
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print what the tests of golden scores have to tell, after a run that keeps them."""
+    lines = [
+        f"{report.nodeid}: {text}"
+        for report in terminalreporter.stats.get("passed", ())
+        for name, text in report.user_properties
+        if name == _PROPERTY
+    ]
+    if lines:
+        terminalreporter.section("golden scores")
+        terminalreporter.write_line("\n".join(lines))
 
 
 def _file_name(name: str) -> str:
@@ -60,9 +76,18 @@ class Golden:
         recordings: a recordings folder for this test, to run or record in.
     """
 
-    def __init__(self, folder: Path, test: str, recordings: Path, pages: Path, is_update: bool) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        test: str,
+        recordings: Path,
+        pages: Path,
+        is_update: bool,
+        tell: Callable[[str], None],
+    ) -> None:
         self.recordings = recordings
         self._folder, self._test, self._pages, self._is_update = folder, test, pages, is_update
+        self._tell = tell
 
     def same_bytes(self, run: Run, name: str = "") -> None:
         """Fail unless a run has the content of its golden run, to the last byte.
@@ -148,8 +173,9 @@ class Golden:
     ) -> None:
         """Fail unless scores are shown to be no worse than the golden ones by a margin or more.
 
-        If the true interquartile mean is worse by the margin or more, this passes with a probability of at
-        most `error_rate`; see `runner.golden.comparison.non_inferiority`.
+        If the true interquartile mean, or the mean of scores with two values, is worse by the margin or
+        more, this passes with a probability of at most `error_rate`; see
+        `runner.golden.comparison.non_inferiority`.
 
         Args:
             scores: one of each seed, higher is better; six or more.
@@ -157,7 +183,7 @@ class Golden:
             error_rate: the greatest probability to pass although it is worse by the margin or more.
             name: tells several golden scores of one test apart.
         """
-        from runner.golden.comparison import non_inferiority
+        from runner.golden.comparison import error_rates, non_inferiority
         from runner.util.files import read_object, write_object
 
         scores = [float(score) for score in scores]
@@ -166,9 +192,15 @@ class Golden:
             non_inferiority(scores, scores, margin, error_rate)  # refuses what could not be compared later
             file.parent.mkdir(parents=True, exist_ok=True)
             write_object(file, {"scores": scores})
+            alarms, misses = error_rates(scores, margin, error_rate)
+            self._tell(
+                f"with a margin of {margin:g}, scores like these fail {alarms:.0%} of the time though "
+                f"nothing changed, and pass {misses:.0%} of the time though worse by the margin"
+            )
             return
         self._require(file)
         result = non_inferiority(read_object(file, 1 << 20)["scores"], scores, margin, error_rate)
+        print(result)  # `pytest -rA` shows it of tests that pass, too
         if not result.is_shown:
             pytest.fail(
                 f"not shown to be as good as the golden scores in {file.name}.\n{result}\n{_UPDATE}",

@@ -79,6 +79,16 @@ def test_golden_runs_are_kept_next_to_the_test_and_not_written_again_while_they_
     assert contents(folder) == before
 
 
+def test_scores_tell_their_error_rates_when_kept_and_their_p_value_on_request(tmp_path):
+    scores = TESTS[: TESTS.index("def test_loop")] + TESTS[TESTS.index("def test_scores") :]
+    code, output = pytest_over(tmp_path, scores, "--golden-update")
+    assert code == 0
+    assert re.search(r"test_scores: with a margin of 2, scores like these fail \d+% of the time", output)
+    code, output = pytest_over(tmp_path, "", "-rA")
+    assert code == 0
+    assert re.search(r"IQM 20\.\d+, golden 20\.\d+, margin 2: p = ", output)
+
+
 def test_what_changed_fails_with_the_first_difference_its_cause_and_a_page(folder):
     before = contents(folder)
     code, output = pytest_over(folder, CHANGED, "--golden-pages", "pages")
