@@ -79,7 +79,8 @@ def training_branches(config: Mapping[str, object]) -> list[TrainingOrigin]:
 
     A branch stores whole sections, such as `quirks`; the origin has the settings that it changed.
     """
-    branches, origins = config.get("branches"), []
+    branches = config.get("branches")
+    origins: list[TrainingOrigin] = []
     for origin in map(parse_origin, branches if isinstance(branches, list) else ()):
         if isinstance(origin, TrainingOrigin):
             held = flatten(config)

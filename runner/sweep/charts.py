@@ -46,7 +46,7 @@ class Axis:
     """The values of a list as text; empty for a range."""
     log: bool
     values: tuple[float, ...]
-    """The value of each trial, or the number of its choice."""
+    """The value of each trial, or the number of its choice; NaN where its algorithm does not use it."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,11 @@ def picture_of(results: Results) -> Picture:
     at = f"first at {objective.level:g}, episodes" if objective.at == "first_over" else objective.at
     return Picture(
         trials=drawn,
-        axes=tuple(_axis(path, parameter, drawn) for path, parameter in parameters.items()),
+        axes=tuple(
+            _axis(path, parameter, drawn)
+            for path, parameter in parameters.items()
+            if any(path in trial.values for trial in drawn)
+        ),
         objective=f"{objective.metric}, {at}",
         lower_is_better=objective.direction == "minimize",
         log=min(values) > 0 and max(values) > 30 * min(values),
@@ -147,9 +151,14 @@ def _nothing_to_draw(results: Results) -> str:
 
 def _axis(path: str, parameter: Range | list[object], trials: Sequence[Ranked]) -> Axis:
     if isinstance(parameter, Range):
-        return Axis(path, (), parameter.log, tuple(float(trial.values[path]) for trial in trials))
+        return Axis(
+            path, (), parameter.log, tuple(float(trial.values.get(path, math.nan)) for trial in trials)
+        )
     choices = [json.dumps(choice) for choice in parameter]
-    numbers = tuple(float(choices.index(json.dumps(trial.values[path]))) for trial in trials)
+    numbers = tuple(
+        float(choices.index(json.dumps(trial.values[path]))) if path in trial.values else math.nan
+        for trial in trials
+    )
     return Axis(path, tuple(map(value_text, parameter)), False, numbers)
 
 
@@ -195,8 +204,9 @@ def parameter_chart(picture: Picture, axis: Axis) -> Chart:
 
     Pruned trials are hollow.
     """
-    values, x = np.array(picture.values), np.array(axis.values)
-    ranges = np.array(picture.ranges)
+    is_used = ~np.isnan(axis.values)
+    values, x = np.array(picture.values)[is_used], np.array(axis.values)[is_used]
+    ranges = np.array(picture.ranges)[is_used]
     labels = [textwrap.shorten(choice, 24) for choice in axis.choices]
     slanted = sum(map(len, labels)) > 28
     bottom, height = (144.0, 210.0) if slanted else (146.0, 187.0)
@@ -211,10 +221,12 @@ def parameter_chart(picture: Picture, axis: Axis) -> Chart:
     chart.frame(axis.path, 14.0, "", [*textwrap.wrap(picture.objective, 30)[:2], f"({better} is better)"])
     for place, ends in zip(chart.x(x).tolist(), chart.y(ranges).tolist(), strict=True):
         chart.shape([(place, end) for end in ends], stroke=_TRIAL, width=0.8, opacity=0.25)
-    is_finished = np.array([trial.state == "finished" for trial in picture.trials[1:]], dtype=np.bool_)
-    for chosen, hollow in ((is_finished, False), (~is_finished, True)):
-        chart.markers(x[1:][chosen], values[1:][chosen], _TRIAL, 0, 1.7, opacity=0.6, hollow=hollow)
-    chart.markers(x[:1], values[:1], _BEST, 3, 4.0)
+    is_best = (np.arange(len(is_used)) == 0)[is_used]
+    is_finished = np.array([trial.state == "finished" for trial in picture.trials])[is_used]
+    for state, hollow in ((is_finished, False), (~is_finished, True)):
+        drawn = state & ~is_best
+        chart.markers(x[drawn], values[drawn], _TRIAL, 0, 1.7, opacity=0.6, hollow=hollow)
+    chart.markers(x[is_best], values[is_best], _BEST, 3, 4.0)
     return chart
 
 
@@ -227,8 +239,8 @@ def parallel_chart(picture: Picture) -> Chart:
     chart = Chart(x, Scale(-0.05, 1.05, 186.0, 24.0), 590.0, 216.0, "The trials in parallel coordinates")
     colours = palette.ramp_colours(len(lines))
     for number in range(len(lines) - 1, -1, -1):
-        chart.line(places, lines[number], colours[number], width=0.9, opacity=0.7)
-    chart.line(places, lines[0], _BEST, width=2.2)
+        _trial_line(chart, lines[number], colours[number], 0.9, 0.7)
+    _trial_line(chart, lines[0], _BEST, 2.2, 1.0)
     title = "Each trial is a line, the best one thick; dark lines are better than light ones"
     chart.text(10.0, 14.0, title, size=9.5, bold=True)
     names = [*(axis.path for axis in picture.axes), picture.objective]
@@ -244,6 +256,13 @@ def parallel_chart(picture: Picture) -> Chart:
     return chart
 
 
+def _trial_line(chart: Chart, heights: Values, colour: str, width: float, opacity: float) -> None:
+    """Draw a trial over the parameters that it uses."""
+    is_used = ~np.isnan(heights)
+    places = np.flatnonzero(is_used).astype(np.float64)
+    chart.line(places, heights[is_used], colour, width=width, opacity=opacity)
+
+
 def _label_column(
     chart: Chart, column: int, values: Sequence[float], log: bool, choices: tuple[str, ...]
 ) -> None:
@@ -252,7 +271,7 @@ def _label_column(
         heights = _unit(np.arange(len(choices), dtype=np.float64), False, choices)
         labels = list(zip(heights, (textwrap.shorten(choice, 18) for choice in choices), strict=True))
     else:
-        ends = np.array([min(values), max(values)])
+        ends = np.array([np.nanmin(values), np.nanmax(values)])
         labels = list(zip(_unit(ends, log, ()), (f"{end:,.4g}" for end in ends), strict=True))
     for height, text in dict(labels).items():
         chart.text(chart.x.at(column) + 5, chart.y.at(float(height)) + 2.8, text, size=SMALL, halo=True)
@@ -263,8 +282,10 @@ def _unit(values: Values, log: bool, choices: tuple[str, ...]) -> Values:
     if choices:
         return values / max(len(choices) - 1, 1)
     scaled = np.log(values) if log else values
-    width = scaled.max() - scaled.min()
-    return np.asarray((scaled - scaled.min()) / width) if width else np.full(len(values), 0.5)
+    lowest, highest = np.nanmin(scaled), np.nanmax(scaled)
+    if lowest == highest:
+        return np.where(np.isnan(scaled), np.nan, 0.5)
+    return np.asarray((scaled - lowest) / (highest - lowest))
 
 
 # --- the page -----------------------------------------------------------------------------------------

@@ -48,7 +48,7 @@ class Plan:
 
 def plan_of(sweep: Sweep) -> Plan:
     """Return what a sweep will take, measured by its first trial with one episode."""
-    search = Search(sweep.file)
+    search = Search(sweep)
     is_grid = sweep.file.strategy == "grid"
     configs: list[ExperimentConfig] = []
     errors: list[ConfigError] = []

@@ -18,8 +18,9 @@ from runner.analysis.compare import statistics
 from runner.analysis.compare.statistics import Estimate, bounded
 from runner.analysis.sections import Grid, Section
 from runner.sweep.importance import Effect, effects_of, effects_of_grid
-from runner.sweep.model import Sweep
+from runner.sweep.model import Range, Sweep
 from runner.sweep.trials import State, Trial, Trials, best_of, recorded_trials
+from runner.util.humanize import UNKNOWN
 from runner.util.values import Json
 
 DEFAULT_SHOWN: Final = 20
@@ -82,8 +83,12 @@ class Results:
         parameters = self.sweep.file.parameters
         if self.is_whole_grid:
             return effects_of_grid(parameters, [list(trial.seed_values.values()) for trial in self.suggested])
+        unused = {
+            path: parameter.low if isinstance(parameter, Range) else parameter[0]
+            for path, parameter in parameters.items()
+        }
         completed = [
-            (trial.values, trial.value)
+            (unused | trial.values, trial.value)
             for trial in self.suggested
             if trial.state == "finished" and trial.value is not None and _is_reached(trial.value)
         ]
@@ -254,7 +259,10 @@ def _ranking_grid(sweep: Sweep, ranked: Sequence[Ranked]) -> Grid:
                 objective_text(entry.median),
                 _between(entry.low, entry.high),
                 *((objective_text(iqm.value), _between(iqm.low, iqm.high)) if has_means else ()),
-                *(value_text(value) for value in entry.values.values()),
+                *(
+                    value_text(entry.values[path]) if path in entry.values else UNKNOWN
+                    for path in sweep.file.parameters
+                ),
                 entry.state,
             )
         )

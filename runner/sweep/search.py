@@ -7,11 +7,11 @@ continues as if undisturbed; nothing of it is stored.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import ModuleType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from runner.sweep.model import Parameter, Range, SweepFile
+from runner.sweep.model import Parameter, Range, Sweep
 from runner.util.extras import require
 
 if TYPE_CHECKING:
@@ -31,16 +31,17 @@ def require_optuna() -> ModuleType:
 
 
 class Search:
-    """Suggests values for trials."""
+    """Suggests values for trials; a grid or `tpe` suggests the values of a configuration once."""
 
-    def __init__(self, file: SweepFile) -> None:
+    def __init__(self, sweep: Sweep) -> None:
         self._optuna = require_optuna()
-        self._file = file
+        self._sweep, self._file = sweep, (file := sweep.file)
         self._space = {path: self._distribution(parameter) for path, parameter in file.parameters.items()}
         self._study = self._optuna.create_study(sampler=self._sampler(), direction=file.objective.direction)
         self._asked_trials: list[Trial] = []
         self._suggested: set[str] = set()
-        self.trials = file.trials or file.grid_points
+        self._points = self._distinct_points() if file.strategy == "grid" else []
+        self.trials = file.trials or len(self._points)
         """The number of trials of the whole search."""
 
     def ask(self, count: int) -> list[dict[str, object]]:
@@ -48,17 +49,17 @@ class Search:
         suggested = []
         for number in range(len(self._asked_trials), min(len(self._asked_trials) + count, self.trials)):
             if self._file.strategy == "grid":
-                self._study.enqueue_trial(self._grid_point(number))
+                self._study.enqueue_trial(self._grid_point(self._points[number]))
             trial, values = self._draw()
             if self._file.strategy == "tpe" and not self._file.repeats:
                 # The same values would give the same runs, from which the search learns nothing.
                 for _ in range(_MAX_DRAWS):
-                    if json.dumps(values, sort_keys=True) not in self._suggested:
+                    if self._identity(values) not in self._suggested:
                         break
                     self._study.tell(trial, state=self._optuna.trial.TrialState.FAIL)
                     trial, values = self._draw()
             self._asked_trials.append(trial)
-            self._suggested.add(json.dumps(values, sort_keys=True))
+            self._suggested.add(self._identity(values))
             suggested.append(values)
         return suggested
 
@@ -78,12 +79,30 @@ class Search:
     def _draw(self) -> tuple[Trial, dict[str, object]]:
         """Return the next trial of Optuna and its values; choices are JSON there."""
         trial = self._study.ask(self._space)
-        return trial, {
-            path: parameter.nearest(trial.params[path])
+        return trial, self._values(trial.params)
+
+    def _values(self, params: Mapping[str, Any]) -> dict[str, object]:
+        """Return Optuna's values of the parameters as those of a configuration."""
+        return {
+            path: parameter.nearest(params[path])
             if isinstance(parameter, Range)
-            else json.loads(trial.params[path])
+            else json.loads(params[path])
             for path, parameter in self._file.parameters.items()
         }
+
+    def _identity(self, values: Mapping[str, object]) -> str:
+        """Return a text that values have in common with those that differ in unused parameters alone."""
+        return json.dumps(self._sweep.applicable(values), sort_keys=True)
+
+    def _distinct_points(self) -> Sequence[int]:
+        """Return the points of the grid, the first of those that differ in unused parameters alone."""
+        points = range(self._file.grid_points)
+        if "algorithm" not in self._file.parameters:
+            return points  # all parameters are used
+        firsts: dict[str, int] = {}
+        for number in points:
+            firsts.setdefault(self._identity(self._values(self._grid_point(number))), number)
+        return list(firsts.values())
 
     def _grid_point(self, number: int) -> dict[str, object]:
         """Return a point of the grid, the last parameter changing fastest, as values for Optuna."""

@@ -24,7 +24,7 @@ State = Literal["finished", "pruned", "unfinished", "failed", "excluded"]
 
 @dataclass
 class Trial:
-    """Values of the parameters, and the results of their runs."""
+    """Values of the parameters that its algorithm uses, and the results of their runs."""
 
     number: int
     values: Json
@@ -81,7 +81,7 @@ class Trials:
 
     def __init__(self, sweep: Sweep) -> None:
         self.sweep = sweep
-        self.search = Search(sweep.file)
+        self.search = Search(sweep)
         self.done: list[Trial] = []
         """The trials of the batches that are over."""
         adaptive = sweep.file.strategy in ("tpe", "genetic") or sweep.file.pruning is not None
@@ -90,7 +90,8 @@ class Trials:
     def ask(self) -> list[Trial]:
         """Return the next batch; empty at the end."""
         batch = []
-        for number, values in enumerate(self.search.ask(self._batch_size), start=len(self.done)):
+        for number, suggested in enumerate(self.search.ask(self._batch_size), start=len(self.done)):
+            values = self.sweep.applicable(suggested)
             try:
                 config = self.sweep.config(values).to_mapping()
             except ConfigError as error:

@@ -200,13 +200,13 @@ def _diff_loops(difference: RunDiff, a: Recording, b: Recording) -> RunDiff:
 
 def _differing_checkpoints(a: Recording, b: Recording) -> list[str]:
     """Return which checkpoint of both runs is the first whose content differs, as a note; none if none is."""
-    ours, theirs = (
+    ours, theirs = [
         {
             (checkpoint.phase, checkpoint.reference): checkpoint.digest
             for checkpoint in read_checkpoints(recording, recording.path.parent)
         }
         for recording in (a, b)
-    )
+    ]
     shared = [key for key in ours if key in theirs]
     differing = [key for key in shared if ours[key] != theirs[key]]
     if not differing:
@@ -298,7 +298,7 @@ def _values_by_path(
 ) -> tuple[dict[str, list[Change]], dict[str, dict[str, object]]]:
     """Return what differs in these fields of a `RunDiff`, nothing for the others, and what is alike."""
     jobs = a.has_tables and b.has_tables
-    values = {
+    values: dict[str, list[Mapping[str, object]]] = {
         "config": [_settings(one) for one in (a, b)],
         "provenance": [one.provenance for one in (a, b)],
         "costs": [_costs(one) | ({} if jobs else loop_means(one)) for one in (a, b)],

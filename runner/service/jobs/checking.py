@@ -110,7 +110,7 @@ def _check_sweep(text: str, source: str, document: Document, recordings: Path) -
         if path.split(".")[0] == "initial_q" and isinstance(choices, list):
             starts |= {("parameters", path, i): choice for i, choice in enumerate(choices)}
     _refuse_paths(starts, document)
-    values, runs = sweep.to_mapping(), Search(sweep.file).trials * len(sweep.seeds)
+    values, runs = sweep.to_mapping(), Search(sweep).trials * len(sweep.seeds)
     if sweep.name in sweeps_in(recordings):
         before = state.read_sweep(sweep.name, recordings).to_mapping()
         if differing := ", ".join(key for key, _, _ in state.differences(before, values)):

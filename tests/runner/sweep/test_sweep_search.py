@@ -6,21 +6,23 @@ import math
 
 import numpy as np
 import pytest
-from sweeping import described
+from sweeping import described, swept
 
 from runner import sweep as names
 from runner.recording.reader import Recording, open_recording
 from runner.sweep import state
+from runner.sweep.charts import picture_of, picture_plots
 from runner.sweep.loading import from_values
-from runner.sweep.model import Objective, SweepFile
+from runner.sweep.model import Objective
 from runner.sweep.objective import curve_of, pruning_bounds, should_prune, value_of
+from runner.sweep.results import results_of, sections
 from runner.sweep.search import Search
 
 CURVE = {0: 0.0, 100: 40.0, 200: 80.0, 300: 60.0}
 
 
 def searched(**changes):
-    return Search(SweepFile.model_validate(described(**changes)))
+    return Search(from_values(described(**changes)))
 
 
 def test_a_grid_has_all_points_in_order():
@@ -131,7 +133,7 @@ def test_exact_measures_belong_to_their_own_evaluation(done, monkeypatch):
 def test_tpe_repeats_no_values_while_there_are_others():
     def tried(**changes):
         parameters = {"step_size": [0.1, 0.2, 0.3, 0.4], "discount": [0.5, 0.7, 0.9]}
-        search = Search(from_values(described(trials=12, batch=4, parameters=parameters, **changes)).file)
+        search = Search(from_values(described(trials=12, batch=4, parameters=parameters, **changes)))
         found = []
         while batch := search.ask(4):
             for values in batch:
@@ -142,6 +144,27 @@ def test_tpe_repeats_no_values_while_there_are_others():
     assert len(tried()) == 12
     assert len(set(tried())) > len(set(tried(repeats=True)))
     assert tried() == tried()
+
+
+@pytest.mark.parametrize("changes", [{"strategy": "grid", "trials": None}, {"trials": 4}])
+def test_parameters_that_an_algorithm_does_not_use_spend_no_trials(changes, tmp_path):
+    parameters = {
+        "algorithm": ["q_learning", "wolf_phc"],
+        "wolf_phc.lose": [0.1, 0.2, 0.4],
+    }
+    sweep = from_values(described(parameters=parameters, seeds=[0], batch=4, **changes))
+    swept(tmp_path, sweep)
+    results = results_of(sweep, tmp_path)
+    assert sorted(map(str, (trial.values for trial in results.ranking))) == [
+        str({"algorithm": "q_learning"}),
+        *(str({"algorithm": "wolf_phc", "wolf_phc.lose": lose}) for lose in (0.1, 0.2, 0.4)),
+    ]
+    assert results.trials == len(results.suggested) == 4
+    rows = {row[-3]: row[-2] for row in sections(results)[0].grids[0].rows}
+    assert rows["q_learning"] == "–"
+    picture = picture_of(results)
+    assert "NaN" not in "".join(plot.svg for plot in picture_plots(picture))
+    assert "nan" not in "".join(plot.svg for plot in picture_plots(picture))
 
 
 def test_an_old_sweep_without_repeats_may_repeat_values(tmp_path):
