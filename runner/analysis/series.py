@@ -68,6 +68,8 @@ class RunSeries:
     """Means over the last training episodes of a finished loop, those that `ls` and `show` average too."""
     recent_episodes: int = 0
     """Number of these episodes."""
+    is_unended: bool = False
+    """Whether no training episode of a loop ended: its length and return are those of the unfinished ones."""
 
     @property
     def finished(self) -> bool:
@@ -182,7 +184,7 @@ def read_series(recording: Recording, axis: Axis = EPISODES) -> RunSeries:
     evaluations = evaluation_records(recording)
     config = recording.config
     recent: Readings = {}
-    recent_episodes = 0
+    recent_episodes, is_unended = 0, False
     if recording.has_reports:
         agents = recording.agents
         exact = {each["evaluation"]: exact_readings(each, agents) for each in recording.optimality()}
@@ -192,6 +194,7 @@ def read_series(recording: Recording, axis: Axis = EPISODES) -> RunSeries:
     else:
         readings = [_single_agent_unnamed(evaluation_readings(each)) for each in evaluations]
         training = _loop_training(recording, places, not_finite)
+        is_unended = not recording.count(schema.TRAIN_EPISODE)
         if recording.status == "finished":
             recent, recent_episodes = _recent_training(recording)
         if left_out := sum(each.not_finite for each in evaluations):
@@ -216,6 +219,7 @@ def read_series(recording: Recording, axis: Axis = EPISODES) -> RunSeries:
         environment=_environment(recording),
         recent=recent,
         recent_episodes=recent_episodes,
+        is_unended=is_unended,
     )
 
 
@@ -329,7 +333,27 @@ def _mean_episodes(
         }
         if means:
             readings["training.mean_return"] = means
+    if not by_stretch and (unfinished := _unfinished_episodes(recording)):
+        by_stretch[bins - 1] = unfinished
     return by_stretch
+
+
+def _unfinished_episodes(recording: Recording) -> Readings:
+    """Return mean length and return of training episodes of which none ended; nothing without rewards."""
+    if not recording.count(schema.TRAIN_STEP) or recording.has_actions_alone("train"):
+        return {}
+    agents, steps, total = recording.agents, 0, 0.0
+    for block in recording.rows("/train/step"):
+        steps += len(block)
+        total = total + block["rewards"].sum(axis=0, dtype=np.float64)
+    returns = np.broadcast_to(total, len(agents)) / recording.environments
+    if not np.isfinite(returns).all():
+        return {}
+    lines = agents if len(agents) > 1 else [""]
+    return {
+        "training.mean_length": {"": steps / recording.environments},
+        "training.mean_return": dict(zip(lines, returns.tolist(), strict=True)),
+    }
 
 
 def _recent_training(recording: Recording) -> tuple[Readings, int]:

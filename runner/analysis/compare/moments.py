@@ -202,6 +202,11 @@ def measured(
             without.setdefault(reason, []).append(run.run_id)
         else:
             by_seed.setdefault(seed_of(run), []).append((run.run_id, value))
+    if metric.startswith("training.mean_") and any(run.is_unended for run in group.runs):
+        unended = listed([run.run_id for run in group.runs if run.is_unended])
+        notes.append(
+            f"{group.label}: no episode ended in {unended}, so unfinished ones count as far as they got"
+        )
     notes += [f"{group.label}, left out: {listed(runs)} ({reason})" for reason, runs in without.items()]
     count = sum(map(len, by_seed.values()))
     if count > len(by_seed):

@@ -330,3 +330,35 @@ def test_training_is_compared_by_the_mean_of_the_last_100_episodes(tmp_path):
     assert "CartPole-v1: the last report of training is after 12 training episodes in short" in text
     bounds = json.loads(compared_as("--normalise", "minmax", "--json"))["tasks"]["CartPole-v1"]
     assert sorted(bounds.values()) == pytest.approx(sorted(mean.values()))
+
+
+class Balance(gymnasium.Env):
+    """Ends when the action is 0, and never otherwise."""
+
+    observation_space = gymnasium.spaces.Discrete(2)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+    def step(self, action):
+        return 0, 1.0, action == 0, False, {}
+
+
+def test_an_algorithm_that_never_ends_an_episode_keeps_its_environment(tmp_path):
+    for algorithm, period in (("good", 1000), ("bad", 10)):
+        for seed in range(2):
+            config = {"algorithm": algorithm}
+            with runner.record(Balance(), tmp_path, name=algorithm, seed=seed, config=config) as env:
+                env.reset(seed=seed)
+                for step in range(1, 101):
+                    if env.step(int(step % period > 0))[2]:
+                        env.reset()
+    arguments = ["compare", "good", "bad", "--normalise", "minmax", "--recordings", str(tmp_path), "--json"]
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 0, result.output
+    reply = json.loads(result.stdout)
+    scores = {own["label"]: own["scores"] for own in reply["algorithms"]}
+    assert [list(own.values()) for own in scores.values()] == [[[1.0, 1.0]], [[0.0, 0.0]]]
+    assert any("no episode ended in" in note for note in reply["notes"])
