@@ -13,6 +13,7 @@ limits on memory and time. `runner.replay.makers` says whether a recording can b
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -102,12 +103,18 @@ def redo_in_child(
 ) -> Iterator[RedoneSteps]:
     """Do recorded episodes again in a child process, which ends with the iterator; see `redo`.
 
-    The child works ahead of the caller by a block at most.
+    The child works ahead of the caller by a block at most. A process that is such a child does it itself, as
+    it may have none.
 
     Raises:
         CannotRedo: see `redo`; or the environment hangs, crashes, or needs more memory.
     """
-    options = {"render": render, "trust": trust, "draw_from": draw_from}
+    options: Any = {"render": render, "trust": trust, "draw_from": draw_from}
+    if multiprocessing.current_process().daemon:
+        _silence()
+        with open_recording(path) as recording:
+            yield from redo(recording, phase, episodes, **options)
+        return
     for message in stream_from_child(_redo_path, path, phase, episodes, **options):
         if isinstance(message, RedoneSteps):  # else steps taken, which show that it does not hang
             yield message
@@ -137,11 +144,15 @@ def stream_from_child(
 
 def _quietly(function: Callable[..., None], *arguments: object, **keywords: object) -> None:
     """Call a function in a child process, without what environments print: it would be mixed with results."""
+    _silence()
+    function(*arguments, **keywords)
+
+
+def _silence() -> None:
     warnings.simplefilter("ignore")
     with open(os.devnull, "wb") as nothing:  # noqa: PTH123 - a device
         for stream in (1, 2):
             os.dup2(nothing.fileno(), stream)
-    function(*arguments, **keywords)
 
 
 def _redo_path(path: Path, phase: str | None, episodes: Sequence[int] | None, **arguments: Any) -> None:

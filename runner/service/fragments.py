@@ -331,6 +331,7 @@ def difference(a: Run, b: Run) -> bytes:
     return as_json(shown_difference)
 
 
-def timeline_step(run: Run, at: StepRef | None) -> bytes:
-    """Return the step of the viewer's timeline at a step."""
-    return str(locate(run, Request(), at).time).encode()
+def viewer_place(run: Run, at: StepRef | None) -> bytes:
+    """Return the step of the viewer's timeline at a step, and its trial as a loop counts it, as JSON."""
+    location = locate(run, Request(), at)
+    return as_json({"time": location.time, "trials": location.request.trials})

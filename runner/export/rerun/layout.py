@@ -70,6 +70,8 @@ class RunView:
     has_values: bool = False
     last: int = 0
     """Steps executed in the whole run; 0 if not known yet."""
+    focus: tuple[int, int] | None = None
+    """First and last step shown where values of steps are lines; None for the whole run."""
 
     def draw_background(self, stream: rr.RecordingStream) -> None:
         """Log what never changes: cells, walls, landmarks, and the frames of table and maps."""
@@ -84,9 +86,8 @@ class RunView:
         """Return the view of the grid; without a scene that of state and action as lines."""
         if self.scene is None:
             entities = [f"{phase}/{name}" for phase in ("train", "eval") for name in ("state", "action")]
-            return self._view(
-                rrb.TimeSeriesView, f"{self.title}: state and action", entities, axis_x=whole_axis(self.last)
-            )
+            axis = time_axis(self.last, self.focus)
+            return self._view(rrb.TimeSeriesView, f"{self.title}: state and action", entities, axis_x=axis)
         bounds = rrb.VisualBounds2D(
             x_range=(-GRID_MARGIN, self.scene.columns + GRID_MARGIN),
             y_range=(-GRID_MARGIN - 0.1, self.scene.rows + GRID_MARGIN + 0.1),
@@ -171,14 +172,15 @@ def arranged(
     )
 
 
-def whole_axis(last: int) -> rrb.TimeAxis:
-    """Return a time axis from 0 to the step `last`, or to the cursor if that is 0."""
+def time_axis(last: int, focus: tuple[int, int] | None = None) -> rrb.TimeAxis:
+    """Return a time axis over `focus`, or from 0 to the step `last`, or to the cursor if that is 0."""
+    start, last = focus or (0, last)
     end = rr.TimeRangeBoundary.absolute(seq=last) if last else rr.TimeRangeBoundary.cursor_relative(seq=0)
-    return rrb.TimeAxis(view_range=rr.TimeRange(start=rr.TimeRangeBoundary.absolute(seq=0), end=end))
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=rr.TimeRangeBoundary.absolute(seq=start), end=end))
 
 
 def _plots(runs: Sequence[RunView], entities: set[str] | None) -> list[rrb.View]:
-    axis = whole_axis(max(run.last for run in runs))
+    axis = time_axis(max(run.last for run in runs))
     views: list[rrb.View] = []
     for name, paths in PLOTS:
         contents = [f"{run.root}/{path}" for run in runs for path in paths]

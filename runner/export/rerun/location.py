@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from runner.analysis.diff import can_compare_steps, divergences
 from runner.analysis.diff.sections import where_in_words
@@ -13,7 +12,7 @@ from runner.analysis.evaluations import evaluation_after
 from runner.analysis.step_reference import StepRef
 from runner.errors import NotInRecording
 from runner.export.contents import require_steps
-from runner.export.rerun.selection import Request, episodes_of, evaluations_with_steps, select
+from runner.export.rerun.selection import Request, episodes_of, evaluations_with_steps, select, time_of
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.replay.recorded import ended_episode
@@ -50,7 +49,7 @@ def locate(run: Run, request: Request, step: StepRef | None) -> Location:
             raise NotInRecording(
                 f"{recording.path}: found no t = {step.t} there; the episode has {len(steps)} steps, from 0."
             )
-        time = _time(recording, phase, steps[step.t])
+        time = time_of(recording, phase, steps[step.t])
     if request.everything:
         return Location(time, request)
     added = dataclasses.replace(
@@ -91,11 +90,5 @@ def _default_time(recording: Recording, request: Request) -> int:
     selected = select(recording, request).by_phase
     for phase in ("eval", "train"):
         if selected[phase] and recording.kind != "variable":
-            return _time(recording, phase, selected[phase][-1].start)
+            return time_of(recording, phase, selected[phase][-1].start)
     return 0
-
-
-def _time(recording: Recording, phase: str, step: int) -> int:
-    """Return the time of a step of a phase."""
-    record: Any = next(recording.blocks(schema.PHASES[phase][0], step, step + 1))[0]
-    return int(record["log_time"]) // schema.STEP_NANOSECONDS

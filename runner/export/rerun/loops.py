@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from runner.export.rerun.columns import MAX_ROWS, Batch, Sender, scalars
 from runner.export.rerun.frames import FrameSender
 from runner.export.rerun.labels import Labels
-from runner.export.rerun.layout import RunView, whole_axis
+from runner.export.rerun.layout import RunView, time_axis
 from runner.export.rerun.members import Member, entity_name, members_of, numbers_in
 from runner.export.rerun.metrics import line_colours, phase_colours, series_lines
 from runner.export.rerun.runs import Source
@@ -37,6 +37,8 @@ MAX_LOGGED: Final = 6
 """Views of logged arrays, and of logged scalars, in the blueprint; all are sent."""
 _BATCH_BYTES: Final = 64 << 20
 _OVERVIEW: Final = "Overview"
+_BY_EPISODE: Final = ("return", "length")
+"""Titles of views of whole episodes, whose time axis is that of the run."""
 
 
 class LoopExporter:
@@ -86,7 +88,10 @@ class LoopExporter:
             left.append((rrb.TextLogView(origin=f"{root}/log", name="Log"), 1))
         tabs = []
         for tab, plots in self._plots.items():
-            views = [self._plot(title, entities) for title, entities in plots.items()]
+            views = [
+                self._plot(title, entities, None if title in _BY_EPISODE else self._selection.focus)
+                for title, entities in plots.items()
+            ]
             if tab == _OVERVIEW:
                 views += [
                     rrb.BarChartView(origin=f"{root}/{entity}", name=name)
@@ -317,13 +322,13 @@ class LoopExporter:
     def _sender(self, part: str) -> Sender:
         return Sender(self._stream, f"{self._root}/{part}" if part else self._root)
 
-    def _plot(self, name: str, entities: Sequence[str]) -> rrb.View:
+    def _plot(self, name: str, entities: Sequence[str], focus: tuple[int, int] | None = None) -> rrb.View:
         contents = [f"{self._root}/{entity}" for entity in entities]
         return rrb.TimeSeriesView(
             origin=f"{self._root}/",
             contents=contents,
             name=name.replace("_", " "),
-            axis_x=whole_axis(self._last),
+            axis_x=time_axis(self._last, focus),
         )
 
     def _log(self, log_time: int, entity: str, archetype: rr.AsComponents) -> None:

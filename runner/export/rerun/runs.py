@@ -64,6 +64,7 @@ class RunExporter:
             has_steps=bool(selection.steps),
             has_values=bool(selection.steps),
             last=last,
+            focus=selection.focus,
         )
 
     def send_metrics(self) -> set[str]:

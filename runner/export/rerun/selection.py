@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,6 +94,8 @@ class Selection:
     """Evaluations with their steps; the last steps of a loop's are one, whose other fields are 0."""
     drawn: dict[str, list[int]] = field(default_factory=dict)
     """Episodes of a loop of which pictures are drawn, by phase."""
+    focus: tuple[int, int] | None = None
+    """First and last step, on the timeline, of the episodes that were asked for by number."""
     exported: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -111,7 +113,7 @@ class Selection:
 
 def select(recording: Recording, request: Request) -> Selection:
     """Return the steps of a request."""
-    selection = Selection(warnings=shortcomings(recording))
+    selection = Selection(warnings=shortcomings(recording), focus=_focus(recording, request))
     if not recording.has_tables:
         return _select_loop(recording, request, selection)
     if request.frames:
@@ -184,6 +186,34 @@ def evaluations_with_steps(recording: Recording, train: Episodes, evals: Episode
             after = int(np.searchsorted(train.stop[: train.ended], trained, side="right"))
             evaluations.append(Evaluation(after, trained, start, stop))
     return evaluations
+
+
+def time_of(recording: Recording, phase: str, step: int) -> int:
+    """Return where a step of a phase is on the timeline."""
+    record: Any = next(recording.blocks(schema.PHASES[phase][0], step, step + 1))[0]
+    return int(record["log_time"]) // schema.STEP_NANOSECONDS
+
+
+def _focus(recording: Recording, request: Request) -> tuple[int, int] | None:
+    explicit = dataclasses.replace(request, with_default=False)
+    if explicit.is_default or request.everything or not recording.has_steps or recording.kind == "variable":
+        return None
+    train, evals = (episodes_of(recording, phase) for phase in schema.PHASES)
+    trials = [np.array(request.trials, np.int64)]
+    if request.evaluations and not request.trials:
+        available, where = evaluations_with_steps(recording, train, evals), str(recording.path)
+        chosen = [evaluation_after(available, after, where) for after in request.evaluations]
+        trials += [np.arange(one.start, one.stop) for one in chosen]
+    times = [
+        time_of(recording, phase, step)
+        for phase, spans in (
+            ("train", train.steps_of(_training_episodes(recording, explicit, train.lengths))),
+            ("eval", evals.steps_of(np.concatenate(trials))),
+        )
+        for span in spans
+        for step in (span.start, span.stop - 1)
+    ]
+    return (min(times), max(times)) if times else None
 
 
 def _training_episodes(

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import os
 import pathlib
 import re
+from dataclasses import replace
 from http import HTTPStatus
 from typing import Annotated, Final
 
@@ -19,6 +22,7 @@ from runner.service import computed
 from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
 from runner.service.errors import Refused
 from runner.service.problems import BUSY_ERRORS, RUN_ERRORS
+from runner.util.processes import CallFailed
 
 router = APIRouter(
     prefix="/runs/{run}",
@@ -26,6 +30,8 @@ router = APIRouter(
     responses=RUN_ERRORS,
 )
 MEDIA: Final = "application/octet-stream"
+DRAW_SECONDS: Final = 120.0
+"""Time for an export whose pictures an environment draws; then it is made without them."""
 BLOCK: Final = 1 << 20
 """Bytes of a file that are read at a time."""
 FILE: Final[dict[int | str, dict[str, object]]] = {
@@ -113,13 +119,25 @@ async def replay(
         Query(max_length=100, description="Trials of the evaluation after this number of training episodes."),
     ] = None,
     every: Annotated[int, Query(ge=0, lt=2**31, description="One of this number of training episodes.")] = 0,
+    trials: Annotated[
+        list[int] | None,
+        Query(
+            max_length=100, description="Evaluation episodes of a loop to open at, counted over the phase."
+        ),
+    ] = None,
+    frames: Annotated[
+        bool, Query(description="Whether the environment of a loop draws the selected episodes.")
+    ] = False,
     if_none_match: IfNoneMatch = None,
 ) -> Response:
     """Return what `dualtaxi export rerun` writes; cached, so that a second request is answered at once.
 
     By default it has the steps of 20 training episodes and of the last evaluation.
     """
-    path = await replay_of([run], cache, processes, episodes, tuple(evaluations or ()), every)
+    request = Request(
+        _ranges(episodes), tuple(evaluations or ()), every, frames=frames, trials=tuple(trials or ())
+    )
+    path = await replay_of([run], cache, processes, request)
     return _file(path, f"{run.file_stem}.rrd", path.stem, if_none_match)
 
 
@@ -127,14 +145,22 @@ async def replay_of(
     runs: list[Run],
     cache: CacheOf,
     processes: ProcessesOf,
-    episodes: str = "",
-    evaluations: tuple[int, ...] = (),
-    every: int = 0,
+    request: Request,
 ) -> pathlib.Path:
-    """Return the export of some runs, made in a child process, once for all concurrent requests."""
-    request = Request(_ranges(episodes), evaluations, every)
+    """Return the export of some runs, made in a child process, once for all concurrent requests.
+
+    Without pictures if their environment hangs, crashes or needs too much memory.
+    """
+
+    async def make() -> bytes:
+        if request.frames:
+            with contextlib.suppress(CallFailed):
+                drawing = processes.submit_within(DRAW_SECONDS, computed.replay, runs, request)
+                return await asyncio.wrap_future(drawing)
+        return await processes(computed.replay, runs, replace(request, frames=False))
+
     key = ("replay", *map(recording_state, runs), request)
-    path = await cache.get_or_await(key, lambda: processes(computed.replay, runs, request), max_seconds=0)
+    path = await cache.get_or_await(key, make, max_seconds=0)
     return pathlib.Path(os.fsdecode(path))
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import http.client
+import json
 from dataclasses import dataclass
 from http import HTTPStatus
 from importlib import metadata
@@ -25,7 +26,7 @@ from runner.service import fragments
 from runner.service.addresses import link
 from runner.service.dependencies import ComputationOf, RecordedRun
 from runner.service.guard import POLICY
-from runner.service.pages.frame import RunView, head_of
+from runner.service.pages.frame import RunView, has_tables, head_of
 from runner.service.pages.rendering import page
 from runner.util.extras import missing
 from runner.util.files import cache_folder, replacing, storage_errors
@@ -79,15 +80,17 @@ async def frame(
 ) -> Response:
     """Show the viewer alone, opened at a step."""
     step = StepRef.parse(at) if at else None
-    time = await compute(fragments.timeline_step, run, step)
-    query: dict[str, int | None] = {}
+    place = json.loads(await compute(fragments.viewer_place, run, step))
+    query: dict[str, object] = {}
     if step:
         query = {"episodes": step.episode} if step.after is None else {"evaluations": step.after}
+        if not has_tables(run):
+            query |= {"trials": place["trials"], "frames": "true"}
     view = _FrameView(
         title=f"{run.name}, {run.run_id}",
         files=f"/static/rerun/{version()}",
         recording=link(f"/api/v1/runs/{run.run_id}/replay.rrd", query),
-        step=int(time),
+        step=place["time"],
     )
     response = page(request, view)
     response.headers["content-security-policy"] = FRAME_POLICY

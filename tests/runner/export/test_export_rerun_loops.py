@@ -198,6 +198,40 @@ def test_pictures_of_selected_episodes_of_a_vector_are_drawn(tmp_path):
             assert own[-1] + N in [step for step, flag in cleared if flag]
 
 
+def shown_ranges(path):
+    """Return the range of time that each view of an export shows, by its title."""
+    reader = RrdReader(str(path))
+    titles, ranges = {}, {}
+    for chunk in reader.stream(store=reader.blueprints()[0]).to_chunks():
+        values = chunk.to_record_batch().to_pydict()
+        view = str(chunk.entity_path).removeprefix("/view/").partition("/")[0]
+        if "ViewBlueprint:display_name" in values:
+            titles[view] = values["ViewBlueprint:display_name"][0][0]
+        if "TimeAxis:view_range" in values:
+            ranges[view] = values["TimeAxis:view_range"][0][0]
+    return {titles[view]: (range_["start"], range_["end"]) for view, range_ in ranges.items()}
+
+
+@pytest.mark.parametrize("is_vector", [False, True])
+def test_views_of_steps_show_the_time_of_the_chosen_episodes(tmp_path, is_vector):
+    if is_vector:
+        run = record_poles(tmp_path)
+    else:
+        with runner.record(make_pole(), tmp_path) as run:
+            list(play(run, 200))
+        run = run.run
+    with open_recording(run.recording) as recording:
+        Exported(recording, tmp_path / "chosen.rrd", episodes=((2, 3),), with_default=True)
+        Exported(recording, tmp_path / "whole.rrd")
+        span = recording.episode_span("train", 2)
+        steps = steps_of(recording)
+    times = steps["log_time"] // schema.STEP_NANOSECONDS
+    first, last = (int(times[steps["step"] == step][0]) for step in (span[0], span[-1]))
+    chosen, whole = (shown_ranges(tmp_path / f"{name}.rrd") for name in ("chosen", "whole"))
+    assert np.abs(np.subtract(chosen["reward"], (first, last))).max() < (N if is_vector else 1)
+    assert whole["reward"] == whole["return"] == chosen["return"] == (0, times.max())
+
+
 def test_each_environment_of_a_vector_has_pictures_by_default(tmp_path):
     with open_recording(record_poles(tmp_path, steps=60).recording) as recording:
         drawn = select(recording, Request(frames=True)).drawn["train"]

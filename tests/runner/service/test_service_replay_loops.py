@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import re
 import sys
 
@@ -11,6 +12,7 @@ import pytest
 from loop_replays import page, part, pictures, serving, steps_of, taken
 
 import runner
+from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 
@@ -130,3 +132,21 @@ def test_an_episode_that_is_not_there_is_refused(loops_client, address, message)
         assert answer.status_code == 404, path
         assert message in answer.json()["error"]["message"]
     assert message in page(loops_client, f"/runs/{address}", 404)
+
+
+@pytest.mark.parametrize(("at", "phase", "number"), [("2:1", "train", 2), ("eval:4:1", "eval", 1)])
+def test_rerun_draws_the_episode_that_it_is_opened_at(loops_client, loops, tmp_path, at, phase, number):
+    chunk = pytest.importorskip("rerun.chunk")
+    frame = page(loops_client, f"/runs/pole/rerun/frame?at={at}")
+    address = html.unescape(re.search('data-recording="([^"]+)"', frame)[1])
+    (tmp_path / "run.rrd").write_bytes(loops_client.get(address).content)
+    chunks = chunk.RrdReader(str(tmp_path / "run.rrd")).store().stream().to_chunks()
+    pictured = {
+        time
+        for piece in chunks
+        if str(piece.entity_path) == f"/{phase}/frame"
+        for time in piece.to_record_batch().column("step").to_pylist()
+    }
+    times = steps_of(loops, "pole", phase, number)["log_time"] // schema.STEP_NANOSECONDS
+    assert set(times.tolist()) <= pictured
+    assert len(pictured) <= len(times) + 2, "those of no other episode, before and after it"
