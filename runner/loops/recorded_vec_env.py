@@ -48,7 +48,8 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
             raise
         super().__init__(base.num_envs, base.observation_space, base.action_space)
         self.metadata = base.metadata
-        self._actions: object = None
+        self._given: object = None
+        self._watch, self._record_step = self.recorded._watch, self.recorded.record_step
         self.training_steps: Callable[[], int] | None = None
         """Returns after how many training steps the environments evaluate; called at their resets."""
 
@@ -89,12 +90,14 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
 
     def step_async(self, actions: object) -> None:
         """Begin a step in each environment."""
-        self._actions = as_given(actions)
+        self._given = as_given(actions)
         self._vector.step_async(actions)
 
     def step_wait(self) -> object:
         """Wait for the steps, and record them."""
-        self.recorded.step(self._actions)
+        result = self._vector.step(self._given)
+        self._watch.steps += 1
+        self._record_step(self._given, result)
         self.reset_infos = self.base.reset_infos
         return self._vector.native
 

@@ -46,10 +46,12 @@ class VecEnvVector(AnyVectorEnv):
     def step(self, actions: object) -> VectorStepResult:  # noqa: ARG002
         """Wait for the steps that `step_async` has begun."""
         observations, rewards, dones, infos = self._step_wait()
-        rounded = rewards if self._rewards_dtype is None else rewards.astype(self._rewards_dtype)
+        rounded = rewards.astype(self._rewards_dtype) if self._rewards_dtype is not None else rewards
         self.native = observations, rounded, dones, infos
+        if not dones.any():
+            return observations, rewards, dones, dones, infos
         truncated = np.zeros(self.num_envs, np.bool_)
-        for i in np.flatnonzero(dones).tolist():
+        for i in dones.nonzero()[0].tolist():
             truncated[i] = infos[i].get("TimeLimit.truncated", False)
         return observations, rewards, dones & ~truncated, truncated, infos
 

@@ -26,7 +26,7 @@ from runner.loops.values import as_given, check_phase, frozen_options
 from runner.loops.vector_rows import VectorRows
 from runner.recording.episode_log import Flags
 from runner.recording.spaces import Value
-from runner.replay.stepping_vector import final_observations, spaces_of_one
+from runner.replay.stepping_vector import spaces_of_one
 
 if TYPE_CHECKING:
     _Wrapper = VectorWrapper[object, object, object, object, object]
@@ -48,8 +48,9 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
         phase: str = "train",
     ) -> None:
         VectorWrapper.__init__(self, env)
-        self._mode = mode
+        self._mode, self._resets_within = mode, mode == AutoresetMode.SAME_STEP
         self._watch = watch
+        self._has_messages = bool(loop.options.info or loop.options.frames_every)
         self._record_into(loop)
         Recorded._enter(self, phase)
 
@@ -72,43 +73,51 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
                 states = watch.before_step(over)
         given = as_given(actions)
         result = self.env.step(actions)
-        try:
-            self._record_step(given, result, extras, over, states)
-        except Exception as error:
-            self._loop.fail(error)
+        self.record_step(given, result, extras, over, states)
         return result
 
-    def _record_step(
+    def record_step(
         self,
         actions: object,
         result: VectorStepResult,
-        extras: Mapping[str, object] | None,
-        over: Flags | None,
-        states: States | None,
+        extras: Mapping[str, object] | None = None,
+        over: Flags | None = None,
+        states: States | None = None,
     ) -> None:
-        """Record a step of all environments.
+        """Record a step of all environments that was just taken.
 
         Args:
+            actions: as they were before the step.
+            result: what the step returned.
+            extras: arrays [N, ...] by name.
             over: [N], whether their episodes were over before; None where that does not matter.
             states: what resets within the step depended on.
         """
-        observations, rewards, terminated, truncated, infos = result
-        final = final_observations(infos) if self._mode == AutoresetMode.SAME_STEP else None
-        with self._loop.lock:
-            if self._loop.active is not self._rows:
-                self._loop.activate(self._rows)
-            self._rows.take(actions, observations, rewards, terminated, truncated, final, states)
-            if extras is not None:
-                try:
-                    self._take_extras(extras)
-                except ConfigError as error:
-                    self._loop.leave_out(error)
+        try:
+            observations, rewards, terminated, truncated, infos = result
+            loop, rows = self._loop, self._rows
+            with loop.lock:
+                if loop.active is not rows:
+                    loop.activate(rows)
+                finals = infos if self._resets_within else None
+                rows.take(actions, observations, rewards, terminated, truncated, finals, states)
+                if extras is not None:
+                    try:
+                        self._take_extras(extras)
+                    except ConfigError as error:
+                        loop.leave_out(error)
+            if self._has_messages:
+                self._record_messages(infos, np.logical_or(terminated, truncated), over)
+        except Exception as error:
+            self._loop.fail(error)
+
+    def _record_messages(self, infos: Info | Sequence[Info], ended: Flags, over: Flags | None) -> None:
+        """Record the chosen fields of infos, and the pictures that are due, of a step."""
         if self._options.info:
             self._messages.info(self._phase, _by_environment(infos))
         if self._options.frames_every:
-            ended = np.logical_or(terminated, truncated)
             self._until_frame -= 1
-            if self._mode == AutoresetMode.SAME_STEP:
+            if self._resets_within:
                 self._record_frames(resets=ended)
             elif self._mode == AutoresetMode.NEXT_STEP:
                 self._record_frames(resets=over, ends=ended)

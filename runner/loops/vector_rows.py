@@ -19,10 +19,11 @@ from runner.loops.rows import MAX_SEED, Rows
 from runner.loops.values import require_reset, warn_user
 from runner.recording import schema
 from runner.recording.episode_log import Columns, EpisodeLog, Episodes, Flags, Steps
-from runner.recording.gym_values import filler, leaves_of, put_chosen
+from runner.recording.gym_values import element_of, filler, leaves_of
 from runner.recording.recorder import Recorder
 from runner.recording.reset_states import ResetState
 from runner.recording.schema import Topic
+from runner.replay.stepping_vector import final_observations
 from runner.util.arrays import Array, Ints
 
 _TRUE: Final = b"\1"
@@ -85,8 +86,10 @@ class VectorRows:
         self._state = np.full(n, -self._state_start)
         """The states before the first row, where both spaces are discrete."""
         self._block_resets: list[ResetsBetween] = []
-        self._finals: list[tuple[int | NDArray[np.intp], NDArray[np.intp], Array]] = []
+        self._finals: list[tuple[NDArray[np.intp], NDArray[np.intp], Array]] = []
         """Rows whose observations are of the next episodes; environments, and the last ones of the ended."""
+        self._ended: list[tuple[int, int]] = []
+        """Rows and environments of which `_last` has the last observations; not in `_finals` yet."""
         self._autoreset_states: dict[int, States] = {}
         """Rows with resets in place of steps, and what those depended on."""
         self._counted, self._ended_here = 0, 0
@@ -110,9 +113,12 @@ class VectorRows:
         self._actions = np.empty((rows, n), action)
         self._observations = np.empty((rows, n), self._observation_dtype)
         self._rewards = np.empty((rows, n))
-        self._terminated, self._truncated = np.empty((2, rows, n), np.bool_)
+        self._ends = np.empty((rows, 2, n), np.bool_)
+        self._terminated, self._truncated = self._ends[:, 0], self._ends[:, 1]
+        self._last = np.empty(n + rows * n // 8, self._observation_dtype)
         self._put_action = filler(self._action_leaves, self._actions, (n,))
         self._put_observation = filler(self._observation_leaves, self._observations, (n,))
+        self._put_last = filler(self._observation_leaves, self._last)
 
     @property
     def filled(self) -> int:
@@ -134,13 +140,14 @@ class VectorRows:
         row = self._filled - 1
         if row < 0:
             return bool(self._over.any())
-        return _TRUE in self._terminated[row].tobytes() or _TRUE in self._truncated[row].tobytes()
+        return _TRUE in self._ends[row].tobytes()
 
     @property
     def over(self) -> Flags:
         """[N]: the environments whose episode ended with the last step and that were not reset since."""
         if not self._filled:
             return self._over
+        self._gather()
         over: Flags = self._terminated[self._filled - 1] | self._truncated[self._filled - 1]
         for reset in self._block_resets:
             over[reset.which[reset.row == self._filled]] = False
@@ -158,7 +165,7 @@ class VectorRows:
         rewards: object,
         terminated: object,
         truncated: object,
-        final: object,
+        infos: object,
         states: States | None = None,
     ) -> None:
         """Record a step of all environments.
@@ -166,8 +173,8 @@ class VectorRows:
         `rewards`, `terminated` and `truncated`: [N].
 
         Args:
-            final: the last observations of episodes that ended, where `observations` are already of the next
-                ones; None where they are not.
+            infos: what has the last observations of episodes that ended, where `observations` are already of
+                the next ones; None where they are not.
             states: what the resets in place of steps depended on, if it is to be recorded.
         """
         if not self._room:
@@ -183,20 +190,28 @@ class VectorRows:
         if rewards.__class__ is not np.ndarray or rewards.shape != (self._n,):
             rewards = np.asarray(rewards, np.float64).reshape(self._n)
         self._rewards[row] = rewards
-        self._terminated[row] = terminated
-        self._truncated[row] = truncated
-        if final is not None and len(which := np.flatnonzero(self._terminated[row] | self._truncated[row])):
-            last = np.zeros(self._n, self._observation_dtype)
-            put_chosen(self._observation_leaves, final, last, which)
-            self._finals.append((row, which, last[which]))
-            after = self._observations[row, which]
-            none = [None] * len(which)
-            self._block_resets.append(ResetsBetween(np.full(len(which), row + 1), which, after, none, none))
+        ends = self._ends[row]
+        ends[0], ends[1] = terminated, truncated
+        is_full = row + 1 == self._room
+        if infos is not None and _TRUE in ends.tobytes() and (final := final_observations(infos)) is not None:
+            for i in (ends[0] | ends[1]).nonzero()[0].tolist():
+                self._put_last(len(self._ended), element_of(final, i))
+                self._ended.append((row, i))
+            is_full |= len(self._ended) + self._n > len(self._last)
         if states:
             self._autoreset_states[row] = states
         self._filled = row + 1
-        if self._filled == self._room:
+        if is_full:
             self.commit()
+
+    def _gather(self) -> None:
+        """Put the ends of episodes in `_ended`, and the resets that followed them, with the block's."""
+        if self._ended:
+            row, which = np.array(self._ended, np.intp).T
+            none, after = [None] * len(row), self._observations[row, which]
+            self._finals.append((row, which, self._last[: len(row)].copy()))
+            self._block_resets.append(ResetsBetween(row + 1, which, after, none, none))
+            self._ended = []
 
     def _now(self) -> Array:
         """Return the observations [N] after the last step or reset of each environment."""
@@ -244,7 +259,7 @@ class VectorRows:
         rows = self._filled
         if not rows:
             return
-        first, over_after = self._recorder.steps[self._phase], self.over
+        first, over_after = self._recorder.steps[self._phase], self.over  # which gathers the ends
         terminated, truncated = self._terminated[:rows], self._truncated[:rows]
         was_reset, only_reset = np.zeros((2, rows, self._n), np.bool_)
         for reset in self._block_resets:
