@@ -47,6 +47,7 @@ from runner.util.processes import report_progress
 from runner.util.values import checked_run_name
 
 POLICIES: Final = ("recorded", "random", "constant")
+RAN_OUT: Final = "the recorded actions ran out"
 MAX_STEPS: Final = 100_000
 """The most steps that a branch takes unless chosen otherwise."""
 
@@ -71,6 +72,8 @@ class Branch:
     origin: BranchOrigin
     parent: Outcome
     outcome: Outcome
+    is_recorded_action: bool
+    """Whether the action of the step is the one that was recorded there."""
 
 
 @dataclass(frozen=True)
@@ -185,14 +188,14 @@ def branch(
             if isinstance(message, int):
                 report(message)
             else:
-                run_id, origin, stopped = message
+                run_id, origin, stopped, is_recorded = message
         with storage_errors(folder / run_id):
             (Path(staging.name) / run_id).rename(folder / run_id)
     own = run_at(folder / run_id)
     with open_recording(run.recording) as recording:
         before = _outcome(recording, origin.phase, origin.episode, "unfinished")
     with open_recording(own.recording) as recording:
-        return Branch(own, origin, before, _outcome(recording, origin.phase, 0, stopped))
+        return Branch(own, origin, before, _outcome(recording, origin.phase, 0, stopped), is_recorded)
 
 
 def _outcome(recording: Recording, phase: str, episode: int, otherwise: str) -> Outcome:
@@ -209,7 +212,7 @@ def _outcome(recording: Recording, phase: str, episode: int, otherwise: str) -> 
 
 
 def _record_branch(path: Path, folder: Path, task: _Task) -> None:
-    """Record a branch; report the steps taken, then its run id, its origin, and why it stopped early."""
+    """Record a branch; report the steps taken, then what `branch` returns."""
     os.chdir(task.user_folder)
     with open_recording(path) as recording:
         if recording.can_train_again:
@@ -223,7 +226,7 @@ def _record_branch(path: Path, folder: Path, task: _Task) -> None:
         make = partial(Replay, recording, task.trust, 0.0, report_progress, False)
         with episode_at(recording, player.phase, player.episode, task.at.t, make, player.begin):
             stopped = player.play()
-    report_progress((player.rec.run.run_id, player.origin, stopped))
+    report_progress((player.rec.run.run_id, player.origin, stopped, player.is_recorded_action))
 
 
 class _Player:
@@ -232,6 +235,7 @@ class _Player:
     rec: Any
     """The recorded environment."""
     origin: BranchOrigin
+    is_recorded_action: bool
 
     def __init__(self, recording: Recording, folder: Path, task: _Task) -> None:
         self._recording, self._folder, self._task = recording, folder, task
@@ -255,7 +259,9 @@ class _Player:
         names: Names = recording.action_names(self.phase) or action_names(env, self._space)
         if self._is_game:
             names = {agent: recording.action_names(self.phase, agent) for agent in recording.agents}
-        self._action = parsed_action(self._space, task.action, next(actions), names)
+        recorded = next(actions)
+        self._action = parsed_action(self._space, task.action, recorded, names)
+        self.is_recorded_action = _text(self._action) == _text(recorded)
         self.origin = BranchOrigin(
             recording.run_id,
             self.phase,
@@ -297,7 +303,7 @@ class _Player:
                 return ""
             action = self._next(observation)
             if action is None:
-                return "the recorded actions ran out"
+                return RAN_OUT
             if time.monotonic() - reported > BLOCK_SECONDS:
                 reported = time.monotonic()
                 report_progress(task.at.t + count)

@@ -150,6 +150,8 @@ def branch_command(
             report=report,
             stop=stop,
         )
+    if actions and _repeats(run, branched_run):
+        say(f"Note: {' and '.join(actions)} is the recorded action at {at}; nothing is changed by it.")
     if isinstance(branched_run, TrainingBranch):
         _print_training(run, branched_run, as_json)
     else:
@@ -168,6 +170,16 @@ def _refuse_what_training_takes() -> None:
             "with --action all or at a trial of an evaluation. Leave this out, or branch at a step of "
             "training, with one action or none."
         )
+
+
+def _repeats(parent: Run, branch: Branch | TrainingBranch) -> bool:
+    """Return whether the action that was given is the recorded one."""
+    from runner.execution.branching import TrainingBranch
+
+    if not isinstance(branch, TrainingBranch):
+        return branch.is_recorded_action
+    digest = parent.summary.content_digest
+    return digest is not None and branch.run.summary.content_digest == digest
 
 
 def _action(actions: tuple[str, ...], run: Run) -> object:
@@ -204,8 +216,13 @@ def _print_training(parent: Run, branch: TrainingBranch, as_json: bool) -> None:
 
 
 def _print_episode(parent: Run, branch: Branch, as_json: bool) -> None:
-    from runner.debugging.branch import Outcome
+    from runner.debugging.branch import RAN_OUT, Outcome
 
+    if branch.outcome.end == RAN_OUT:
+        say(
+            "The branch outlived the recorded actions, and stopped with the last of them. "
+            "--policy random, constant or MODULE:FUNCTION plays on to an end."
+        )
     if as_json:
         both = {"parent": asdict(branch.parent), "branch": asdict(branch.outcome)}
         print_json({"run_id": branch.run.run_id, "origin": asdict(branch.origin)} | both)

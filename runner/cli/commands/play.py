@@ -41,12 +41,14 @@ if TYPE_CHECKING:
 ReadKey = Callable[[float | None], str]
 """Waits for a key, at most a number of seconds; returns its meaning, empty if none was pressed."""
 
-_KEYS: Final = "space: pause   arrows: back, forward   q: quit"
-_PAUSED_KEYS: Final = "paused   space: continue   arrows: back, forward   q: quit"
+_KEYS: Final = "space: pause   arrows: back, forward   r: restart   q: quit"
+_PAUSED_KEYS: Final = "paused   space: continue   arrows: back, forward   r: restart   q: quit"
+_END_KEYS: Final = "the end   arrow: back   r: restart   q: quit"
 _MEANINGS: Final = {
     b" ": "pause",
     **dict.fromkeys((b"q", b"Q", b"\x1b"), "quit"),
     **dict.fromkeys((b"b", b"\x1b[D", b"\xe0K"), "back"),
+    **dict.fromkeys((b"r", b"R"), "restart"),
     **dict.fromkeys((b"n", b"\x1b[C", b"\xe0M"), "forward"),
 }
 """The bytes that terminals send (of arrows escape sequences, on Windows after 0xE0), and their meaning."""
@@ -77,7 +79,8 @@ def play_command(
     By default it is the typical trial of the last evaluation: the median by success, return and length; of
     your own loop the first trial of its last evaluation; of a run without evaluations the last training
     episode. --best and --worst choose among the trials of all evaluations, or else the training episodes. The
-    space bar pauses, the arrow keys (or b and n) step back and forward, and q quits. Where stdout is no
+    space bar pauses, the arrow keys (or b and n) step back and forward, r restarts, and q quits; the last
+    step stays until a key is pressed. Where stdout is no
     terminal, the frames come one after another, without waiting. --json prints one line for each step.
 
     In a terminal it shows pictures, as `dualtaxi export film` does: by the terminal's graphics (kitty,
@@ -102,7 +105,7 @@ def play_command(
             for step in played.steps():
                 print_json(step, indent=None)
             return
-        if not terminal.is_terminal:
+        if not terminal.is_terminal or terminal.is_dumb_terminal:
             for frame in played.frames():
                 text = (frame.above + frame.below).plain
                 echo("\n".join(line.rstrip() for line in text.splitlines()) + "\n")
@@ -193,30 +196,35 @@ class _Bounded:
 def _play(
     frames: Iterator[Frame], seconds: float, read_key: ReadKey | None, show: Callable[[Frame, str], None]
 ) -> None:
-    """Show frames at even intervals; keys pause, step back and forward, and quit.
+    """Show frames at even intervals; keys pause, step back and forward, restart and quit.
 
     `read_key` waits for a key, None if stdin is no terminal; `show` draws a frame, and a text about the keys.
+    The last frame stays until a key is pressed, if there are keys.
     """
-    seen = list(itertools.islice(frames, 1))
+    seen = list(itertools.islice(frames, 2))
     number, paused, due = 0, False, time.monotonic() + seconds
-    while number < len(seen):
-        keys = _PAUSED_KEYS if paused else _KEYS
-        show(seen[number], keys if read_key else "")
-        key = ""
+    while seen:
+        is_last = number + 1 == len(seen)
         if read_key is None:
+            show(seen[number], "")
             time.sleep(max(due - time.monotonic(), 0))
+            key = "quit" if is_last else ""
         else:
-            key = read_key(None if paused else max(due - time.monotonic(), 0))
+            show(seen[number], _END_KEYS if is_last else _PAUSED_KEYS if paused else _KEYS)
+            key = read_key(None if paused or is_last else max(due - time.monotonic(), 0))
         if key == "quit":
+            show(seen[number], "")
             return
-        if key == "pause":
+        if key == "restart":
+            number, paused = 0, False
+        elif key == "pause":
             paused = not paused
         elif key == "back":
             number, paused = max(number - 1, 0), True
-        elif key == "forward" or (not paused and time.monotonic() >= due):
+        elif not is_last and (key == "forward" or (not paused and time.monotonic() >= due)):
+            number += 1
             if number + 1 == len(seen):
                 seen += itertools.islice(frames, 1)
-            number += 1 if number + 1 < len(seen) or not paused else 0
         due = max(due + seconds, time.monotonic()) if key == "" else time.monotonic() + seconds
 
 
@@ -240,7 +248,7 @@ def _key_reader() -> Iterator[ReadKey | None]:
             tty.setcbreak(descriptor)  # keys one by one and without echo; Ctrl-C still interrupts
             yield _posix_key
         finally:
-            termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+            termios.tcsetattr(descriptor, termios.TCSAFLUSH, before)  # keys are not for the shell
 
 
 def _posix_key(seconds: float | None) -> str:
@@ -251,6 +259,8 @@ def _posix_key(seconds: float | None) -> str:
     if not ready:
         return ""
     key = os.read(descriptor, 1)
+    if not key:  # the terminal was closed
+        return "quit"
     if key == b"\x1b" and select.select([descriptor], [], [], 0)[0]:  # an arrow key sends three bytes
         key += os.read(descriptor, 2)
     return _MEANINGS.get(key, "")

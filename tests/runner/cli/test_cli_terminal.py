@@ -54,8 +54,8 @@ def test_a_run_shows_its_progress(command, tiny):
 
 def test_colours_only_repeat_the_text(recorded):
     words = ["play", "tiny", "--episode", 0, "--speed", 1000]
-    coloured = _typed(words, recorded.recordings)
-    plain = _typed(words, recorded.recordings, NO_COLOR="1")
+    coloured = _typed(words, recorded.recordings, keys=b"q", once="the end")
+    plain = _typed(words, recorded.recordings, keys=b"q", once="the end", NO_COLOR="1")
     assert "\x1b[1;38;5" in coloured or "\x1b[1;30;48" in coloured
     assert "[1;38;5" not in plain
     assert "48;5" not in plain
@@ -133,6 +133,16 @@ def test_play_pauses_steps_and_quits(recorded):
     steps = [int(step) for step in re.findall(r"step (\d+) of", shown)]
     assert [step for i, step in enumerate(steps) if i == 0 or step != steps[i - 1]] == [0, 1, 2, 3, 2, 1]
     assert "paused" in shown
+
+
+def test_play_waits_at_the_end_and_can_start_once_more(recorded):
+    words = ["play", "tiny", "--episode", 0, "--speed", 1000]
+    shown = _typed(words, recorded.recordings, keys=b"bn\x1b[Crq", once="the end")
+    steps = [int(step) for step in re.findall(r"step (\d+) of", shown)]
+    last = max(steps)
+    tail = steps[steps.index(last) :]
+    assert [step for i, step in enumerate(tail) if i == 0 or step != tail[i - 1]] == [last, last - 1, last, 0]
+    assert "q: quit" not in shown.rpartition("step 0 of")[2]
 
 
 @pytest.mark.parametrize(

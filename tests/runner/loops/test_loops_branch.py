@@ -128,6 +128,30 @@ def test_policies_recorded_constant_and_of_the_user(runs, tmp_path, monkeypatch)
     assert balanced.run.status == "finished"
     ended = runner.branch(balanced.run, at="0:301", action=0, recordings=tmp_path)
     assert ended.outcome.end == "the recorded actions ran out"
+    words = [
+        "branch",
+        str(balanced.run.folder),
+        "--at",
+        "0:301",
+        "--action",
+        "0",
+        "--recordings",
+        str(tmp_path),
+    ]
+    assert "--policy random, constant or MODULE:FUNCTION plays on" in CliRunner().invoke(cli, words).stderr
+
+
+def test_the_recorded_action_is_named(runs, tmp_path):
+    run = runs["CartPole-v1"]
+    action = int(rows(run, 0)["action"][3])
+
+    def messages(*words):
+        done = CliRunner().invoke(cli, ["branch", str(run.folder), "--recordings", str(tmp_path), *words])
+        assert done.exit_code == 0, done.output
+        return done.stderr
+
+    assert f"{action} is the recorded action at 0:3" in messages("--at", "0:3", "--action", str(action))
+    assert "is the recorded" not in messages("--at", "0:3", "--action", str(1 - action))
 
 
 def test_a_branch_says_where_it_comes_from_and_its_parent_lists_it(runs, tmp_path):
