@@ -55,14 +55,19 @@ def _folders(_ctx: click.Context, _param: click.Parameter, value: tuple[Path, ..
     return value or (recordings_folder(),)
 
 
-folders_option: Final = option(
-    "--recordings",
-    type=DIRECTORY,
-    metavar="DIR",
-    multiple=True,
-    callback=_folders,
-    help="A folder of runs; may be repeated.  [default: $DUALTAXI_RECORDINGS, or ./recordings]",
-)
+def _folders_option(must_exist: bool) -> Declared:
+    return option(
+        "--recordings",
+        type=click.Path(exists=must_exist, file_okay=False, path_type=Path),
+        metavar="DIR",
+        multiple=True,
+        callback=_folders,
+        help="A folder of runs; may be repeated.  [default: $DUALTAXI_RECORDINGS, or ./recordings]",
+    )
+
+
+folders_option: Final = _folders_option(must_exist=True)
+served_folders_option: Final = _folders_option(must_exist=False)
 set_option: Final = option(
     "--set",
     multiple=True,

@@ -3,7 +3,7 @@
 At most, every episode lasts until the step limit. A typical agent soon learns to reach the end: the typical
 figure assumes half the limit for each evaluation trial and for the first 500 training episodes, and a tenth
 of it for the others; for random actions half of it throughout. These are rules of thumb from the shipped
-experiments, whose steps were between a quarter of the typical figure and all of it.
+experiments, whose steps were between a sixth of the typical figure and all of it.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from runner.config import ExperimentConfig
 CLUMSY_EPISODES: Final = 500
 CLUMSY, SKILLED = 0.5, 0.1
 """Typical length of an episode as a share of the step limit: at first and in trials, and later."""
+LEAST: Final = 1 / 6
+"""The steps of an agent that learns quickly, as a share of the typical figure."""
 BYTES_PER_STEP: Final = {"zstd": 15, "lz4": 30, "none": 100}
 """Measured bytes of a step by compression, without the message index."""
 INDEX_BYTES: Final = 16

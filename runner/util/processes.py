@@ -80,13 +80,14 @@ def starting_processes(with_main: bool = True) -> Iterator[None]:
     the one and hands them this process's `sys.path`, with the folder that the other put there.
 
     Args:
-        with_main: whether the script of this process is imported in them, as `multiprocessing` does.
+        with_main: whether the script of this process is imported in them, as `multiprocessing` does, for what
+            it registers; never if it does not guard its statements, which would run once more there.
     """
     with _starting:
         main, before, path = sys.modules["__main__"], os.environ.get(_SAFE_PATH), sys.path
         os.environ[_SAFE_PATH] = "1"
         sys.path = _without_current_folder(path)
-        if not with_main:  # it may not guard its statements
+        if not with_main or not _is_guarded(main):
             sys.modules["__main__"] = types.ModuleType("__main__")
         try:
             yield
@@ -96,6 +97,14 @@ def starting_processes(with_main: bool = True) -> Iterator[None]:
                 del os.environ[_SAFE_PATH]
             else:
                 os.environ[_SAFE_PATH] = before
+
+
+def _is_guarded(main: types.ModuleType) -> bool:
+    """Return whether a script says `if __name__ == "__main__":`, or there is none, as in a notebook."""
+    file = getattr(main, "__file__", None)
+    with contextlib.suppress(OSError):
+        return file is None or b"__main__" in Path(file).read_bytes()
+    return True
 
 
 def _without_current_folder(path: list[str]) -> list[str]:

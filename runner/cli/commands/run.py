@@ -63,8 +63,9 @@ def run_command(
     other or in parallel with --workers; the recordings are the same. Ctrl-C ends a run properly and keeps
     what it recorded; a second Ctrl-C kills it.
 
-    Steps and disk are estimated first. The estimate assumes that evaluation trials and the first 500 training
-    episodes last half the step limit, and later ones a tenth; "at most" is all of the limit.
+    Steps and disk are estimated first, from an agent that learns quickly to a slow one, of which evaluation
+    trials and the first 500 training episodes last half the step limit, and later ones a tenth; "at most" is
+    all of the limit.
 
     With --live the Rerun viewer shows training as it happens: all metrics, and every Nth episode.
 
@@ -169,7 +170,7 @@ def _watcher(config: ExperimentConfig, live: bool, every: int | None, url: str |
 
 def _announce(config: ExperimentConfig, folder: Path) -> None:
     """Print the estimate; if the disk may be too small and there is a terminal, ask whether to continue."""
-    from runner.execution.estimate import estimate, free_bytes, step_limit
+    from runner.execution.estimate import LEAST, estimate, free_bytes, step_limit
 
     limit, seeds, free = step_limit(config), len(config.seeds), free_bytes(folder)
     runs = f"{seeds} runs of {config.episodes:,} episodes" if seeds > 1 else f"{config.episodes:,} episodes"
@@ -179,11 +180,13 @@ def _announce(config: ExperimentConfig, folder: Path) -> None:
         say(f"{runs} without a step limit, so the size is unknown; {size(free)} of disk are free.")
         return
     one = estimate(config, limit)
+    steps, disk = one.typical_steps * seeds, one.typical_bytes * seeds
     say(
-        f"{runs}: about {amount(one.typical_steps * seeds)} steps, {size(one.typical_bytes * seeds)} "
+        f"{runs}: about {amount(LEAST * steps)} to {amount(steps)} steps, "
+        f"{size(LEAST * disk)} to {size(disk)} "
         f"(at most {amount(one.max_steps * seeds)}, {size(one.max_bytes * seeds)})."
     )
-    if free >= one.typical_bytes * seeds:
+    if free >= disk:
         return
     say(f"The disk of {folder} has {size(free)} left, which may be too little.")
     if _is_interactive() and not click.confirm("Continue?", err=True):

@@ -105,3 +105,11 @@ def test_json_of_no_run_and_of_two_is_a_named_list(command):
         == len(command.json("ls", "--limit", "1")["runs"])
         == 1
     )
+
+
+@pytest.mark.parametrize("words", [("ls",), ("du",), ("prune", "--keep-last", "1"), ("index", "rebuild")])
+def test_a_folder_that_does_not_exist_is_refused(command, tmp_path, words):
+    done = command(*words, "--recordings", tmp_path / "nowhere")
+    assert done.exit_code == 2
+    assert "nowhere' does not exist" in done.stderr
+    assert "No runs in" in command("ls").stderr  # nobody named this folder, and nobody recorded yet

@@ -208,3 +208,13 @@ def test_without_a_terminal_a_line_now_and_then_shows_that_work_goes_on(
     done = recorded(*typed, *into)
     assert done.exit_code == 0, done.output
     assert re.search(line, done.stderr), done.stderr
+
+
+def test_the_steps_of_a_run_are_in_the_range_of_the_estimate(command):
+    done = command("run", "cliff_walking")
+    low, high = re.search(
+        r"episodes: about ([\d.]+) thousand to ([\d.]+) thousand steps", done.stderr
+    ).groups()
+    (run,) = list_runs(command.recordings)
+    steps = run.summary["train_steps"] + run.summary["eval_steps"]
+    assert float(low) * 1000 <= steps <= float(high) * 1000

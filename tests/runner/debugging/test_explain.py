@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import pytest
 from click.testing import CliRunner
@@ -301,3 +303,18 @@ def test_prune_removes_what_was_trained_but_what_is_kept(tmp_path):
     assert explanations_in(tmp_path) == []
     assert [run.run_id for run in list_runs(tmp_path / UNLISTED)] == [kept.run_id]
     assert not (tmp_path / ".explain" / found.name.split("/")[0]).exists()
+
+
+def test_a_script_without_a_guard_is_not_run_by_the_processes_that_train(tmp_path):
+    script = (
+        "from pathlib import Path\n"
+        "import runner\n"
+        "with Path('begun').open('a') as file:\n"
+        "    file.write('.')\n"
+        f"runner.explain({LAKE!r}, {LAKE | PLANTED!r}, seeds=2, recordings='runs')\n"
+    )
+    (tmp_path / "script.py").write_text(script)
+    words = [sys.executable, "script.py"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "begun").read_text() == "."
