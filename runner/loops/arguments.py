@@ -8,7 +8,7 @@ import inspect
 import sys
 import textwrap
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any, Final
 
@@ -97,16 +97,12 @@ def _kept(kind: type[Any]) -> dict[str, str]:
         if isinstance(node, ast.Name | ast.Attribute) and not isinstance(node.ctx, ast.Load)
     )
     kept: dict[str, str] = {}
-    for statement in function.body:
-        if not isinstance(statement, ast.Assign | ast.AnnAssign):
-            continue
-        value = statement.value
+    for target, value in (pair for statement in function.body for pair in _assigned(statement)):
         if isinstance(value, ast.Call) and ast.unparse(value.func) in _COPIES and len(value.args) == 1:
-            value = value.args[0]
-        for target in statement.targets if isinstance(statement, ast.Assign) else [statement.target]:
-            if isinstance(value, ast.Name) and isinstance(target, ast.Attribute):
-                is_own = ast.unparse(target.value) == own and stored[f".{target.attr}"] == 1
-                kept |= {value.id: target.attr} if is_own and not stored[value.id] else {}
+            value = value.args[0]  # noqa: PLW2901 - what is copied
+        if isinstance(value, ast.Name) and isinstance(target, ast.Attribute):
+            is_own = ast.unparse(target.value) == own and stored[f".{target.attr}"] == 1
+            kept |= {value.id: target.attr} if is_own and not stored[value.id] else {}
     others = (method for base in kind.__mro__ for method in vars(base).values() if method is not constructor)
     changed = {
         instruction.argval
@@ -116,6 +112,18 @@ def _kept(kind: type[Any]) -> dict[str, str]:
         if instruction.opname == "STORE_ATTR"
     }
     return {name: attribute for name, attribute in kept.items() if attribute not in changed}
+
+
+def _assigned(statement: ast.stmt) -> Iterator[tuple[ast.expr, ast.expr | None]]:
+    """Yield each target of an assignment with its value, also of several at once."""
+    if isinstance(statement, ast.AnnAssign):
+        yield statement.target, statement.value
+    elif isinstance(statement, ast.Assign):
+        for target in statement.targets:
+            if isinstance(target, ast.Tuple) and isinstance(statement.value, ast.Tuple):
+                yield from zip(target.elts, statement.value.elts, strict=False)
+            else:
+                yield target, statement.value
 
 
 def plain_kwargs(kwargs: Mapping[str, object], owner: str) -> dict[str, object]:

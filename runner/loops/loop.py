@@ -68,6 +68,7 @@ class Loop(Generic[R]):
         make_rows: Callable[[Recorder, Described, str, Callable[[object], None]], R],
         batch: tuple[int, ...] = (),
     ) -> None:
+        options = options.for_environment(maker)
         self._loop_run = LoopRun(described, options, maker)
         self.started = self._loop_run.started
         self._recorder = self._loop_run.recorder
@@ -123,7 +124,12 @@ class Loop(Generic[R]):
             return self._rows[phase]
 
     def add_maker(self, phase: str, maker: EnvironmentMaker) -> None:
-        """Note how the environment of a phase was made, if it is another one than the first."""
+        """Note how the environment of a phase was made, if it is another one than the first.
+
+        Raises:
+            ConfigError: as for the first one.
+        """
+        self.options.for_environment(maker)
         with self.lock:
             if not self.closed:
                 self._loop_run.own_makers[phase] = maker

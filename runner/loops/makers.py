@@ -40,6 +40,7 @@ from runner.loops.wrappers import (
 from runner.recording.maker import FUNCTION_NAME, MAX_SPEC, EnvironmentMaker, VectorMaker
 from runner.replay.games import MultiAgent, Turns
 from runner.replay.makers import class_name, layers_of
+from runner.replay.scripts import MAIN
 from runner.replay.stepping_vector import spaces_of_one
 from runner.replay.trust import name_of
 from runner.util.values import MAX_TEXT
@@ -105,7 +106,7 @@ def _with_spec(
     maker = replace(
         maker,
         spec=text,
-        registered_by="" if top == "gymnasium" else registered_by,
+        registered_by="" if top in ("gymnasium", MAIN) else registered_by,
         assumed=tuple(assumed),
         inner_wrappers=inner,
     )
@@ -123,11 +124,7 @@ def _spec_fields(spec: EnvSpec) -> tuple[dict[str, object], str]:
     except CannotBeMade:  # a function without a name of its own, which its module registers under the id
         entry_point = name_of(spec.entry_point)
         registered_by = entry_point.partition(":")[0]
-        if (
-            registered is None
-            or name_of(registered.entry_point) != entry_point
-            or registered_by == "__main__"
-        ):
+        if registered is None or name_of(registered.entry_point) != entry_point or registered_by == MAIN:
             raise
     fields: dict[str, object] = {
         "id": spec.id,
@@ -274,6 +271,18 @@ def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
         return _with_versions(maker, [top], reason)
     spec = json.dumps(fields, default=plain_number)
     return _with_versions(replace(maker, spec=spec, registered_by=top, assumed=tuple(assumed)), [top])
+
+
+def why_not_certain(maker: EnvironmentMaker) -> str:
+    """Return why an environment cannot be made again for certain, with what to do; empty if it can."""
+    if maker.make:
+        return ""
+    if maker.assumed:
+        return f"the arguments of {', '.join(maker.assumed)} could not be recorded; {NAME_MAKE}"
+    specs = maker.spec + (maker.vector.wrapper_specs if maker.vector else "")
+    if f'"{MAIN}:' in specs:
+        return f"it is defined in the script that is run, which may change; {NAME_MAKE}"
+    return maker.reason
 
 
 def checked_make(make: object) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal, TypedDict
 
 import numpy as np
@@ -14,6 +14,9 @@ from runner.config.loading import packing_from
 from runner.config.sections import Recording
 from runner.errors import ConfigError, nearest
 from runner.loops.description import Described
+from runner.loops.makers import why_not_certain
+from runner.loops.values import warn_user
+from runner.recording.maker import EnvironmentMaker
 from runner.runs.run import Run
 from runner.runs.shards import find_joined
 from runner.util.extras import require
@@ -124,6 +127,21 @@ class Options:
             if not holds:
                 raise ConfigError(f"{key}: found {getattr(self, key)!r}, expected {expected}")
         checked_run_name(self.name)
+
+    def for_environment(self, maker: EnvironmentMaker) -> Options:
+        """Return these options, with whole steps where actions alone are too few and `on_error` is "warn".
+
+        Raises:
+            ConfigError: they are too few: the environment may not be made again.
+        """
+        reason = why_not_certain(maker) if self.steps == "actions" else ""
+        if not reason:
+            return self
+        lost = f"all else would be lost, as the environment cannot be made again for certain: {reason}"
+        if self.on_error == "raise":
+            raise ConfigError(f'steps: found "actions", expected "all": {lost}.')
+        warn_user(f'steps: found "actions", recorded are whole steps: {lost}.')
+        return replace(self, steps="all")
 
     def config(self, described: Described) -> Json:
         """Return the configuration that the recording carries.

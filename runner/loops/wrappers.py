@@ -16,6 +16,7 @@ from gymnasium.wrappers.vector import RecordVideo as VectorRecordVideo
 from runner.loops.arguments import VARIABLE, CannotBeMade, arguments_of, factory_of, plain_kwargs
 from runner.recording.maker import FUNCTION_NAME
 from runner.replay.makers import class_name
+from runner.replay.scripts import MAIN
 from runner.replay.trust import name_of
 from runner.util.values import MAX_TEXT
 
@@ -118,12 +119,10 @@ def entry_point_of(value: object) -> str:
     text = value if isinstance(value, str) else ""
     if not text and callable(value):
         module, name = getattr(value, "__module__", None), getattr(value, "__qualname__", "?")
-        if module == "__main__":
-            raise CannotBeMade(f"{name} is defined in the script that was run")
         if getattr(sys.modules.get(str(module)), name, None) is value:
             text = f"{module}:{name}"
     if not FUNCTION_NAME.fullmatch(text) or "." in text.partition(":")[2]:
         raise CannotBeMade(f"{name_of(value)} cannot be imported by name"[:MAX_TEXT])
-    if text.startswith("__main__:"):
-        raise CannotBeMade(f"{text} is defined in the script that was run")
+    if text.startswith(f"{MAIN}:") and not getattr(sys.modules[MAIN], "__file__", None):
+        raise CannotBeMade(f"{text} is defined in no file")
     return text

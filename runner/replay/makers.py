@@ -19,6 +19,7 @@ from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
 from runner.replay.games import as_parallel
+from runner.replay.scripts import MAIN, definition
 from runner.replay.specifications import (
     EnvironmentSpec,
     modules_of,
@@ -210,7 +211,7 @@ def _registered(maker: EnvironmentMaker, trust: bool) -> tuple[EnvironmentSpec, 
         importlib.import_module(maker.registered_by)
     registered = gymnasium.registry.get(spec.id)
     if registered is None and trust and spec.entry_point:
-        registered = gymnasium.envs.registration.EnvSpec(spec.id, entry_point=spec.entry_point)
+        registered = gymnasium.envs.registration.EnvSpec(spec.id, entry_point=_creator(spec.entry_point))
     if registered is None and spec.id == spec.entry_point.partition(":")[2]:
         raise CannotRedo(f"The environment is made by {spec.entry_point}. {TRUST}")
     if registered is None:
@@ -224,7 +225,7 @@ def _registered(maker: EnvironmentMaker, trust: bool) -> tuple[EnvironmentSpec, 
                 f"{spec.id} is {spec.entry_point} in the recording, and "
                 f"{name_of(registered.entry_point)} here: it is another environment, or another version."
             )
-        registered = dataclasses.replace(registered, entry_point=spec.entry_point)
+        registered = dataclasses.replace(registered, entry_point=_creator(spec.entry_point))
     if not trust:
         is_whole = maker.vector is not None and maker.vector.mode == "custom"
         own = {key: value for key, value in spec.kwargs.items() if key not in _OF_VECTORS}
@@ -287,10 +288,17 @@ def _wrapper(entry_point: str, base: type, arguments: Mapping[str, object], trus
 def _attribute(name: str) -> Any:
     """Return the object that `module:attribute` names; the module is imported."""
     module, _, path = name.partition(":")
+    if module == MAIN:
+        return definition(path)
     value: Any = importlib.import_module(module)
     for part in path.split("."):
         value = getattr(value, part)
     return value
+
+
+def _creator(entry_point: str) -> Any:
+    """Return what Gymnasium takes as an entry point: a definition of the script itself, else its name."""
+    return _attribute(entry_point) if entry_point.startswith(f"{MAIN}:") else entry_point
 
 
 def layers_of(env: object) -> Iterator[Any]:

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from runner.errors import CannotRedo
 from runner.recording.maker import EnvironmentMaker
+from runner.replay.scripts import MAIN, script_of_run, why_not_defined
 from runner.runs.marks import environment_of_job, own_mark
 from runner.util.processes import OWN_ONLY, importing_from
 from runner.util.values import JsonView
@@ -157,7 +158,8 @@ def trusting(
     if mark is None and not trust and os.environ.get(OWN_ONLY):
         raise CannotRedo(SERVED)
     folders = [*(mark.folders if mark else ()), *([str(Path.cwd())] if trust else [])]
-    with importing_from(folders, is_for_good=parent_process() is not None):
+    script = (mark.script, mark.script_digest) if mark else ("", "")
+    with importing_from(folders, is_for_good=parent_process() is not None), script_of_run(*script):
         yield trust or mark is not None
 
 
@@ -290,11 +292,8 @@ def is_left_out(entry_point: str) -> bool:
 def why_not_imported(module: str, trust: bool) -> str:
     """Return why a module may not or cannot be imported; empty if it can be tried."""
     path, root = module.partition(":")[0], _top(module)
-    if root == "__main__":
-        return (
-            "The environment was defined in the script that recorded it, which cannot be imported: move it "
-            "to a module, and name the function that makes it: make='module:function'."
-        )
+    if root == MAIN:
+        return why_not_defined()
     if not trust and root not in PACKAGES and path not in WRAPPERS:
         return f"The environment needs {module}, which is not a known package of environments. {TRUST}"
     try:

@@ -25,6 +25,7 @@ class Rooms(gymnasium.Env[Any, Any]):
     render_mode = "rgb_array"
 
     def __init__(self, with_text: bool = False) -> None:
+        self.with_text = with_text
         inside: dict[str, spaces.Space[Any]] = {
             "position": spaces.Box(-1, 1, (2,), np.float32),
             "doors": spaces.MultiBinary(3),

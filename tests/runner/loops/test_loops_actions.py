@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from gymnasium.vector import SyncVectorEnv
-from making import Rooms
+from gymnasium.wrappers import TransformReward
+from making import Leaving, Rooms
 from starlette.testclient import TestClient
 
 import runner
@@ -27,6 +28,7 @@ from runner.export.reports.report import render_report
 from runner.recording.actions import packed
 from runner.recording.reader import open_recording
 from runner.replay.whole_steps import whole_steps
+from runner.runs.marks import MARK_FILE
 from runner.service.app import create_app
 from runner.service.settings import Settings
 from tests.waiting import until
@@ -211,10 +213,78 @@ def test_values_that_vary_in_size_need_whole_steps(tmp_path):
     assert not runner.list_runs(tmp_path)
 
 
+class Biased(gymnasium.Env):
+    """Keeps its argument in no attribute."""
+
+    observation_space = action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, bias=0.0):
+        self.reward = 1 + bias
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+    def step(self, action):
+        return 1, self.reward, False, False, {}
+
+
+class BiasedGame(Leaving):
+    """The same as a game."""
+
+    def __init__(self, bias=0.0):
+        super().__init__()
+        self.reward = 1 + bias
+
+
+def record_batch(folder, **options):
+    spaces = {"observation_space": Biased.observation_space, "action_space": Biased.action_space}
+    with runner.record_batches("biased", folder, autoreset_mode="NextStep", **spaces, **options) as rec:
+        rec.batch(np.zeros((4, 2), int), np.zeros((3, 2), int), np.ones((3, 2)), np.zeros((3, 2), bool))
+    return rec
+
+
+@pytest.mark.parametrize(
+    ("record", "why"),
+    [
+        (lambda *a, **o: runner.record(Biased(), *a, **o), "Biased could not be recorded"),
+        (lambda *a, **o: runner.record(TransformReward(Biased(), abs), *a, **o), "argument func"),
+        (
+            lambda *a, **o: runner.record_vector(SyncVectorEnv([Biased]), *a, **o),
+            "Biased could not be recorded",
+        ),
+        (lambda *a, **o: runner.record_parallel(BiasedGame(), *a, **o), "BiasedGame could not be recorded"),
+        (record_batch, "known by its name alone"),
+    ],
+)
+def test_actions_alone_need_an_environment_that_can_be_made_again(record, why, tmp_path):
+    with pytest.raises(ConfigError, match=f'steps: .*expected "all".*{why}.*make="module:function"'):
+        record(tmp_path, steps="actions")
+    assert not runner.list_runs(tmp_path)
+    with pytest.warns(RuntimeWarning, match="recorded are whole steps") as warned:
+        rec = record(tmp_path, steps="actions", on_error="warn")
+    rec.close()
+    assert len(warned) == 1
+    assert rec.run.summary["steps_recorded"]
+    rec = record(tmp_path, steps="actions", make=f"{__name__}:Biased")
+    rec.close()
+    assert not rec.run.summary["steps_recorded"]
+
+
+def test_actions_alone_need_an_environment_for_evaluation_that_can_be_made_again(tmp_path):
+    pole = gymnasium.make("CartPole-v1")
+    with (
+        runner.record(pole, tmp_path, steps="actions") as rec,
+        pytest.raises(ConfigError, match="argument func"),
+    ):
+        runner.record(TransformReward(gymnasium.make("CartPole-v1"), abs), into=rec, phase="eval")
+
+
 def test_an_environment_of_ones_own_is_not_imported(tmp_path):
     with runner.record(Rooms(), tmp_path, steps="actions") as rec:
         rec.reset(seed=0)
         rec.step(rec.action_space.sample())
+    (rec.run.folder / MARK_FILE).unlink()
     before = rec.run.recording.read_bytes()
     with pytest.raises(CannotRedo):
         rerecord(rec.run)
@@ -318,6 +388,7 @@ def test_wide_actions_of_many_environments_stay_readable(tmp_path):
         action_space=space,
         autoreset_mode="NextStep",
         steps="actions",
+        make="gymnasium:make_vec",
     ) as rec:
         rec.reset(np.zeros((16, 2), np.float32))
         actions = draws.uniform(-1, 1, (600, 16, 1024))
