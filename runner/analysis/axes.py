@@ -1,4 +1,4 @@
-"""The horizontal axes of metrics: training episodes, environment steps, updates and wall time.
+"""The horizontal axes of metrics: training episodes, environment steps, updates, wall time, logged values.
 
 A moment of a run is known by the training episodes and training steps before it; `Positions` returns where
 such moments are on an axis. Pages, plots, reports, comparisons and exports read axes here.
@@ -6,6 +6,7 @@ such moments are on an axis. Pages, plots, reports, comparisons and exports read
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -37,33 +38,40 @@ class Axis:
     """What it counts: `training steps`."""
     whole: bool
     """Whether its values are whole numbers."""
+    unit: str = ""
 
     @property
     def label(self) -> str:
         """The title with its unit."""
-        return self.title if self.whole else f"{self.title}, seconds"
+        return f"{self.title}, {self.unit}" if self.unit else self.title
 
     def moment(self, value: float) -> str:
-        """Return a value in words: `2,048 training steps`, `12.5 seconds of wall time`."""
-        return f"{value:,.0f} {self.title}" if self.whole else f"{value:,.6g} seconds of {self.title}"
+        """Return a value in words: `2,048 training steps`, `12.5 seconds of wall time`, `epoch 3`."""
+        return self.length(value) if self.whole or self.unit else f"{self.title} {value:,.6g}"
+
+    def length(self, value: float) -> str:
+        """Return the length of a part of the axis in words."""
+        if self.whole:
+            return f"{value:,.0f} {self.title if value != 1 else self.title.removesuffix('s')}"
+        return f"{value:,.6g} {self.unit} of {self.title}".replace("  ", " ")
+
+    def counts(self, name: str) -> bool:
+        """Return whether values logged under a name are positions on the axis."""
+        return name.rpartition("/")[2] in UPDATE_NAMES if self is UPDATES else name == self.name
 
 
 EPISODES: Final = Axis("episodes", "training episodes", whole=True)
 STEPS: Final = Axis("steps", "training steps", whole=True)
 UPDATES: Final = Axis("updates", "updates", whole=True)
-TIME: Final = Axis("time", "wall time", whole=False)
+TIME: Final = Axis("time", "wall time", whole=False, unit="seconds")
 AXES: Final = {axis.name: axis for axis in (EPISODES, STEPS, UPDATES, TIME)}
+LOGGED_STEPS: Final = Axis("steps", "steps", whole=True)
+"""The steps of a run without an environment: those that were given with the values."""
 
 
 def axis_of(name: str) -> Axis:
-    """Return the axis of a name.
-
-    Raises:
-        RunnerError: there is none.
-    """
-    if name not in AXES:
-        raise RunnerError(f"axis: found {name!r}, expected one of {', '.join(AXES)}.{nearest(name, AXES)}")
-    return AXES[name]
+    """Return the axis of a name: one of `AXES`, or else the values logged under this name."""
+    return AXES.get(name) or Axis(name, name, whole=False)
 
 
 @dataclass(frozen=True)
@@ -81,44 +89,53 @@ class Positions:
         if self.axis is EPISODES:
             return np.asarray(episodes, np.float64)
         own = np.asarray(steps, np.float64)
-        if self.axis is STEPS:
+        if self.axis.name == STEPS.name:
             return own
-        if self.axis is UPDATES:  # a count holds until the next one
-            return np.concatenate([[0.0], self.values])[np.searchsorted(self.steps, own, side="right")]
-        return np.interp(own, self.steps, self.values)
+        if self.axis is TIME:
+            return np.interp(own, self.steps, self.values)
+        # a logged value holds until the next one
+        return np.concatenate([[0.0], self.values])[np.searchsorted(self.steps, own, side="right")]
 
     def one(self, episodes: int, steps: int) -> float:
         """Return the position of one moment, an integer where the axis has whole numbers."""
         if self.axis is EPISODES:
             return episodes
-        if self.axis is STEPS:
+        if self.axis.name == STEPS.name:
             return steps
         value = float(self.at(episodes, steps))
         return int(value) if self.axis.whole else value
 
 
 def positions(recording: Recording, axis: Axis) -> Positions:
-    """Return the positions of a recording's moments on an axis."""
+    """Return the positions of a recording's moments on an axis, or on the nearest one that it has.
+
+    Raises:
+        RecordingError: it has no such axis.
+        RunnerError: there is none of this name.
+    """
     steps, values = np.empty(0), np.empty(0)
-    if axis is UPDATES:
-        if recording.has_reports:  # each training step of a job updates its tables
-            return Positions(STEPS, steps, values)
-        steps, values = _updates(recording)
+    if axis is UPDATES and recording.has_reports:  # each training step of a job updates its tables
+        return Positions(STEPS, steps, values)
+    if axis in (EPISODES, STEPS):
+        if not recording.has_environment:
+            axis = LOGGED_STEPS
+        elif axis is EPISODES and not recording.has_reports and not any(recording.done().values()):
+            axis = STEPS  # of values that were logged before the first step
     elif axis is TIME:
         steps, values = _times(recording)
+    elif axis is not LOGGED_STEPS:
+        steps, values = _logged(recording, axis)
     return Positions(axis, steps, values)
 
 
 def axes_of(recording: Recording) -> list[Axis]:
-    """Return the axes that a recording has."""
-    axes = []
+    """Return the axes that a recording has, without those of logged values but updates."""
+    axes: dict[Axis, None] = {}
     for axis in AXES.values():
-        try:
-            positions(recording, axis)
-        except RecordingError:
-            continue
-        axes.append(axis)
-    return axes
+        with contextlib.suppress(RecordingError):
+            own = positions(recording, axis).axis
+            axes[own if own is LOGGED_STEPS else axis] = None
+    return list(axes)
 
 
 def edges_of(axis: Axis, last: float, parts: int) -> Values:
@@ -160,36 +177,45 @@ def _times(recording: Recording) -> tuple[Values, Values]:
     return np.concatenate(steps), np.concatenate(values)
 
 
-def _updates(recording: Recording) -> tuple[Values, Values]:
-    """Return training steps, and the number of updates that the loop logged there.
+def _logged(recording: Recording, axis: Axis) -> tuple[Values, Values]:
+    """Return training steps, and the positions on an axis that the loop logged there.
 
     Of more than 262,144 values every second, fourth, ... is used.
 
     Raises:
-        RecordingError: the numbers of the steps' episodes decrease; compiled code uses them as indices.
+        RecordingError: they decrease, or no updates were logged.
+        RunnerError: nothing else was logged under the name.
     """
     steps: list[int] = []
     values: list[float] = []
     name, every, count = "", 1, 0
     for scalar in recording.decoded(SCALAR_TOPIC):
-        is_count = scalar["phase"] == "train" and scalar["name"].rpartition("/")[2] in UPDATE_NAMES
+        is_count = scalar["phase"] == "train" and axis.counts(scalar["name"])
         if not is_count or scalar["name"] != (name := name or scalar["name"]):
             continue
-        if not (math.isfinite(scalar["value"]) and scalar["value"] >= (values[-1] if values else 0)):
+        step, value = scalar["step"], scalar["value"]
+        is_later = step >= (steps[-1] if steps else 0) and value >= (values[-1] if values else 0)
+        if not (is_later and math.isfinite(value)):
             raise RecordingError(
-                f"{recording.path}: found {scalar['value']:g} updates logged as {name!r} at training step "
-                f"{scalar['step']:,}, expected numbers that do not decrease: it has no axis of updates."
+                f"{recording.path}: found {value:g} logged as {name!r} at training step "
+                f"{step:,}, expected numbers that do not decrease: it has no axis of "
+                f"{axis.title}."
             )
         count += 1
         if count % every == 0:
-            steps.append(scalar["step"])
-            values.append(scalar["value"])
+            steps.append(step)
+            values.append(value)
         if len(steps) > _MAX_KNOWN:
             steps, values, every = steps[1::2], values[1::2], 2 * every
-    if not steps:
+    if not steps and axis is UPDATES:
         raise RecordingError(
             f"{recording.path}: has no axis of updates: nothing was logged as {' or '.join(UPDATE_NAMES)}; "
             'rec.log("updates", COUNT) records it.'
+        )
+    if not steps:
+        raise RunnerError(
+            f"axis: found {axis.name!r}, expected one of {', '.join(AXES)}, or a name under which run "
+            f"{recording.run_id} logged numbers that do not decrease.{nearest(axis.name, AXES)}"
         )
     return np.array(steps, np.float64), np.array(values, np.float64)
 

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.axes import EPISODES, STEPS, Axis, Positions, edges_of, positions
+from runner.analysis.axes import EPISODES, Axis, Positions, edges_of, positions
 from runner.analysis.evaluations import (
     EvaluationRecord,
     TrainingRecord,
@@ -37,6 +37,8 @@ LOGGED: Final = "training.logged."
 """Prefix of the names under which a loop logged values."""
 _MAX_TITLE: Final = 40
 _MAX_POINTS: Final = 200
+_MAX_EXACT: Final = 1_000
+"""The most positions at which the values of a run without an environment are not averaged."""
 _MAX_NAMES: Final = 64
 
 
@@ -70,6 +72,10 @@ class RunSeries:
     """Number of these episodes."""
     is_unended: bool = False
     """Whether no training episode of a loop ended: its length and return are those of the unfinished ones."""
+    averaged: str = ""
+    """What its values are means over, a sentence; empty if each recorded value is there."""
+    names: Sequence[str] = ()
+    """All names under which values were logged, also those that are not read."""
 
     @property
     def finished(self) -> bool:
@@ -104,7 +110,7 @@ def values_left_out(runs: Collection[RunSeries]) -> list[str]:
         if run.not_finite.keys() - {FURTHER_NAMES}
     ] + [
         f"Run {run.run_id}: left out, as they have other names than the first {_MAX_NAMES} that were logged: "
-        f"{count:,} values."
+        f"{count:,} values. Choose others by their names."
         for run in runs
         if (count := run.not_finite.get(FURTHER_NAMES))
     ]
@@ -158,29 +164,35 @@ def parse_target(text: str) -> tuple[str, float]:
 # --- reading ------------------------------------------------------------------------------------------
 
 
-def series_of(paths: Iterable[Path], axis: Axis = EPISODES) -> list[RunSeries]:
+def series_of(paths: Iterable[Path], axis: Axis = EPISODES, metrics: Collection[str] = ()) -> list[RunSeries]:
     """Return the metrics of recordings over an axis, see `read_series`."""
     series = []
     for path in paths:
         with open_recording(path) as recording:
-            series.append(read_series(recording, axis))
+            series.append(read_series(recording, axis, metrics))
     return series
 
 
-def read_series(recording: Recording, axis: Axis = EPISODES) -> RunSeries:
+def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection[str] = ()) -> RunSeries:
     """Return the metrics of a recording over an axis, also of one that was cut off.
 
     The returns and lengths of a loop's training episodes, and the values it logged, are means over at most
-    200 stretches of 1, 2, 5, 10, ... episodes (or steps, ...), so that those of several runs agree. Values
-    that are not finite are left out of the means, and counted in `not_finite`.
+    200 stretches of 1, 2, 5, 10, ... episodes (or steps, ...), so that those of several runs agree. A run of
+    values alone is read as it is if it has at most 1,000 positions. Values that are not finite are left out
+    of the means, and counted in `not_finite`.
+
+    Of the names under which values were logged the first 64 are read; or those among `metrics`, such as
+    `training.logged.loss`, if any are given.
 
     Raises:
         RecordingError: the recording is damaged, or does not have the axis.
     """
     not_finite: Counter[str] = Counter()
-    if axis is EPISODES and not recording.can_train_again and not any(recording.done().values()):
-        axis = STEPS  # values without an environment have the steps that were given with them
     places = positions(recording, axis)
+    axis = axis if recording.has_reports else places.axis
+    averaged = ""
+    names = dict.fromkeys(each.removeprefix(LOGGED) for each in metrics if each.startswith(LOGGED))
+    room = 0 if metrics else _MAX_NAMES
     evaluations = evaluation_records(recording)
     config = recording.config
     recent: Readings = {}
@@ -193,7 +205,7 @@ def read_series(recording: Recording, axis: Axis = EPISODES) -> RunSeries:
         training = [(places.one(each.episode, each.step), training_readings(each)) for each in reports]
     else:
         readings = [_single_agent_unnamed(evaluation_readings(each)) for each in evaluations]
-        training = _loop_training(recording, places, not_finite)
+        training, averaged = _loop_training(recording, places, names, room, not_finite)
         is_unended = not recording.count(schema.TRAIN_EPISODE)
         if recording.status == "finished":
             recent, recent_episodes = _recent_training(recording)
@@ -220,10 +232,14 @@ def read_series(recording: Recording, axis: Axis = EPISODES) -> RunSeries:
         recent=recent,
         recent_episodes=recent_episodes,
         is_unended=is_unended,
+        averaged=averaged,
+        names=list(names),
     )
 
 
 def _environment(recording: Recording) -> str:
+    if not recording.has_environment:
+        return ""
     kwargs = recording.config.get("env", {}).get("kwargs", {})
     name = recording.environment["env_id"].rpartition(":")[2]
     return " ".join([name, *(f"{key}={value}" for key, value in kwargs.items())])
@@ -286,21 +302,45 @@ def _single_agent_unnamed(readings: Readings) -> Readings:
 
 
 def _loop_training(
-    recording: Recording, places: Positions, not_finite: Counter[str]
-) -> list[tuple[float, Readings]]:
-    """Return the means over stretches of training, by the end of the stretch."""
-    done = recording.done()
-    last = float(places.at(done["episodes"], done["train_steps"]))
-    if not any(done.values()):
-        times = (time for time, _ in recording.messages(schema.SCALAR_TOPIC))
-        last = max(times, default=0) / schema.STEP_NANOSECONDS
-    edges = edges_of(places.axis, last, _MAX_POINTS)
+    recording: Recording, places: Positions, names: dict[str, None], room: int, not_finite: Counter[str]
+) -> tuple[list[tuple[float, Readings]], str]:
+    """Return the means over stretches of training, by the end of the stretch, and a sentence on these.
+
+    All names under which values were logged are added to `names`. Those that are in it are read, and `room`
+    further ones.
+    """
+    edges, averaged = _edges(recording, places)
     training = _mean_episodes(recording, places, edges, not_finite)
-    for name, values in _mean_scalars(recording, places, edges, not_finite).items():
+    means, has_several = _mean_scalars(recording, places, edges, names, room, not_finite)
+    for name, values in means.items():
         for k in np.flatnonzero(~np.isnan(values)).tolist():
             training.setdefault(k, {})[f"{LOGGED}{name}"] = {"": float(values[k])}
     ends = (edges.astype(np.int64) if places.axis.whole else edges).tolist()
-    return [(ends[k + 1], readings) for k, readings in training.items()]
+    if has_several:
+        averaged = averaged or "Values at the same position are averaged."
+    return [(ends[k + 1], readings) for k, readings in training.items()], averaged
+
+
+def _edges(recording: Recording, places: Positions) -> tuple[NDArray[np.float64], str]:
+    """Return the edges of stretches, and a sentence on them if not each position has one of its own."""
+    if recording.has_environment:
+        done = recording.done()
+        last = float(places.at(done["episodes"], done["train_steps"]))
+        first = 0.0
+    else:
+        steps: set[int] = set()
+        last_step = 0
+        for scalar in recording.decoded(schema.SCALAR_TOPIC):
+            last_step = max(last_step, int(scalar["step"]))
+            if len(steps) <= _MAX_EXACT:
+                steps.add(int(scalar["step"]))
+        if len(steps) <= _MAX_EXACT:
+            ends = np.unique(places.at(0, sorted(steps)))
+            return np.concatenate([ends[:1] - 1, ends]) if len(ends) else np.arange(2.0), ""
+        last = float(places.at(0, last_step))
+        first = -1.0 if places.axis.whole else 0.0  # so that a stretch is steps 0 to 99, not 1 to 100
+    edges = edges_of(places.axis, last - first, _MAX_POINTS) + first
+    return edges, f"Means over stretches of {places.axis.length(float(edges[1] - edges[0]))}."
 
 
 def _mean_episodes(
@@ -372,19 +412,29 @@ def _recent_training(recording: Recording) -> tuple[Readings, int]:
 
 
 def _mean_scalars(
-    recording: Recording, places: Positions, edges: NDArray[np.float64], not_finite: Counter[str]
-) -> dict[str, NDArray[np.float64]]:
-    """Return the means of the values logged under each name in each stretch; NaN where there are none."""
+    recording: Recording,
+    places: Positions,
+    edges: NDArray[np.float64],
+    names: dict[str, None],
+    room: int,
+    not_finite: Counter[str],
+) -> tuple[dict[str, NDArray[np.float64]], bool]:
+    """Return the means of the values logged under each name in each stretch; NaN where there are none.
+
+    Also whether any is the mean of several values.
+    """
     ends = edges[1:].tolist()
     bins = len(ends)
     after = (0, 0)  # training steps, and the episodes that ended in them
+    wanted = set(names)
     sums: dict[str, NDArray[np.float64]] = {}
     counts: dict[str, NDArray[np.float64]] = {}
     for scalar in recording.decoded(schema.SCALAR_TOPIC):
         name = scalar["name"] if scalar["phase"] == "train" else f"{scalar['name']} ({scalar['phase']})"
         if name not in sums:
-            if len(sums) == _MAX_NAMES:
-                not_finite[FURTHER_NAMES] += 1
+            names[name] = None
+            if name not in wanted and len(sums) >= room:
+                not_finite[FURTHER_NAMES] += bool(room)
                 continue
             sums[name], counts[name] = np.zeros(bins), np.zeros(bins)
         if not abs(scalar["value"]) <= LARGEST:
@@ -399,7 +449,8 @@ def _mean_scalars(
         sums[name][k] += scalar["value"]
         counts[name][k] += 1
     with np.errstate(invalid="ignore"):
-        return {name: sums[name] / counts[name] for name in sums}
+        means = {name: sums[name] / counts[name] for name in sums}
+    return means, any((own > 1).any() for own in counts.values())
 
 
 def training_step(scalar: Message) -> int:

@@ -204,7 +204,7 @@ PICTURE_SIZE: Final = Parsed(
 )
 GRID: Final = Parsed("RxC", "ROWSxCOLUMNS up to 8x8, such as 3x3", lambda text: _pair(text, 8))
 TARGET: Final = Parsed("METRIC=LEVEL", "METRIC=LEVEL such as success_percent=80", _target)
-AXIS: Final = Parsed("axis", "episodes, steps, updates or time", _axis)
+AXIS: Final = Parsed("axis", "episodes, steps, updates, time or a logged name", _axis)
 STEP: Final = Parsed("step", "EPISODE:T, or eval:N:TRIAL:T", _step)
 PLACE: Final = Parsed("step", "EPISODE:T, step:N, or eval:N:TRIAL:T", _place)
 DIRECTORY: Final = click.Path(file_okay=False, path_type=Path)

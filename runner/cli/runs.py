@@ -139,7 +139,7 @@ def opened_run(
 
     run = find_recorded(run_name, recordings)
     with open_recording(run.recording) as recording:
-        if needs_steps:
+        if needs_steps and recording.has_environment:
             require_steps(recording, "export")
         yield run, recording
         for shortcoming in shortcomings(recording):

@@ -69,6 +69,8 @@ def why_no_steps(recording: Recording) -> str:
             f"they were left out (steps: {recording.config['recording']['steps']}); "
             f"`dualtaxi rerecord {recording.run_id}` records them"
         )
+    if not recording.has_environment:
+        return "values were logged, and no environment was recorded"
     return "it ended before one was recorded"
 
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
+from typing import Final
 
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names, actions_in_words
@@ -34,7 +35,15 @@ from runner.recording.metadata import (
 )
 from runner.recording.run_file import Summary, parse_result
 from runner.recording.schema import Topic
-from runner.util.values import Json
+from runner.util.values import Json, JsonView
+
+NO_ENVIRONMENT: Final = "none"
+"""The environment's id in the configuration of a run of logged values alone."""
+
+
+def has_environment(config: JsonView) -> bool:
+    """Return whether a run of this configuration has an environment, and not logged values alone."""
+    return config.get("env") != {"id": NO_ENVIRONMENT, "kwargs": {}}
 
 
 class RunDescription(ABC):
@@ -345,6 +354,11 @@ class RunDescription(ABC):
     def own_environments(self) -> int:
         """How many environments resets name: those of all shards, or those that took turns."""
         return sum(shard.environments for shard in self.shards) or self.environments
+
+    @property
+    def has_environment(self) -> bool:
+        """Whether it is about an environment, and not logged values alone."""
+        return has_environment(self.config)
 
     @property
     def leaves_out_steps(self) -> bool:

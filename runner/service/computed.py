@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis import diff as differences
-from runner.analysis.axes import AXES, EPISODES, axes_of, axis_of
+from runner.analysis.axes import AXES, EPISODES, Axis, axes_of, axis_of
 from runner.analysis.compare import compare
 from runner.analysis.compare.moments import moment_of
 from runner.analysis.compare.score_table import MIN_MAX, parse_table
@@ -30,7 +30,13 @@ from runner.analysis.groups import grouped, groups_of, metrics_of, require_two
 from runner.analysis.histograms import histograms
 from runner.analysis.panels import Curve, NoMetrics, Panel, panels_of, smoothed
 from runner.analysis.qtable import describe_tables, one_array, replay_at
-from runner.analysis.series import parse_target, read_series, series_of
+from runner.analysis.series import (
+    RunSeries,
+    parse_target,
+    read_series,
+    series_of,
+    values_left_out,
+)
 from runner.export.plots.curves import curves_sheet
 from runner.export.plots.image import check_suffix, save
 from runner.export.plots.style import CurveStyle
@@ -45,6 +51,8 @@ from runner.util.values import Json, finite
 
 TABLE_NAME: Final = "scores.csv"
 """Stands for a table of scores in messages."""
+MAX_NAMES: Final = 10_000
+"""The most names of logged values in a response."""
 RecordKind = Literal["evaluations", "training", "optimality"]
 
 
@@ -110,6 +118,12 @@ class Curves:
     axes: list[AxisInfo]
     groups: list[CurveGroup]
     curves: list[ShownCurve]
+    averaged: str
+    """What the values of loops are means over; empty if every recorded point is there."""
+    notes: list[str]
+    """What is left out, a sentence each."""
+    names: list[str]
+    """Names of logged values, the first 10,000, of which `training.logged.NAME` is a metric."""
 
 
 def curves(
@@ -124,16 +138,20 @@ def curves(
 ) -> bytes:
     """Return the metrics of runs over an axis as JSON, runs that differ only in the seed as one curve.
 
-    All metrics if none are named; positions from `start` to before `stop`; curves of more than `points` are
-    thinned, 0 is no limit; `lines` adds the single runs of a curve, `smooth` exponential means with a
-    memory of this percentage of the part shown.
+    All metrics if none are named, with the first 64 names of logged values; positions from `start` to before
+    `stop`; curves of more than `points` are thinned, 0 is no limit; `lines` adds the single runs of a curve,
+    `smooth` exponential means with a memory of this percentage of the part shown.
     """
-    series, common = [], list(AXES.values())
+    series: list[RunSeries] = []
+    common: list[Axis] = []
     for path in [paths] if isinstance(paths, Path) else paths:
         with open_recording(path) as recording:
-            series.append(read_series(recording, axis_of(axis)))
             own = axes_of(recording)
-            common = [each for each in common if each in own]
+            common = [each for each in common if each in own] if series else own
+            series.append(read_series(recording, axis_of(axis), metrics))
+    over = series[0].axis if series else axis_of(axis)
+    if over not in common and axis not in AXES:
+        common.append(over)
     groups = groups_of(series)
     shown: list[ShownCurve] = []
     with contextlib.suppress(NoMetrics):
@@ -145,10 +163,13 @@ def curves(
                     _shown_curve(panel, curve, start, stop, points, lines, memory) for curve in panel.curves
                 ]
     result = Curves(
-        axis,
+        over.name,
         [AxisInfo(each.name, each.title, each.label) for each in common],
         [CurveGroup(group.label, [run.run_id for run in group.runs], group.left_out) for group in groups],
         shown,
+        " ".join(dict.fromkeys(run.averaged for run in series if run.averaged)),
+        values_left_out(series),
+        list(dict.fromkeys(name for run in series for name in run.names))[:MAX_NAMES],
     )
     return as_json(result)
 
@@ -297,7 +318,7 @@ def comparison(
     require_scipy()
     over = axis_of(axis)
     chosen, names = moment_of(moment, parse_target(target) if target else None, metrics, over)
-    series = series_of(paths, over)
+    series = series_of(paths, over, names)
     if normalise is not None:
         table = None if normalise == MIN_MAX else parse_table(normalise, TABLE_NAME)
         return as_json(compare_algorithms(series, table, by, names, chosen))

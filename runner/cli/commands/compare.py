@@ -113,7 +113,7 @@ def compare_command(
     read_at, chosen = moment_of(moment, target, metrics, axis)
     runs = find_all_recorded(run_names, recordings)
     with stage_line("reading runs") as stage:
-        series = series_of((run.recording for run in runs), axis)
+        series = series_of((run.recording for run in runs), axis, chosen)
         stage("computing intervals")
         made = _compare(series, by, chosen, read_at, normalise, html is not None)
         if html is not None:

@@ -116,6 +116,7 @@ def _print_code(run: Run, as_json: bool) -> None:
 def _parts(details: RunDetails, branches: Mapping[str, Origin]) -> list[RenderableType]:
     from runner.analysis.summary import brief_provenance
     from runner.cli.evaluations import evaluation_table
+    from runner.recording.description import has_environment
     from runner.recording.reader import open_recording
 
     run = details.run
@@ -151,7 +152,7 @@ def _parts(details: RunDetails, branches: Mapping[str, Origin]) -> list[Renderab
     given = dict(details.config)
     if (frames := given.get("frames")) and isinstance(frames, Mapping) and not frames.get("every"):
         del given["frames"]
-    if given.get("env") == {"id": "none", "kwargs": {}}:  # only values were logged
+    if not has_environment(given):
         del given["env"]
     config = {key: _yaml(value) for key, value in given.items() if value not in ([], {})}
     parts += [title("Configuration"), facts(config)]

@@ -92,7 +92,8 @@ def curves_sheet(groups: Sequence[Group], panels: Sequence[Panel], style: CurveS
 def footnote(groups: Sequence[Group], panels: Sequence[Panel], style: CurveStyle = PLAIN) -> str:
     """Return what lines and bands mean, and which values are not drawn."""
     runs = [run for group in groups for run in group.runs]
-    left_out = "".join(f" {sentence}" for sentence in values_left_out(runs)) + not_drawn(panels, style)
+    sentences = [*dict.fromkeys(run.averaged for run in runs), *values_left_out(runs)]
+    left_out = "".join(f" {sentence}" for sentence in sentences if sentence) + not_drawn(panels, style)
     if style.smooth:
         left_out = (
             f" Lines are exponential means with a memory of {style.smooth:g} % of the axis; "

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from runner.analysis.axes import AXES
+from runner.analysis.axes import axis_of
 from runner.analysis.histograms import Histogram
 from runner.drawing import palette
 from runner.environments.naming import spoken
@@ -47,7 +47,7 @@ def heatmap_chart(histogram: Histogram) -> Chart:
     rows = counts.shape[1]
     names = [shortened(name, _MAX_LETTERS) for name in histogram.names]
     left = max(56.0, 16 + _LETTER * max(map(len, names), default=0))
-    axis, x = AXES[histogram.axis], Scale(0.0, histogram.edges[-1], left, WIDTH - 16)
+    axis, x = axis_of(histogram.axis), Scale(0.0, histogram.edges[-1], left, WIDTH - 16)
     low, high = (0.0, float(rows)) if histogram.names else (histogram.values[0], histogram.values[-1])
     y = Scale(low, high, HEIGHT - 34, 34.0)
     title = title_of(histogram)

@@ -47,8 +47,20 @@ Stop = Annotated[
 Step = Annotated[int | None, Query(ge=0, lt=2**62, description="After this number of training steps.")]
 Episode = Annotated[int | None, Query(ge=0, lt=2**62, description="After this number of training episodes.")]
 PhasePath = Annotated[Phase, Path(description="`train`, or `eval`: the trials of evaluations.")]
-AxisName = Annotated[str, Query(max_length=20, description=f"The horizontal axis: one of {', '.join(AXES)}.")]
-Metrics = Annotated[list[str] | None, Query(max_length=100, description="Default: all.")]
+AxisName = Annotated[
+    str,
+    Query(
+        max_length=1000,
+        description=f"The horizontal axis: one of {', '.join(AXES)}, or a name of logged values.",
+    ),
+]
+Metrics = Annotated[
+    list[str] | None,
+    Query(
+        max_length=100,
+        description="Default: all, with the first 64 names of logged values; `training.logged.NAME` for any.",
+    ),
+]
 FirstPosition = Annotated[float, Query(ge=0, allow_inf_nan=False, description="The first position.")]
 LastPosition = Annotated[
     float | None, Query(ge=0, allow_inf_nan=False, description="The first position not included.")

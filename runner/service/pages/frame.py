@@ -9,6 +9,7 @@ from runner.analysis.evaluations import loop_summary
 from runner.errors import RecordingError
 from runner.export.reports.rendering import View
 from runner.recording import schema
+from runner.recording.description import has_environment
 from runner.recording.metrics import EvaluationMetric
 from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics, Summary
@@ -57,7 +58,12 @@ class RunView(View):
 
 def head_of(run: Run) -> RunHead:
     """Return the facts of a run that all of its pages show."""
+    has_episodes = has_environment(run.file.config)
     has_tab = {
+        "replay": has_episodes,
+        "episodes": has_episodes,
+        "evaluations": has_episodes,
+        "rerun": has_episodes,
         "learned": has_tables(run),
         "when": has_tables(run),
         "why": has_tables(run),

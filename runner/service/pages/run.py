@@ -21,6 +21,7 @@ from runner.analysis.sections import Section
 from runner.client.jobs import RunProgress
 from runner.errors import RecordingError, RunnerError
 from runner.export.reports.rendering import View
+from runner.recording.description import has_environment
 from runner.recording.labels import MAX_NOTE
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
@@ -219,9 +220,12 @@ def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:
     summary = live or (_done_by(run) if not run.can_train_again and run.status == "running" else run.summary)
     episodes = summary.get("episode", summary.get("episodes"))
     trial_steps = summary.get("eval_steps")
-    facts = _results(run, EvaluationMetrics.of(summary.get("last_evaluation") or {})) | {
+    taken = {
         "Training episodes": humanize.number(episodes, 0),
         "Training steps": humanize.number(summary.get("train_steps"), 0),
+    }
+    facts = _results(run, EvaluationMetrics.of(summary.get("last_evaluation") or {})) | {
+        **(taken if has_environment(run.file.config) else {}),
         **({"Evaluation steps": humanize.number(trial_steps, 0)} if trial_steps or live else {}),
         "Time": _duration(run),
         **({"Other processes": f"{others}, added at the end"} if (others := shards_in_words(run)) else {}),

@@ -236,6 +236,29 @@ def test_logged_pictures_are_shown_newest_first_with_their_steps(client, recordi
     assert "No picture was logged" in page_of(client, "/runs/first/pictures")
 
 
+def test_a_run_of_values_alone_has_their_curves_and_no_empty_pages(client, recordings):
+    with SummaryWriter("runs/alone", recordings=recordings, monitor_gym=False) as writer:
+        for step in range(20):
+            writer.add_scalars("v", {str(i): i + step for i in range(100)}, step)
+    page = page_of(client, "/runs/alone")
+    tabs = re.findall(r'<li><a href="/runs/\w+/?(\w*)"', page[page.index("tabs") :])
+    assert tabs == ["", "config", "code", "system", "console"]
+    assert "Training steps" not in page
+    curves = client.get("/api/v1/curves?run=alone").json()
+    assert ([axis["label"] for axis in curves["axes"]], curves["axis"]) == (
+        ["steps", "wall time, seconds"],
+        "steps",
+    )
+    assert [len(curve["positions"]) for curve in curves["curves"]] == [20] * 64
+    assert (curves["averaged"], len(curves["names"])) == ("", 100)
+    assert "720 values. Choose others by their names" in curves["notes"][0]
+    curves = client.get("/api/v1/curves?run=alone&axis=v/0&metric=training.logged.v/99").json()
+    assert [(one["metric"], one["values"][:2]) for one in curves["curves"]] == [
+        ("training.logged.v/99", [99.0, 100.0])
+    ]
+    assert (curves["axis"], curves["notes"]) == ("v/0", [])
+
+
 def test_the_time_and_the_machine_are_shown(client, recordings):
     with runner.record(make("CartPole-v1"), recordings, name="alone", system=False) as env:
         list(play(env, 50))

@@ -9,6 +9,7 @@ const plots = box.querySelector("[data-plots]"), message = box.querySelector("[d
 const form = box.querySelector("form"), fields = form.elements;
 const COLOURS = 7;  // of lines, in the style
 const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3]];
+const MAX_AXES = 100;  // logged values among the axes to choose from
 const SHARES = "training.reward";
 const shown = new Map();
 let requests = 0, last = null;
@@ -20,13 +21,14 @@ function chosen() {
   const number = (name) => query.get(name) ? Number(query.get(name)) : null;
   return {
     axis: query.get("axis") ?? "episodes", from: number("from"), to: number("to"), smooth: number("smooth") ?? 0,
-    log_x: query.has("log_x"), log_y: query.has("log_y"), lines: query.has("lines"),
+    log_x: query.has("log_x"), log_y: query.has("log_y"), lines: query.has("lines"), logged: query.get("logged") ?? "",
   };
 }
 
 function fill(state) {
   for (const name of ["from", "to"]) fields[name].value = state[name] ?? "";
   for (const name of ["log_x", "log_y", "lines"]) fields[name].checked = state[name];
+  fields.logged.value = state.logged;
   fields.smooth.value = state.smooth;
   fields.smoothed.value = state.smooth ? `${state.smooth} % of the axis` : "none";
 }
@@ -34,7 +36,7 @@ function fill(state) {
 function change(changes, keep = true) {
   const query = new URLSearchParams(location.search);
   for (const [name, value] of Object.entries(changes)) {
-    if (value === null || value === false || value === 0 || value === "episodes") query.delete(name);
+    if (value === null || value === false || value === 0 || value === "" || value === "episodes") query.delete(name);
     else query.set(name, value === true ? "1" : value);
   }
   if (keep) history.pushState(null, "", query.size ? `?${query}` : location.pathname);
@@ -45,19 +47,23 @@ function change(changes, keep = true) {
 // --- data -----------------------------------------------------------------------------------------------
 
 async function draw() {
-  const mine = ++requests, { axis, from, to, lines, smooth } = chosen();
+  const mine = ++requests, { axis, from, to, lines, smooth, logged } = chosen();
   const query = new URLSearchParams({ axis, points: Math.max(400, Math.round(plots.clientWidth)) });
   for (const run of runs) query.append("run", run.id);
   if (from !== null) query.set("start", Math.max(0, from));
   if (to !== null) query.set("stop", axis === "time" ? to : to + 1);
   if (lines) query.set("lines", "true");
   if (smooth) query.set("smooth", smooth);
+  if (logged) query.set("metric", `training.logged.${logged}`);
   box.setAttribute("aria-busy", "true");
   try {
     const found = await request(`/api/v1/curves?${query}`);
     if (mine !== requests) return;
     last = found;
-    fields.axis.replaceChildren(...found.axes.map(({ name, label }) => new Option(label, name, false, name === axis)));
+    const named = found.axes.map(({ name }) => name), others = found.names.filter((name) => !named.includes(name)).slice(0, MAX_AXES);
+    fields.axis.replaceChildren(...[...found.axes, ...others.map((name) => ({ name, label: name }))].map(({ name, label }) => new Option(label, name, false, name === found.axis)));
+    box.querySelector("[data-names]").hidden = found.names.length < 2;
+    fields.logged.list.replaceChildren(...found.names.map((name) => new Option(name)));
     box.querySelector("[data-seeds]").hidden = found.groups.every((group) => group.runs.length < 2);
     found.groups.forEach((group, i) => group.runs.forEach((id) => {  // the colours of the runs above
       const swatch = document.querySelector(`.swatch[data-run="${id}"]`);
@@ -83,10 +89,10 @@ function show() {
   const thinned = last.curves.filter((curve) => curve.thinned), repeated = last.groups.flatMap((group) => group.left_out);
   const parts = [!last.curves.length ? "No metrics were recorded."
     : thinned.length ? `Thinned: of up to ${Math.max(...thinned.map((curve) => curve.of)).toLocaleString("en")} points a curve the lowest and highest of each stretch are drawn. Zoom in for all of them.`
-      : "Every recorded point is drawn. Drag across a plot to zoom; double click shows all."];
+      : `${last.averaged || "Every recorded point is drawn."} Drag across a plot to zoom; double click shows all.`];
   if (last.groups.some((group) => group.runs.length > 1)) parts.push("Runs that differ only in the seed: interquartile mean with its 95 % interval; below four runs, mean and range.");
   if (repeated.length) parts.push(`Left out, as the same run is there: ${repeated.map(named).join(", ")}.`);
-  message.textContent = parts.join(" ");
+  message.textContent = [...parts, ...last.notes].join(" ");
 }
 
 function rank(metric) {
@@ -289,6 +295,7 @@ form.addEventListener("submit", (event) => {
   go(end("from"), end("to"));
 });
 fields.axis.addEventListener("change", () => { change({ axis: fields.axis.value, from: null, to: null }); draw(); document.dispatchEvent(new Event("axischange")); });
+fields.logged.addEventListener("change", () => { change({ logged: fields.logged.value }); draw(); });
 fields.lines.addEventListener("change", () => { change({ lines: fields.lines.checked }); draw(); });
 for (const name of ["log_x", "log_y"]) fields[name].addEventListener("change", () => { change({ [name]: fields[name].checked }); if (last) show(); });
 let sliding = 0;
