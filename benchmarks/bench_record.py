@@ -73,6 +73,7 @@ def measure(quick: bool) -> list[Figure]:
         figures += _extras(Path(folder), steps, repetitions)
         figures += _short(Path(folder), 100 if quick else 1_000, repetitions)
         figures += _logging(Path(folder), steps, repetitions)
+        figures += _infos(Path(folder), steps // 20, repetitions)
         figures += _memory(Path(folder), 10_000_000 if not quick else 1_000_000)
     return figures
 
@@ -306,6 +307,34 @@ def _logging(folder: Path, steps: int, repetitions: int) -> list[Figure]:
                 env.log("value", k + 0.5)
             spent.append((time.process_time() - begin) / steps * 1e6)
     return [figure("log of a number", spent, "us", (4, 2), higher_is_better=False)]
+
+
+class Pictured(Observed):
+    """An environment whose infos have a picture."""
+
+    picture = np.random.default_rng(0).integers(0, 256, (84, 84, 4), dtype=np.uint8)
+
+    def step(self, action: Any) -> Any:
+        """Return the same step each time, with the picture."""
+        return *super().step(action)[:4], {"picture": self.picture}
+
+
+def _infos(folder: Path, steps: int, repetitions: int) -> list[Figure]:
+    """Return what recording a picture in the info adds to a step."""
+    added = []
+    for _ in range(repetitions):
+        spent = []
+        for info in ((), ("*",)):
+            with runner.record(
+                Pictured(np.zeros((1, 4), np.float32), "a"), folder / "recordings", info=info
+            ) as env:
+                env.reset()
+                begin = time.thread_time()
+                for _ in range(steps):
+                    env.step(0)
+                spent.append(time.thread_time() - begin)
+        added.append((spent[1] - spent[0]) / steps * 1e6)
+    return [figure("info with a picture, 84x84x4", added, "us", (60, 30), higher_is_better=False)]
 
 
 def _memory(folder: Path, steps: int) -> list[Figure]:

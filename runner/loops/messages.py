@@ -6,7 +6,7 @@ import json
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
@@ -26,10 +26,10 @@ from runner.recording.reset_states import ResetState
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.runs.checkpoints import MAX_CHECKPOINTS
 from runner.runs.store import Store
-from runner.util.jsonable import as_json
+from runner.util.jsonable import as_json, is_packed, packed
 from runner.util.values import is_utf8
 
-MAX_INFO_BYTES: Final = 1 << 20
+MAX_INFO_BYTES: Final = 4 << 20
 """The most bytes of JSON for the info of one step."""
 _MAX_WAITING: Final = 1024
 """Logged numbers, or states, that wait for the recorder; it gets them twice a second at the latest."""
@@ -37,6 +37,20 @@ _MAX_SERIES: Final = 4096
 """The most names of logged numbers whose encoders are kept at hand."""
 _LONG_NAME: Final = 200
 """Numbers under longer names do not wait, because together they would be large."""
+
+
+def _info_text(what: str, value: Any, limit: int) -> str:
+    """Return a field of an info as JSON of at most `limit` bytes."""
+    text, is_array = "", is_packed(value)
+    if is_array and value.nbytes <= limit:
+        array = packed(value)
+        data = array.pop("base64")  # has nothing to escape, so the encoder need not look at it
+        text = f'{json.dumps(array)[:-1]}, "base64": "{data}"' + "}"
+    elif not is_array:
+        text = json.dumps(as_json(value, packs=True))
+    if not 0 < len(text) <= limit:
+        raise ValueError(f"{what} takes more than {MAX_INFO_BYTES:,} bytes of JSON")
+    return text
 
 
 class LoopState(Protocol):
@@ -218,9 +232,7 @@ class Messages:
         pieces, size = [], 0
         for key, value in fields.items():
             try:
-                text = json.dumps(as_json(value))
-                if size + len(text) > MAX_INFO_BYTES:
-                    raise ValueError(f"{what} takes more than {MAX_INFO_BYTES:,} bytes of JSON")
+                text = _info_text(what, value, MAX_INFO_BYTES - size)
             except (ValueError, RecursionError) as error:
                 text = json.dumps(f"not recorded: {error}")
                 self._loop.warn_once(

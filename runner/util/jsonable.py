@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import binascii
 import dataclasses
 import math
 import os
@@ -13,21 +14,60 @@ from typing import Any, Final
 
 import numpy as np
 
+from runner.util.arrays import Array
+
 MAX_VALUES: Final = 4_000_000
 _MAX_REPR: Final = 10_000
+_MAX_LISTED: Final = 64
+"""The most numbers of an array that are written as a list where arrays may be packed."""
 
 
-def as_json(value: object) -> Any:
+def as_json(value: object, packs: bool = False) -> Any:
     """Return a value as JSON can hold it; what it cannot hold as its `repr`.
 
     Arrays and sets become lists, dataclasses and namespaces mappings, paths text; NaN and infinities become
     text.
 
+    Args:
+        packs: write arrays of more than 64 numbers as their bytes, which `unpacked` returns exactly.
+
     Raises:
         ValueError: the value contains itself, or more than 4,000,000 values.
         RecursionError: it is nested too deeply.
     """
-    return _Conversion().of(value)
+    return _Conversion(packs).of(value)
+
+
+def is_packed(value: object) -> bool:
+    """Return whether a value is an array that is written as its bytes where arrays may be packed."""
+    return isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and value.size > _MAX_LISTED
+
+
+def packed(array: Array) -> dict[str, object]:
+    """Return an array as JSON: its dtype, its shape, and its bytes in C order as base64."""
+    data = binascii.b2a_base64(array.tobytes(), newline=False).decode()
+    return {"dtype": array.dtype.str, "shape": list(array.shape), "base64": data}
+
+
+def unpacked(value: Any) -> Any:
+    """Return JSON with each array that `packed` wrote as an array again.
+
+    Raises:
+        ValueError: an object has the keys of a packed array, and is none.
+    """
+    if isinstance(value, list):
+        return [unpacked(part) for part in value]
+    if not isinstance(value, dict):
+        return value
+    if value.keys() != {"dtype", "shape", "base64"}:
+        return {key: unpacked(part) for key, part in value.items()}
+    try:
+        dtype = np.dtype(value["dtype"])
+        if dtype.kind not in "biuf":
+            raise ValueError(f"found {dtype}, expected numbers")
+        return np.frombuffer(binascii.a2b_base64(value["base64"]), dtype).reshape(value["shape"]).copy()
+    except TypeError as error:
+        raise ValueError(f"found {error}, expected dtype, shape and base64 of an array") from error
 
 
 def as_mapping(value: object) -> Mapping[Any, Any] | None:
@@ -47,14 +87,16 @@ def as_mapping(value: object) -> Mapping[Any, Any] | None:
 class _Conversion:
     """One conversion, bounded: a graph of few objects can stand for endless JSON."""
 
-    def __init__(self) -> None:
-        self._left = MAX_VALUES
+    def __init__(self, packs: bool) -> None:
+        self._packs, self._left = packs, MAX_VALUES
         self._path: set[int] = set()
 
     def of(self, value: Any) -> Any:
         self._count(1)
         if isinstance(value, Enum):
             value = value.value
+        elif self._packs and is_packed(value):
+            return packed(value)
         elif isinstance(value, np.generic | np.ndarray) and value.dtype.kind in "biufU":
             self._count(value.size)
             value = value.tolist()
