@@ -326,7 +326,7 @@ def _infos(folder: Path, steps: int, repetitions: int) -> list[Figure]:
         spent = []
         for info in ((), ("*",)):
             with runner.record(
-                Pictured(np.zeros((1, 4), np.float32), "a"), folder / "recordings", info=info
+                Pictured(np.zeros((steps + 1, 4), np.float32), "a"), folder / "recordings", info=info
             ) as env:
                 env.reset()
                 begin = time.thread_time()
