@@ -1,4 +1,8 @@
-"""The Q-tables at a step: their size and fill, one state with its history, all values as one array."""
+"""The Q-tables at a step: their size and fill, one state with its history, all values as one array.
+
+Of a job they are exact at every step. A loop's are the arrays of a state's and an action's numbers that it
+recorded by `snapshot`, of each name the latest.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +12,9 @@ from typing import NotRequired, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.environments.naming import action_names, actions_in_words, states_in_words
-from runner.errors import RunnerError
+from runner.environments.naming import action_names, actions_in_words, numbered, state_of, states_in_words
+from runner.errors import NotInRecording, RunnerError
+from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.history import history_of
 from runner.replay.steps import last_step, step_of_episode
@@ -26,6 +31,8 @@ class TableSummary(TypedDict):
     percent_filled: float
     lowest: float
     highest: float
+    snapshot_step: NotRequired[int]
+    """Of a loop: after how many training steps it was recorded."""
 
 
 class ActionValue(TypedDict):
@@ -38,7 +45,8 @@ class ActionValue(TypedDict):
     policy: NotRequired[float]
     """Probability of the action, where the algorithm learns a policy."""
     greedy: bool
-    visits: int
+    visits: int | None
+    """None if a loop did not record all its steps; so are the changes, of a loop's table."""
     changed_step: int | None
     changed_episode: int | None
 
@@ -51,25 +59,94 @@ class TablesDescription(TypedDict):
     tables: list[TableSummary]
     state: NotRequired[int]
     state_in_words: NotRequired[str]
-    visits: NotRequired[int]
+    visits: NotRequired[int | None]
     """Visits to the state up to the step."""
     values: NotRequired[list[ActionValue]]
 
 
-def replay_at(recording: Recording, step: int | None = None, episode: int | None = None) -> TableReplay:
-    """Return the tables after a number of training steps, or episodes; by default after the last."""
+def describe_tables(
+    recording: Recording, step: int | None = None, episode: int | None = None, state: int | str | None = None
+) -> tuple[TablesDescription, NDArray[np.float64]]:
+    """Return the tables after a number of training steps, or episodes, by default after the last.
+
+    Args:
+        state: a number or a name; its values are part of the description.
+
+    Returns:
+        What JSON can hold, and the tables as `one_array` returns them.
+
+    Raises:
+        RecordingError: they are not recorded.
+        RunnerError: there is no such state.
+    """
     if episode is not None:
         step = step_of_episode(recording, episode)
-    return TableReplay(recording, last_step(recording) if step is None else step)
-
-
-def describe_tables(recording: Recording, replay: TableReplay, state: int | None = None) -> TablesDescription:
-    """Return the tables at the step of a replay as JSON can hold them, with a state's values if given."""
+    if not recording.can_train_again:
+        return _describe_snapshots(recording, step, state)
+    step = last_step(recording) if step is None else step
+    number = state_of(recording.mdp, state) if isinstance(state, str) else state
+    replay = TableReplay(recording, step)
     tables = [summarize(agent, q) for agent, q in zip(replay.agents, replay.tables, strict=True)]
     description: TablesDescription = {"run_id": recording.run_id, "step": replay.step, "tables": tables}
+    if number is not None:
+        _add_state(description, recording, replay, number)
+    return description, one_array(replay.tables)
+
+
+def _describe_snapshots(
+    recording: Recording, step: int | None, state: int | str | None
+) -> tuple[TablesDescription, NDArray[np.float64]]:
+    """Return the latest tables that a loop recorded, or those at a step."""
+    shape = tuple(recording.spaces[name].get("n") for name in ("observation", "action"))
+    if None in shape or not recording.has_states:
+        recording.require_job("a Q-table", "A loop has one where states and actions are Discrete.")
+    arrays = [array for array in recording.arrays() if array.values.shape == shape and array.phase == "train"]
+    last = max([recording.count(schema.TRAIN_STEP), *(array.step for array in arrays)])
+    latest = {array.name: array for array in arrays if step is None or array.step <= step <= last}
+    if not latest:
+        raise NotInRecording(
+            f"{recording.path}: found no table after {last if step is None else step:,} of {last:,} training "
+            f"steps, expected an array of shape {list(shape)}, such as a loop records by "
+            '`rec.snapshot("q", q)`.'
+        )
+    tables = {name: array.values.astype(np.float64) for name, array in latest.items()}
+    description: TablesDescription = {
+        "run_id": recording.run_id,
+        "step": last if step is None else step,
+        "tables": [{**summarize(name, q), "snapshot_step": latest[name].step} for name, q in tables.items()],
+    }
     if state is not None:
-        _add_state(description, recording, replay, state)
-    return description
+        states = states_in_words(recording.mdp) if recording.tabular else range(shape[0])
+        number = numbered(str(state), list(map(str, states)), "a state", 1)
+        taken = _actions_taken(recording, number, max(array.step for array in latest.values()))
+        names = recording.action_names("train") or tuple(map(str, range(shape[1])))
+        description["state"], description["state_in_words"] = number, str(states[number])
+        description["visits"] = None if taken is None else sum(taken)
+        description["values"] = [
+            {
+                "agent": table,
+                "action": action,
+                "action_in_words": name,
+                "value": float(q[number, action]),
+                "greedy": bool(q[number].argmax() == action),
+                "visits": None if taken is None else taken[action],
+                "changed_step": None,
+                "changed_episode": None,
+            }
+            for table, q in tables.items()
+            for action, name in enumerate(names)
+        ]
+    return description, one_array(list(tables.values()))
+
+
+def _actions_taken(recording: Recording, state: int, stop: int) -> list[int] | None:
+    """Return how often each action was taken in a state before a step; None if steps are missing."""
+    if recording.count(schema.TRAIN_STEP) < stop:
+        return None
+    counts = np.zeros(recording.spaces["action"]["n"], np.int64)
+    for block in recording.blocks(schema.TRAIN_STEP, 0, stop):
+        counts += np.bincount(block["action"][block["state"] == state], minlength=len(counts))
+    return [int(count) for count in counts]
 
 
 def one_array(tables: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:

@@ -88,21 +88,21 @@ def agent_of(mdp: Mdp, name: str) -> int:
 
 def state_of(mdp: Mdp, text: str) -> int:
     """Return a state from its name, such as `taxi 1 (0,0), passenger at B`, or its number."""
-    return _numbered(text, [str(name) for name in states_in_words(mdp)], "a state", 1)
+    return numbered(text, [str(name) for name in states_in_words(mdp)], "a state", 1)
 
 
 def own_action(mdp: Mdp, agent: int, text: str) -> int:
     """Return an agent's action from its name or its number."""
     names = numbered_actions(mdp)[agent]
-    return _numbered(text, names, f"an action of {spoken(mdp.agents[agent])}")
+    return numbered(text, names, f"an action of {spoken(mdp.agents[agent])}")
 
 
 def joint_action(mdp: Mdp, text: str) -> int:
     """Return a joint action from its name, such as `pickup + east`, or its number."""
-    return _numbered(text, [str(name) for name in actions_in_words(mdp)], "a joint action")
+    return numbered(text, [str(name) for name in actions_in_words(mdp)], "a joint action")
 
 
-def _numbered(text: str, names: list[str], what: str, listed: int = MAX_LISTED) -> int:
+def numbered(text: str, names: list[str], what: str, listed: int = MAX_LISTED) -> int:
     """Return the number that a text is, or that it names; an error lists some names."""
     if text.isascii() and text.isdecimal() and len(text) <= 12 and int(text) < len(names):
         return int(text)

@@ -29,7 +29,7 @@ from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.analysis.groups import grouped, groups_of, metrics_of, require_two
 from runner.analysis.histograms import histograms
 from runner.analysis.panels import Curve, NoMetrics, Panel, panels_of, smoothed
-from runner.analysis.qtable import describe_tables, one_array, replay_at
+from runner.analysis.qtable import describe_tables
 from runner.analysis.series import (
     RunSeries,
     parse_target,
@@ -247,12 +247,11 @@ def thinned(values: NDArray[np.float64], points: int) -> NDArray[np.intp]:
 def q_table(path: Path, step: int | None, episode: int | None, state: int | None, form: str) -> bytes:
     """Return the Q-table of a moment: its summary and a state's history as `json`, or all of it as `npy`."""
     with open_recording(path) as recording:
-        recording.require_job("a Q-table", "A loop's arrays are in its recording.")
-        replay = replay_at(recording, step, episode)
+        description, table = describe_tables(recording, step, episode, state)
         if form == "json":
-            return as_json(describe_tables(recording, replay, state))
+            return as_json(description)
         stream = io.BytesIO()
-        np.save(stream, one_array(replay.tables))
+        np.save(stream, table)
         return stream.getvalue()
 
 

@@ -49,6 +49,9 @@ def qtable_command(
 ) -> None:
     """Show the exact Q-table of RUN at any step: the nearest snapshot, with the recorded steps replayed.
 
+    For your own loop it is the latest snapshot before the step: each array of [states, actions] that
+    rec.snapshot() recorded, which the output names with its step.
+
     --state shows its values, the policy if the algorithm learns one, the greedy action (ties go to the
     first), how often each action was taken there so far, and which step last changed each value. In Python:
     runner.replay.tables.tables_at().
@@ -62,8 +65,7 @@ def qtable_command(
         raise click.UsageError("--step and --episode exclude each other: choose one.")
     import numpy as np
 
-    from runner.analysis.qtable import describe_tables, one_array, replay_at
-    from runner.environments.naming import state_of
+    from runner.analysis.qtable import describe_tables
     from runner.recording.reader import open_recording
 
     if output is not None:
@@ -74,10 +76,7 @@ def qtable_command(
         compilation_notice(),
         stage_line("replaying recorded steps"),
     ):
-        replay = replay_at(recording, step, episode)
-        number_of_state = None if state is None else state_of(recording.mdp, state)
-        values = describe_tables(recording, replay, number_of_state)
-        array = one_array(replay.tables)
+        values, array = describe_tables(recording, step, episode, state)
     if output is not None:
 
         def write(path: Path) -> None:
@@ -100,9 +99,11 @@ def _draw(values: TablesDescription) -> None:
             f"{each['states']:,} states, {each['actions']} actions, {each['percent_filled']:.1f} % filled, "
             f"values from {each['lowest']:.4g} to {each['highest']:.4g}"
         )
+        if "snapshot_step" in each:
+            head[each["agent"]] += f"; the latest snapshot, after {each['snapshot_step']:,} steps"
     if "state" in values:
         head["state"] = f"{values['state']}: {values['state_in_words']}"
-        head["visits"] = f"{values['visits']:,}"
+        head["visits"] = _count(values["visits"])
     parts: list[RenderableType] = [facts(head)]
     for each in values["tables"] if "state" in values else ():
         rows = [row for row in values["values"] if row["agent"] == each["agent"]]
@@ -116,17 +117,19 @@ def _state_table(rows: list[ActionValue]) -> Table:
     headings = ("action", "", "value", *policy, "greedy", "visits", "changed\nby step", "in\nepisode")
     grid = table(*headings, left=("", "greedy"), shrinking=("",))
     for row in rows:
-        changes = (row["changed_step"], row["changed_episode"])
         grid.add_row(
             str(row["action"]),
             row["action_in_words"],
             number(row["value"], 4),
             *([number(row["policy"], 4)] if policy else []),
             "greedy" if row["greedy"] else "",
-            f"{row['visits']:,}",
-            *(UNKNOWN if change is None else f"{change:,}" for change in changes),
+            *map(_count, (row["visits"], row["changed_step"], row["changed_episode"])),
         )
     return grid
+
+
+def _count(count: int | None) -> str:
+    return UNKNOWN if count is None else f"{count:,}"
 
 
 @click.command("table", cls=Command)

@@ -159,6 +159,33 @@ def test_commands_that_need_a_job_refuse_a_loop(folder, words):
     assert "loop" in done.output
 
 
+def test_the_table_of_a_loop_is_its_latest_snapshot(tmp_path):
+    q, taken = np.zeros((16, 4)), []
+    with runner.record(gymnasium.make("FrozenLake-v1"), tmp_path, name="table") as rec:
+        state, _ = rec.reset(seed=0)
+        for step in range(60):
+            action = step % 4
+            after, _, terminated, truncated, _ = rec.step(action)
+            q[state, action] += 1
+            taken.append((state, action))
+            state = rec.reset()[0] if terminated or truncated else after
+            if step in (19, 49):
+                rec.snapshot("q", q)
+                rec.snapshot("weights", q[:3])
+    assert "q  " in (shown := dualtaxi(tmp_path, "qtable", "table").stdout)
+    assert "the latest snapshot, after 50 steps" in shown
+    words = ("qtable", "table", "--step", "30", "--state", "0", "--json", "-o", tmp_path / "q.npy")
+    found = json.loads(dualtaxi(tmp_path, *words).stdout)
+    assert (found["step"], found["visits"]) == (30, sum(state == 0 for state, _ in taken[:20]))
+    assert [table["snapshot_step"] for table in found["tables"]] == [20]
+    visits = [taken[:20].count((0, action)) for action in range(4)]
+    assert [row["value"] for row in found["values"]] == [row["visits"] for row in found["values"]] == visits
+    assert np.load(tmp_path / "q.npy")[0].tolist() == visits
+    for words, message in (("--step", "5"), "no table after 5 of 60"), (("--step", "61"), "61 of 60"):
+        refused = dualtaxi(tmp_path, "qtable", "table", *words)
+        assert (refused.exit_code, message in refused.output) == (2, True)
+
+
 def test_an_evaluation_of_a_loop_is_played(folder):
     with open_recording(runner.find_run("lake", folder).recording) as recording:
         trained = recording.count(schema.TRAIN_EPISODE)
