@@ -119,8 +119,9 @@ def read_explanation(name: str, recordings: Path) -> Explanation:
     numbers = [explanation.difference.value, *(value for one in explanation.mixtures for value in one.values)]
     numbers += [each.share.value for each in explanation.settings if each.share is not None]
     numbers.append(explanation.seconds)
-    if not all(one.values for one in explanation.mixtures) or not explanation.mixtures:
-        raise RunnerError(f"{path}: no longer describes an explanation (a mixture has no values).")
+    counts = {len(one.values) for one in explanation.mixtures}
+    if len(explanation.mixtures) < 2 or counts != {len(explanation.seeds)} or not explanation.seeds:
+        raise RunnerError(f"{path}: no longer describes an explanation (a mixture lacks values).")
     if not all(math.isfinite(value) and abs(value) < MAX_VALUE for value in numbers):
         raise RunnerError(f"{path}: no longer describes an explanation (a value is not finite).")
     known_settings = {each.name for each in explanation.settings}

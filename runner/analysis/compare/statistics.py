@@ -153,6 +153,18 @@ def bootstrap_means(values: Values) -> list[Estimate]:
     return [Estimate(*row) for row in rows]
 
 
+def bootstrap_ratio(numerator: Values, denominator: Values) -> Estimate:
+    """Return the ratio of two means over the same seeds, [seeds], and its percentile bootstrap interval."""
+    n, value = len(numerator), float(numerator.mean() / denominator.mean()) if denominator.any() else np.nan
+    if n < 2 or np.isnan(value):
+        return Estimate(value, np.nan, np.nan)
+    weights = _weights(n, RESAMPLES)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = (weights @ numerator) / (weights @ denominator)
+    low, high = np.quantile(ratios[~np.isnan(ratios)], _TAILS)
+    return Estimate(value, float(low), float(high))
+
+
 def improvement(a: Values, b: Values) -> Estimate:
     """Return the probability that a run of A has a higher value than one of B; equal ones count half.
 

@@ -123,7 +123,7 @@ def explain_command(
 def _in_words(plan: Plan) -> str:
     """Return what will be trained, and how long it takes."""
     runs, most = plan.mixtures * plan.seeds, plan.most_mixtures * plan.seeds
-    reused = f", {plan.known:,} of them known" if plan.known else ""
+    reused = f", {plan.known:,} of them trained already" if plan.known else ""
     settings, seeds = counted(plan.settings, "setting"), counted(plan.seeds, "seed")
     if most != runs:
         text = f"from {runs:,} to {most:,} runs: delta debugging of {settings}, each mixture with {seeds}"

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import runner
+from runner.analysis.compare.statistics import Estimate
 from runner.cli import cli
 from runner.config import from_mapping
 from runner.debugging.explain import EPISODES, RUNS
-from runner.debugging.explanation import plots, sections
+from runner.debugging.explanation import Explanation, Mixture, Setting, Side, plots, sections, signed, summary
 from runner.debugging.explanation_files import explanations_in, read_explanation
 from runner.debugging.factors import mix
 from runner.errors import RunnerError
@@ -130,6 +134,48 @@ def test_above_eight_settings_a_minimal_set_is_found(tmp_path):
     assert set(found.smallest.settings) == {"epsilon", "discount"}
     assert {setting.name for setting in found.settings if setting.share} == {"epsilon", "discount"}
     assert len(found.mixtures) < 60
+    text = "\n".join(line for section in sections(found) for line in section.sentences)
+    assert "there may be a smaller one" in text
+    assert "smallest set" not in text
+    assert "not in the set" in str(sections(found)[1].grids)
+
+
+def test_the_part_of_the_smallest_set_has_an_interval_and_few_seeds_that_differ_are_named():
+    def mixture(names, *values):
+        return Mixture(names, Estimate(float(np.mean(values)), math.nan, math.nan), values)
+
+    zero = Estimate(0.0, 0.0, 0.0)
+    whole = mixture(("epsilon", "discount"), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 90.0, 100.0, 110.0)
+    part = mixture(("epsilon",), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 80.0, 99.0, 120.0)
+    explanation = Explanation(
+        name="a-b/success_percent",
+        a=Side("a"),
+        b=Side("b"),
+        metric="success_percent",
+        at=None,
+        episodes=10,
+        seeds=tuple(range(10)),
+        method="all mixtures",
+        value_a=zero,
+        value_b=whole.mean,
+        difference=Estimate(30.0, 5.0, 60.0),
+        settings=tuple(Setting(name, "0", "1", zero, zero, zero) for name in ("epsilon", "discount")),
+        interactions=(),
+        smallest=part,
+        mixtures=(mixture((), *[0.0] * 10), part, whole),
+        first_step=None,
+        notes=(),
+        trained=0,
+        seconds=1.0,
+    )
+    made = explanation.part_of(part)
+    assert made.value == pytest.approx(299 / 300)
+    assert made.low < made.value < made.high
+    text = " ".join(summary(explanation))
+    assert re.search(r"epsilon alone makes 100 % \(\d+ % to \d+ %\) of it: the smallest set", text)
+    assert "of 10 seeds, one of 95 % holds 84 to 91 % of the time" in text
+    assert "A and B have the same value with 7 of the 10 seeds" in text
+    assert signed(zero) == "+0.000"
 
 
 def test_settings_that_only_go_together_are_one(tmp_path):
@@ -245,7 +291,10 @@ def test_the_command_plans_answers_and_prints_json(tmp_path):
     assert plan["seconds"] > 0
     assert json.loads(typed("--dry-run", "--json").stdout) == plan  # the time is known from before
     whole = typed()
-    assert "8 runs: 4 mixtures of 2 settings, 2 seeds each, 4 of them known; about 10 s" in whole.stderr
+    assert (
+        "8 runs: 4 mixtures of 2 settings, 2 seeds each, 4 of them trained already; about 10 s"
+        in whole.stderr
+    )
     assert "epsilon alone makes 100 % of it" in whole.stdout
     found = json.loads(typed("--json").stdout)
     assert found["smallest"]["settings"] == ["epsilon"]
