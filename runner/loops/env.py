@@ -21,6 +21,8 @@ from runner.loops.recorded import RecordedAlone, require_pictures
 from runner.loops.rows import Rows
 from runner.loops.single_rows import ROWS
 from runner.loops.values import UNCHANGEABLE, as_given, check_phase
+from runner.loops.wrappers import return_name
+from runner.replay.makers import class_name, layers_of
 from runner.runs.run import Run
 
 
@@ -35,7 +37,8 @@ class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[object, object, object,
         gymnasium.Wrapper.__init__(self, env)
         self._owner = owner
         self._env_step = env.step
-        self._has_messages = bool(loop.options.info or loop.options.frames_every)
+        self._return_name = return_name([class_name(layer) for layer in layers_of(env)])
+        self._has_messages = bool(loop.options.info or loop.options.frames_every or self._return_name)
         self._watch = GeneratorWatch(env, sparse=loop.options.steps == "actions")
         self._record_into(loop, is_owner=owner is None)
         self._enter(phase)
@@ -66,6 +69,8 @@ class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[object, object, object,
             if self._has_messages:
                 if self._options.info:
                     self._messages.info(self._phase, info)
+                if self._return_name and (terminated or truncated):
+                    self._log_return(info)
                 self._record_frame(is_over=terminated or truncated)
         except Exception as error:
             self._loop.fail(error)

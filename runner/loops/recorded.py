@@ -8,6 +8,8 @@ import weakref
 from collections.abc import Iterator, Mapping
 from typing import Any, Generic, Literal, Self, TypeVar
 
+import numpy as np
+
 from runner.environments.gym_types import Info, ResetOptions, ResetResult
 from runner.errors import ConfigError
 from runner.loops.generators import GeneratorWatch
@@ -16,6 +18,7 @@ from runner.loops.messages import Messages
 from runner.loops.options import Arguments, Options
 from runner.loops.rows import Rows
 from runner.loops.values import frozen_options
+from runner.recording.episode_log import Flags
 from runner.runs.run import Run
 
 S = TypeVar("S", bound=Rows)
@@ -28,6 +31,8 @@ class Recorded(Generic[R]):
     _loop: Loop[R]
     _messages: Messages
     _options: Options
+    _return_name = ""
+    """The name under which returns before a wrapper changed them are logged; empty if none did."""
     _until_frame = 0
     """Steps up to the next frame."""
     _owner: Recorded[R] | None = None
@@ -47,6 +52,15 @@ class Recorded(Generic[R]):
         The request is noticed within about a second; the loop has to look, and to end by itself.
         """
         return self._loop.should_stop
+
+    def _log_return(self, info: Info, ended: Flags | bool = True) -> None:
+        """Log the mean return of episodes that just ended, as their statistics inside of wrappers have it."""
+        for values in (info, info.get("final_info")):
+            statistics = values.get("episode") if isinstance(values, Mapping) else None
+            if isinstance(statistics, Mapping) and "r" in statistics:
+                returns = np.atleast_1d(np.asarray(statistics["r"], np.float64))[np.atleast_1d(ended)]
+                if len(returns):
+                    self._messages.log(self._phase, self._return_name, float(returns.mean()))
 
     def log(self, name: str | Mapping[str, object], value: object = None) -> None:
         """Record a number or a text under a name: `rec.log("loss", loss)`, `rec.log({"loss": loss})`.

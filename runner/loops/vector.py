@@ -24,8 +24,10 @@ from runner.loops.options import RecordOptions, options_of
 from runner.loops.recorded import Recorded, require_pictures, without_none
 from runner.loops.values import as_given, check_phase, frozen_options
 from runner.loops.vector_rows import VectorRows
+from runner.loops.wrappers import return_name
 from runner.recording.episode_log import Flags
 from runner.recording.spaces import Value
+from runner.replay.makers import class_name, layers_of
 from runner.replay.stepping_vector import spaces_of_one
 
 if TYPE_CHECKING:
@@ -50,7 +52,9 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
         VectorWrapper.__init__(self, env)
         self._mode, self._resets_within = mode, mode == AutoresetMode.SAME_STEP
         self._watch = watch
-        self._has_messages = bool(loop.options.info or loop.options.frames_every)
+        layers = [*layers_of(env), *layers_of(getattr(env.unwrapped, "envs", [None])[0])]
+        self._return_name = return_name(list(map(class_name, layers)))
+        self._has_messages = bool(loop.options.info or loop.options.frames_every or self._return_name)
         self._record_into(loop)
         Recorded._enter(self, phase)
 
@@ -115,6 +119,8 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
         """Record the chosen fields of infos, and the pictures that are due, of a step."""
         if self._options.info:
             self._messages.info(self._phase, _by_environment(infos))
+        if self._return_name and ended.any() and isinstance(infos, Mapping):
+            self._log_return(infos, ended)
         if self._options.frames_every:
             self._until_frame -= 1
             if self._resets_within:

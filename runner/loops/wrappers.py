@@ -64,6 +64,21 @@ def _creator_of(spec: EnvSpec) -> object:
     return load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
 
 
+def return_name(names: Sequence[str]) -> str:
+    """Return the name under which the returns of episode statistics are logged; empty if there is no need.
+
+    Statistics of episodes inside of a wrapper that changes rewards, such as `NormalizeReward`, have returns
+    that the recorded rewards do not show.
+
+    Args:
+        names: the wrappers, `module:class`, from the outermost in.
+    """
+    classes = [name.rpartition(":")[2] for name in names]
+    inside = next((at for at, name in enumerate(classes) if name == "RecordEpisodeStatistics"), 0)
+    changing = [name for name in classes[:inside] if "Reward" in name]
+    return f"return before {changing[-1]}" if changing else ""
+
+
 def only_observes(wrapper: object) -> bool:
     """Return whether a wrapper changes nothing that is recorded, and can be left out."""
     return isinstance(wrapper, _SHOWS_ONLY) or class_name(wrapper) in OBSERVERS

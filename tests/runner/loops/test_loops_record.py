@@ -14,6 +14,8 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import NormalizeReward, RecordEpisodeStatistics
 
 import runner
 from runner.errors import ConfigError, EnvironmentNotUsable, RecordingError, RunnerError
@@ -391,3 +393,35 @@ def test_forked_children_and_pids_do_not_matter(tmp_path):
             os.waitpid(child, 0)
         list(play(env, 20))
     check_integrity(env.run.recording)
+
+
+@pytest.mark.parametrize("mode", ["alone", "next_step", "same_step"])
+def test_returns_before_a_wrapper_changed_the_rewards_are_logged(tmp_path, mode):
+    def make_env():
+        return NormalizeReward(RecordEpisodeStatistics(gymnasium.make("Pendulum-v1", max_episode_steps=20)))
+
+    returns = []
+    if mode == "alone":
+        with runner.record(make_env(), tmp_path) as env:
+            env.action_space.seed(0)
+            env.reset(seed=0)
+            for _ in range(60):
+                *_, truncated, info = env.step(env.action_space.sample())
+                if truncated:
+                    returns.append(float(info["episode"]["r"]))
+                    env.reset()
+    else:
+        autoreset = AutoresetMode[mode.upper()]
+        envs = SyncVectorEnv([make_env] * 2, autoreset_mode=autoreset)
+        with runner.record_vector(envs, tmp_path) as env:
+            env.action_space.seed(0)
+            env.reset(seed=0)
+            for _ in range(60):
+                *_, truncated, infos = env.step(env.action_space.sample())
+                if truncated.any():
+                    statistics = infos.get("final_info", infos)["episode"]
+                    returns.append(float(np.mean(statistics["r"])))
+    with open_recording(env.run.recording) as recording:
+        logged = [(each["name"], each["value"]) for each in recording.decoded(schema.SCALAR_TOPIC)]
+    assert len(returns) > 1
+    assert logged == [("return before NormalizeReward", value) for value in returns]
