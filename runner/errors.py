@@ -8,7 +8,8 @@ without a traceback and exits with `exit_code`.
     ├── EnvironmentNotUsable an environment is unknown, or has no transition table
     ├── CannotRedo           a loop's environment cannot be made again here, or not drawn
     ├── RecordingError       a recording is damaged, of another program, or of an unknown version
-    │   └── NotInRecording   a recording has no such episode, evaluation, trial or step
+    │   ├── NotInRecording   a recording has no such episode, evaluation, trial or step
+    │   └── CutOff           a recording ends in the middle, as that of a killed process does
     ├── Diverged             a recording differs from what its job produces
     ├── RunNotFound          no run, or more than one, matches a name
     ├── StorageError         a file or folder cannot be written, or the disk is full
@@ -80,6 +81,10 @@ class RecordingError(RunnerError):
 
 class NotInRecording(RecordingError):
     """A recording has no such episode, evaluation, trial or step."""
+
+
+class CutOff(RecordingError):
+    """A recording ends in the middle, as the recording of a killed process does; all before is whole."""
 
 
 class Diverged(RunnerError):

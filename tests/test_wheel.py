@@ -83,7 +83,7 @@ def test_the_first_ten_minutes_need_no_clone(python: Path, folder: Path) -> None
     assert "finished" in dualtaxi("show", "@latest")
     assert "taxi 1" in dualtaxi("play", "@latest")
     assert dualtaxi("qtable", "@latest", "--episode", "20", "--state", "300")
-    assert "sound" in dualtaxi("verify", "@latest")
+    assert "reproduced" in dualtaxi("verify", "@latest")
     dualtaxi("run", "quick", *SHORT, "--seed", "1", "--name", "other")
     assert dualtaxi("diff", "quick@latest", "other@latest", "--first", code=1)
 

@@ -1,4 +1,4 @@
-"""Verify a loop by doing it again: its environment takes the recorded actions, and every result is compared.
+"""Verify a loop by a rerun: its environment takes the recorded actions, and every result is compared.
 
 This shows that the recorded returns were really obtained, whatever chose the actions.
 """
@@ -8,15 +8,17 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import platform
+import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
-from runner.errors import CannotRedo, RecordingError
+from runner.errors import CannotRedo, NotInRecording
+from runner.execution.verification import Verification
 from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording, open_recording
@@ -30,159 +32,158 @@ from runner.util.processes import report_progress
 Report = Callable[[int], None]
 _OUTSIDE: Final = (
     "The environment gives other results each time for the same seed and actions: it depends on more than "
-    "its seed, such as the global random generators, the clock or threads."
+    "its seed, such as the global random generators, the clock, the order of a set, or threads."
 )
+_HASH_SEEDS: Final = (1, 2)
+"""A difference is looked for again with each: two texts in a set may have the same order with one."""
+_AHEAD_SECONDS: Final = 3_244_643
+"""37 days and some hours, minutes and seconds: an odd number of each."""
 
 
-@dataclass(frozen=True)
-class Redone:
-    """What came of doing the episodes of a loop again."""
-
-    verdict: Literal["reproduced", "differs", "impossible"]
-    episodes: int = 0
-    """Episodes that were compared."""
-    unfinished: int = 0
-    """Those of them that were in progress when the recording ended."""
-    steps: int = 0
-    """Steps that were compared; all before the first difference were equal."""
-    left_out: int = 0
-    """Steps that could not be compared: the random generators' state at their beginning was not recorded."""
-    cut_off: int = 0
-    """Steps at the end that could not be compared: their resets were lost when the loop was killed."""
-    difference: Difference | None = None
-    """The first difference; of an impossible verdict that with which the environment was found out."""
-    reason: str = ""
-    """Why it is impossible, as a sentence."""
-    of_episodes: int | None = None
-    """The number of episodes that a sample was compared of; None if all were to be compared."""
-    tolerance: float = 0.0
-    """Absolute and relative, for floating-point values; 0 if bytes were compared."""
-    assumed: tuple[str, ...] = ()
-    """The classes whose arguments are not known for certain: those of their attributes, or the defaults, were
-    taken."""
-    versions: Differences = field(default_factory=dict)
-    """The packages, and the platform, that are others than recorded."""
-
-
-def verify_by_redoing(
-    path: Path,
+def rerun_loop(
+    checked: Verification,
     sample: int | None = None,
     tolerance: float = 0.0,
     trust: bool = False,
     report: Report = lambda _: None,
-) -> Redone:
-    """Do the episodes of a loop again, in a child process with limits, and compare every step.
+) -> Verification:
+    """Rerun a loop's environment in a child process with limits, and compare every step.
+
+    A difference counts if it comes out again in other processes, with other hash seeds and a later clock.
 
     Args:
-        sample: how many episodes to do again, at even distances; None for all that happened.
+        checked: the result of checking the file, which is returned if it is not sound, or not of a loop.
+        sample: how many episodes to rerun, at even distances; None for all that happened.
         tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
     """
-    result = Redone("impossible", tolerance=tolerance)
-    with open_recording(path) as recording:
+    if not (checked.is_loop and checked.sound):
+        return checked
+    with open_recording(checked.path) as recording:
         if reason := why_not_redone(recording, trust):
-            return replace(result, reason=reason)
+            return replace(checked, reason=reason)
         if recording.maker is not None:
-            result = replace(
-                result, versions=_other_versions(recording.maker), assumed=recording.maker.assumed
-            )
+            checked = replace(checked, changes=_other_versions(recording.maker))
+        assumed = recording.maker.assumed if recording.maker else ()
+    found = replace(checked, act="rerun", environment="installed", tolerance=tolerance, assumed=assumed)
     try:
-        for message in stream_from_child(_compare, path, sample, tolerance, trust):
+        for message in stream_from_child(_rerun, checked.path, found, sample, trust):
             if isinstance(message, int):
                 report(message)
             else:
-                result = replace(message, versions=result.versions, assumed=result.assumed)
+                found = message
+        reason, is_different = found.reason, found.difference is not None
+        if is_different and not reason and not all(_differs_again(found, trust, k) for k in _HASH_SEEDS):
+            reason = _OUTSIDE
     except CannotRedo as error:
-        return replace(result, reason=str(error))
-    return result
+        return replace(checked, reason=str(error))
+    return replace(checked, reason=reason, difference=found.difference) if reason else found
 
 
-def _compare(path: Path, sample: int | None, tolerance: float, trust: bool) -> None:
+def _differs_again(found: Verification, trust: bool, hash_seed: int) -> bool:
+    """Return whether another process finds the same difference."""
+    messages = stream_from_child(_first_again, found.path, found, trust, hash_seed=hash_seed)
+    return [message for message in messages if not isinstance(message, int)] == [found.difference]
+
+
+def _rerun(path: Path, found: Verification, sample: int | None, trust: bool) -> None:
     """Report the number of steps taken, and at last the result; runs in a child process."""
     with open_recording(path) as recording:
         if sample is None:
-            outcome = _compare_all(recording, tolerance, trust)
+            found = _rerun_all(recording, found, trust)
         else:
-            outcome = _compare_sample(recording, sample, tolerance, trust)
-        if outcome.difference is not None and (reason := why_uncertain(recording, trust)):
-            outcome = replace(outcome, verdict="impossible", reason=reason)
-        elif outcome.difference is not None and not _is_repeatable(recording, outcome, trust):
-            outcome = replace(outcome, verdict="impossible", reason=_OUTSIDE)
-    report_progress(outcome)
+            found = _rerun_sample(recording, found, sample, trust)
+        if found.difference is not None:
+            finding, reason = str(found.difference), why_uncertain(recording, trust)
+            found = replace(found, verdict="differs", finding=finding, reason=reason)
+    if found.verdict == "consistent":
+        found = replace(found, verdict="reproduced")
+    report_progress(found)
 
 
-def _compare_all(recording: Recording, tolerance: float, trust: bool) -> Redone:
-    outcome = Redone("reproduced", tolerance=tolerance)
+def _rerun_all(recording: Recording, found: Verification, trust: bool) -> Verification:
     total = {phase: recording.step_count(phase) for phase in schema.PHASES}
     left = total.copy()
-    with closing(Replay(recording, trust, tolerance, report_progress)) as replay:
+    with closing(Replay(recording, trust, found.tolerance, report_progress)) as replay:
         for steps in replay.all():
             if len(steps):
                 after = total[steps.phase] - 1 - int(steps.step[-1])
                 left[steps.phase] = min(left[steps.phase], after)
-            outcome = replace(
-                outcome,
-                episodes=outcome.episodes + int(np.count_nonzero(steps.t == 0)),
-                steps=outcome.steps + len(steps),
+            found = replace(
+                found,
+                episodes=found.episodes + int(np.count_nonzero(steps.t == 0)),
+                steps=found.steps + len(steps),
                 difference=steps.difference,
             )
         ended = sum(recording.count(recording.topic(f"/{phase}/episode")) for phase in schema.PHASES)
-        outcome = replace(outcome, left_out=replay.skipped, unfinished=max(0, outcome.episodes - ended))
-    if outcome.difference is None and "content_digest" not in recording.result:
-        outcome = replace(outcome, cut_off=sum(left.values()))
-    if outcome.difference is not None:
-        return replace(outcome, verdict="differs")
-    if not outcome.steps:
-        reason = "No reset had a seed, and the state of the random generators was not recorded."
-        return replace(outcome, verdict="impossible", reason=reason)
-    return outcome
+        found = replace(found, left_out=replay.skipped, unfinished=max(0, found.episodes - ended))
+    if found.difference is None and "content_digest" not in recording.result:
+        found = replace(found, cut_off=sum(left.values()))
+    if found.difference is None and not found.steps:
+        raise CannotRedo("No reset had a seed, and the state of the random generators was not recorded.")
+    return found
 
 
-def _compare_sample(recording: Recording, sample: int, tolerance: float, trust: bool) -> Redone:
-    """Compare some episodes, at even distances, of training and evaluation together."""
+def _rerun_sample(recording: Recording, found: Verification, sample: int, trust: bool) -> Verification:
+    """Rerun some episodes, at even distances, of training and evaluation together."""
     ended = [
         (phase, number)
         for phase in schema.PHASES
         for number in range(recording.count(recording.topic(f"/{phase}/episode")))
     ]
     places = np.unique(np.linspace(0, len(ended) - 1, min(sample, len(ended))).round().astype(int))
-    outcome = Redone("reproduced", of_episodes=len(ended), tolerance=tolerance)
+    found = replace(found, of_episodes=len(ended))
     reason = "No episode ended."
     for phase, number in (ended[place] for place in places):
-        taken = outcome.steps
+        taken = found.steps
 
         def report(steps: int, taken: int = taken) -> None:
             report_progress(taken + steps)
 
         try:
-            for steps in redo(recording, phase, [number], trust=trust, tolerance=tolerance, report=report):
-                outcome = replace(outcome, steps=outcome.steps + len(steps), difference=steps.difference)
+            episode = redo(recording, phase, [number], trust=trust, tolerance=found.tolerance, report=report)
+            for steps in episode:
+                found = replace(found, steps=found.steps + len(steps), difference=steps.difference)
         except CannotRedo as error:
             reason = str(error)
             span = recording.episode_span(phase, number)
-            outcome = replace(outcome, left_out=outcome.left_out + len(span))
+            found = replace(found, left_out=found.left_out + len(span))
             continue
-        outcome = replace(outcome, episodes=outcome.episodes + 1)
-        if outcome.difference is not None:
-            return replace(outcome, verdict="differs")
-    return outcome if outcome.episodes else replace(outcome, verdict="impossible", reason=reason)
+        found = replace(found, episodes=found.episodes + 1)
+        if found.difference is not None:
+            return found
+    if not found.episodes:
+        raise CannotRedo(reason)
+    return found
 
 
-def _is_repeatable(recording: Recording, found: Redone, trust: bool) -> bool:
-    """Return whether the environment differs in the same way when it is done again once more."""
+def _first_again(path: Path, found: Verification, trust: bool) -> None:
+    """Report the first difference of the episode that differs, if it differs again; runs in a child process.
+
+    The clock is months ahead, so that an environment that depends on it, however coarsely, is found out.
+    """
+    _advance_clocks()
     first = found.difference
-    assert first is not None
-
-    def report(_: int) -> None:
-        report_progress(found.steps)
-
+    assert isinstance(first, Difference)
     episodes = None if first.episode is None else [first.episode]
-    with contextlib.suppress(RecordingError):  # an episode without steps
+    with open_recording(path) as recording, contextlib.suppress(NotInRecording):  # an episode without steps
         for steps in redo(
-            recording, first.phase, episodes, trust=trust, tolerance=found.tolerance, report=report
+            recording,
+            first.phase,
+            episodes,
+            trust=trust,
+            tolerance=found.tolerance,
+            report=report_progress,
         ):
             if steps.difference is not None:
-                return steps.difference == first
-    return False
+                report_progress(steps.difference)
+
+
+def _advance_clocks() -> None:
+    """Set the functions of `time` that return a number ahead, before an environment's module takes them."""
+    for name in ("time", "monotonic", "perf_counter"):
+        for unit, function in ((1, name), (10**9, f"{name}_ns")):
+            now: Callable[[], float] = getattr(time, function)
+            setattr(time, function, lambda now=now, ahead=_AHEAD_SECONDS * unit: now() + ahead)
 
 
 def _other_versions(maker: EnvironmentMaker) -> Differences:

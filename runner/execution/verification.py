@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 from runner.errors import Diverged
 from runner.recording.reader import Recording
+from runner.replay.differences import Difference
 from runner.runs.provenance import Differences
 from runner.util.values import Json
 
@@ -18,7 +19,16 @@ LOOP_NOT_COMPARED: Final = (
 NAMES_NOT_COMPARED: Final = f"{LOOP_NOT_COMPARED}; --rerun compares them with the installed environment"
 """What a verification leaves out: the messages do not depend on it."""
 CIRCUMSTANCES: Final = ("command", "directory", "host", "user")  # they cannot explain a difference
-NOT_COMPLETE: Final = "the run did not end; verified as far as it got"
+
+Verdict = Literal["reproduced", "consistent", "interrupted", "differs", "damaged"]
+"""The verdict on a recording:
+
+- `reproduced`: its job was retrained, or its environment rerun, and everything compared is equal;
+- `consistent`: only the file was checked, and agrees with itself; `Verification.reason` is why;
+- `interrupted`: the run did not end, and all up to its end is reproduced, or consistent;
+- `differs`: the job or the environment gives something else, each time the same;
+- `damaged`: the bytes of the file are wrong, or its parts contradict each other.
+"""
 
 
 @dataclass(frozen=True)
@@ -26,36 +36,57 @@ class Verification:
     """The result of a verification."""
 
     path: Path
+    verdict: Verdict = "consistent"
+    act: Literal["checked", "retrained", "rerun"] = "checked"
+    """What was done: only the file was checked, a job was retrained, or a loop's environment was rerun."""
+    environment: Literal["", "recorded", "installed"] = ""
+    """The environment with which it was retrained or rerun."""
+    reason: str = ""
+    """Why the environment cannot be rerun, as a sentence; empty if it was, or was not to be."""
     finding: str = ""
-    """The first thing that is wrong, or empty."""
-    difference: Diverged | None = None
-    """The finding as an error with attributes, if a message or a value differs."""
+    """The first thing that differs or is damaged; empty if nothing is."""
+    difference: Diverged | Difference | None = None
+    """The first difference with attributes; that of a loop which cannot be rerun shows why."""
     train_steps: int = 0
-    """Training steps that were compared."""
+    """Training steps that were compared, with one another or with the retrained ones."""
     eval_steps: int = 0
     """Evaluation steps that were compared."""
+    episodes: int = 0
+    """Episodes that were retrained, or rerun; of a job, training episodes."""
+    unfinished: int = 0
+    """Rerun episodes that were in progress when the recording ended."""
+    steps: int = 0
+    """Steps that were retrained or rerun; of a loop, all before the first difference were equal."""
+    left_out: int = 0
+    """Steps that could not be rerun: the random generators' state at their beginning was not recorded."""
+    cut_off: int = 0
+    """Steps at the end that could not be rerun: their resets were lost when the loop was killed."""
+    of_episodes: int | None = None
+    """The number of episodes that a rerun sample is of; None if all were to be rerun."""
+    tolerance: float = 0.0
+    """Absolute and relative, for floating-point values that were rerun; 0 if bytes were compared."""
+    assumed: tuple[str, ...] = ()
+    """What was rerun with default arguments, as its own were not recorded."""
     content_digest: str = ""
     """The digest of all that was compared; empty if the recording has none, or is not complete."""
     notes: tuple[str, ...] = ()
     """What a reader should know though it is not wrong."""
-    provenance: Differences = field(default_factory=dict)
-    """The differences between the recording's provenance and this process's."""
+    changes: Differences = field(default_factory=dict)
+    """What is not as recorded here and may explain a difference: packages, platform, code, environment."""
     not_compared: str = ""
     """What of the recording was not compared."""
-    needs_redo: bool = False
-    """Whether its steps are compared with their environment by `runner.execution.redo` only."""
-    nothing_yet: bool = False
-    """Whether the run was interrupted before it recorded anything."""
+    is_loop: bool = False
+    """Whether its steps can be compared by a rerun of its environment only."""
 
     @property
     def sound(self) -> bool:
-        """Whether nothing is wrong."""
-        return not self.finding
+        """Whether nothing differs, and nothing is damaged."""
+        return self.verdict not in ("differs", "damaged")
 
 
-def with_difference(found: Verification, error: Diverged) -> Verification:
+def with_difference(found: Verification, error: Diverged, verdict: Verdict = "damaged") -> Verification:
     """Return a verification with a difference as its finding."""
-    return replace(found, finding=str(error), difference=error)
+    return replace(found, verdict=verdict, finding=str(error), difference=error)
 
 
 def compare_names(recording: Recording, learners: list[str] | None = None) -> None:

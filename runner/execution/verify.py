@@ -10,24 +10,23 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from mcap.writer import MCAP0_MAGIC
 
 from runner.config import from_mapping
 from runner.config.job import Job
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
-from runner.errors import ConfigError, Diverged, RecordingError
+from runner.errors import ConfigError, CutOff, Diverged, EnvironmentNotUsable, RecordingError, RunnerError
 from runner.execution.initial_tables import recorded_tables
+from runner.execution.redo import rerun_loop
 from runner.execution.session import Report, Session, recorder_for
 from runner.execution.verification import (
     CIRCUMSTANCES,
     NAMES_NOT_COMPARED,
-    NOT_COMPLETE,
+    Verdict,
     Verification,
     compare_names,
     compare_result,
@@ -37,71 +36,96 @@ from runner.execution.verification import (
 from runner.execution.verify_loop import verify_loop
 from runner.learning.learner import Learner
 from runner.recording import schema
-from runner.recording.integrity import check_integrity, may_be_cut, refuse_foreign, survey
+from runner.recording.integrity import check_integrity, refuse_foreign, survey
 from runner.recording.reader import Recording, open_recording
 from runner.recording.records import Report as BytesReport
 from runner.recording.reference import Reference
+from runner.runs.listing import run_at
 from runner.runs.provenance import Differences, differing_provenance
-from runner.util.files import open_regular
 
 
-def damage_of(path: Path, report: BytesReport = lambda *_: None) -> str:
-    """Return the first damage of a recording's bytes; empty if there is none."""
+def verify(
+    path: Path,
+    rerun: bool | None = None,
+    *,
+    sample: int | None = None,
+    tolerance: float = 0.0,
+    trust: bool = False,
+    report: Report = lambda _: None,
+) -> Verification:
+    """Verify a recording: check its file, then retrain its job, or rerun its environment.
+
+    Args:
+        path: the recording.
+        rerun: of a job, whether to retrain it with the installed environment instead of the recorded one; of
+            a loop, False checks only the file.
+        sample: how many episodes of a loop to rerun, at even distances; None for all that happened.
+        tolerance: absolute and relative, for a loop's floating-point observations and rewards; 0 compares
+            bytes.
+        trust: whether what the recording of a loop names may be imported.
+        report: called with the progress of a job's training a few times a second.
+
+    Raises:
+        RecordingError: there is no such file, or it is not a dualtaxi recording.
+    """
+    found = check(path, damage_of(path), bool(rerun), report)
+    return found if rerun is False else rerun_loop(found, sample, tolerance, trust)
+
+
+def damage_of(path: Path, report: BytesReport = lambda *_: None) -> RecordingError | None:
+    """Return the first damage of a recording's bytes, if there is any.
+
+    Raises:
+        RecordingError: there is no such file, or it is not a dualtaxi recording.
+    """
     refuse_foreign(path)
     try:
         check_integrity(path, report)
     except RecordingError as error:
-        return str(error)
-    return ""
+        return error
+    return None
 
 
-def verify(
-    path: Path, rerun: bool = False, report: Report = lambda _: None, damage: str | None = None
+def check(
+    path: Path,
+    damage: RecordingError | None,
+    installed: bool = False,
+    report: Report = lambda _: None,
 ) -> Verification:
-    """Verify a recording.
+    """Check a recording's file; retrain its job, but do not rerun the environment of a loop.
 
     Args:
         path: the recording.
-        rerun: compare with the installed environment's job instead of the recorded environment's.
+        damage: the result of `damage_of`.
+        installed: retrain with the installed environment instead of the recorded one.
         report: called with the progress a few times a second.
-        damage: the result of `damage_of`, if it was called before; by default it is called here.
-
-    Raises:
-        RecordingError: there is no such file, or it is not a dualtaxi recording.
-        EnvironmentNotUsable: the environment is not installed, for a rerun.
     """
-    damage = damage_of(path) if damage is None else damage
+    is_cut = isinstance(damage, CutOff) and not _states_its_end(path)
     try:
         with open_recording(path) as recording:
-            verification = _verify_content(recording, rerun, report)
-            damage = damage and damage + _first_unreadable(recording)
+            found = _check_content(recording, installed, report)
+            unreadable = "" if damage is None or is_cut else _first_unreadable(recording)
     except (RecordingError, ConfigError) as error:
-        if damage and _is_empty(path):
-            return Verification(path, nothing_yet=True)
-        finding = damage or str(error)
+        if is_cut and not survey(path).chunks:
+            return Verification(path, verdict="interrupted")
+        finding = str(damage or error)
         with contextlib.suppress(RecordingError), open_recording(path) as recording:
             finding += _first_unreadable(recording)
-        return Verification(path, finding=finding)
-    if not damage:
-        return verification
-    if _is_empty(path):
-        return Verification(path, nothing_yet=True)
-    if verification.sound:
-        return replace(verification, finding=damage, content_digest="")
-    return replace(verification, notes=(*verification.notes, damage))
+        return Verification(path, verdict="damaged", finding=finding)
+    if damage is None:
+        return found
+    if is_cut and found.sound:
+        return replace(found, verdict="interrupted", content_digest="", notes=(*found.notes, str(damage)))
+    if found.sound:
+        return replace(found, verdict="damaged", finding=f"{damage}{unreadable}", content_digest="")
+    return replace(found, verdict="damaged", notes=(*found.notes, str(damage)))
 
 
-def _is_empty(path: Path) -> bool:
-    """Return whether a recording is cut off before its first messages, and not damaged otherwise."""
-    try:
-        with open_regular(path) as stream:
-            stream.seek(-len(MCAP0_MAGIC), os.SEEK_END)
-            if stream.tell() and stream.read() == MCAP0_MAGIC:
-                return False  # it was closed: a damaged length may look like a cut
-        contents = survey(path)
-        return not contents.chunks and may_be_cut(path, contents)
-    except (RecordingError, OSError):
-        return False
+def _states_its_end(path: Path) -> bool:
+    """Return whether the run of a recording is stated to have finished: then its file is whole."""
+    with contextlib.suppress(RunnerError):
+        return run_at(path).file.status == "finished"
+    return False
 
 
 def _first_unreadable(recording: Recording) -> str:
@@ -117,7 +141,7 @@ def _first_unreadable(recording: Recording) -> str:
     return ""
 
 
-def _verify_content(recording: Recording, rerun: bool, report: Report) -> Verification:
+def _check_content(recording: Recording, installed: bool, report: Report) -> Verification:
     verification = Verification(recording.path)
     if recording.lost:
         holes = "; ".join(
@@ -125,21 +149,35 @@ def _verify_content(recording: Recording, rerun: bool, report: Report) -> Verifi
             for topic, places in recording.lost.items()
             for first, end in places
         )
-        finding = f"{recording.path}: {holes}: lost in a repair. `dualtaxi resume` runs the job again."
-        return replace(verification, finding=finding)
+        finding = f"{recording.path}: {holes}: lost in a repair. `dualtaxi resume` retrains the job."
+        return replace(verification, verdict="damaged", finding=finding)
     if not recording.can_train_again:
         return verify_loop(recording)
     job = Job(from_mapping(recording.config), recording.seed or 0)
     if recording.job != job.identity:
         return with_difference(verification, Diverged("metadata run", "job", recording.job, job.identity))
-    return _verify_job(recording, job, rerun, report)
+    return _retrain(recording, job, installed, report)
 
 
-def _verify_job(recording: Recording, job: Job, rerun: bool, report: Report) -> Verification:
+def _retrain(recording: Recording, job: Job, installed: bool, report: Report) -> Verification:
     env, complete = job.config.env, recording.status == "finished"
-    mdp = load_mdp(env.id, env.kwargs, job.config.rewards) if rerun else recording.mdp
-    reference = Reference(recording, complete, without_steps=job.config.recording.steps == "none")
+    verification = Verification(
+        recording.path,
+        verdict="reproduced" if complete else "interrupted",
+        act="retrained",
+        environment="installed" if installed else "recorded",
+    )
+    try:
+        mdp = load_mdp(env.id, env.kwargs, job.config.rewards) if installed else recording.mdp
+    except EnvironmentNotUsable as error:
+        verdict: Verdict = "consistent" if complete else "interrupted"
+        return Verification(recording.path, verdict, reason=str(error))
     learner = Learner(job.config, mdp, job.seed, recorded_tables(recording))
+    try:
+        compare_names(recording, list(learner.agents))
+    except Diverged as error:
+        return with_difference(verification, error)
+    reference = Reference(recording, complete, without_steps=job.config.recording.steps == "none")
     recorder = recorder_for(job, learner, None, reference)
     variable = set(schema.TOPICS) - set(schema.BLOCK_TOPICS) - {schema.LOG_TOPIC}
     recorded = {topic.name: recording.count(topic) for topic in variable}
@@ -148,25 +186,23 @@ def _verify_job(recording: Recording, job: Job, rerun: bool, report: Report) -> 
         return reference.exhausted and all(recorder.counts[name] >= n for name, n in recorded.items())
 
     session = Session(job, learner, recorder, report, stop=lambda: not complete and all_compared())
-    verification = Verification(recording.path, notes=() if complete else (NOT_COMPLETE,))
-    if rerun:  # what may explain a difference
+    if installed:  # what may explain a difference
         changes = differing_provenance(recording.provenance) | differing_environment(recording, mdp)
         changes = {key: values for key, values in changes.items() if key not in CIRCUMSTANCES}
-        verification = replace(verification, provenance=changes)
+        verification = replace(verification, changes=changes)
     else:
         verification = replace(verification, not_compared=NAMES_NOT_COMPARED)
     try:
-        compare_names(recording, list(session.learners))
         ended = session.run()
         topics = recorder.drain()
         if complete or ended:
             reference.check_exhausted()
-        if rerun:
+        if installed:
             description = json.loads(json.dumps(mdp.description()))
             for key in sorted(description):
                 compare_values(key, recording.environment.get(key), description[key])
     except Diverged as error:
-        return with_difference(verification, error)
+        return with_difference(verification, error, "differs")
     finally:
         recorder.abandon()
     result = recording.result
@@ -175,7 +211,13 @@ def _verify_job(recording: Recording, job: Job, rerun: bool, report: Report) -> 
     steps = {"train": recording.count(schema.TRAIN_STEP), "eval": recording.count(schema.EVAL_STEP)}
     if whole:  # else the job was run a little further than it is recorded
         steps = recorder.steps
-    verification = replace(verification, train_steps=steps["train"], eval_steps=steps["eval"])
+    verification = replace(
+        verification,
+        train_steps=steps["train"],
+        eval_steps=steps["eval"],
+        steps=steps["train"] + steps["eval"],
+        episodes=recording.count(schema.TRAIN_EPISODE),
+    )
     return compare_result(verification, recording, session.summary(topics)) if whole else verification
 
 

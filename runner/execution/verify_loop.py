@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from runner.errors import Diverged, RecordingError
 from runner.execution.verification import (
     LOOP_NOT_COMPARED,
-    NOT_COMPLETE,
     Verification,
     compare_names,
     compare_result,
@@ -27,21 +26,23 @@ from runner.runs.checkpoints import read_checkpoints
 
 
 def verify_loop(recording: Recording) -> Verification:
-    """Verify the recording of a user's own loop; `runner.execution.redo` does its steps again.
+    """Check the file of a user's own loop; `runner.execution.redo` reruns its environment.
 
     Compared are the numbers of its messages, its steps with the environment's outcomes where it is tabular,
     steps, resets and episodes with one another, and its digest with its messages.
     """
     finished = "content_digest" in recording.result
-    notes = [] if finished else [NOT_COMPLETE]
+    notes: list[str] = []
     if recording.leaves_out_steps:
         notes.append("whole steps were left out: digests represent their observations and rewards")
+    is_over = finished and recording.status != "interrupted"
     verification = Verification(
         recording.path,
+        verdict="consistent" if is_over else "interrupted",
         train_steps=recording.step_count("train"),
         eval_steps=recording.step_count("eval"),
         not_compared="" if recording.config.get("env") == {"id": "none", "kwargs": {}} else LOOP_NOT_COMPARED,
-        needs_redo=True,
+        is_loop=True,
     )
     try:
         compare_names(recording)
@@ -64,7 +65,8 @@ def verify_loop(recording: Recording) -> Verification:
             taken = last // schema.STEP_NANOSECONDS
             raise Inconsistent(f"found {steps:,} steps, expected {taken:,} by the time of the last")
     except Inconsistent as error:
-        return replace(verification, notes=tuple(notes), finding=f"{recording.path}: {error}")
+        finding = f"{recording.path}: {error}"
+        return replace(verification, verdict="damaged", notes=tuple(notes), finding=finding)
     except Diverged as error:
         return with_difference(replace(verification, notes=tuple(notes)), error)
     verification = replace(verification, notes=tuple(notes))

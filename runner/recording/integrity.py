@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import operator
+import os
 import struct
 from collections.abc import Iterator
 from functools import cache
@@ -19,7 +20,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, MetadataIndex
 from mcap.writer import MCAP0_MAGIC
 
-from runner.errors import RecordingError
+from runner.errors import CutOff, RecordingError
 from runner.recording import schema
 from runner.recording.blocks import RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, has_message_index, message_index
@@ -79,13 +80,17 @@ def check_integrity(path: Path, report: Report = lambda *_: None) -> None:
     """Check every byte of a finished recording.
 
     Raises:
+        CutOff: it ends in the middle, and is whole up to there.
         RecordingError: something is wrong; the first such thing is named with its offset.
     """
     contents = survey(path, keep_result=True, report=report)
     if contents.reason:
         advice = "; `dualtaxi repair` mends it" if contents.end else ""
-        raise RecordingError(f"{path}: {contents.reason}{advice}.")
+        error = CutOff if may_be_cut(path, contents) else RecordingError
+        raise error(f"{path}: {contents.reason}{advice}.")
     found, expected = _tails(path, contents)
+    if len(found) < len(expected) and expected.startswith(found):
+        raise CutOff(f"{path}: the file ends at {contents.size}, in its summary; `dualtaxi repair` mends it.")
     if found != expected:
         same = itertools.takewhile(bool, map(operator.eq, found, expected))
         at = sum(same)
@@ -269,6 +274,10 @@ def _ends_torn(stream: BinaryIO, contents: Contents) -> bool:
     Before it may stand a good chunk without its index, which is written again.
     """
     offset = contents.end
+    if contents.size > len(MCAP0_MAGIC):
+        stream.seek(-len(MCAP0_MAGIC), os.SEEK_END)
+        if stream.read() == MCAP0_MAGIC:
+            return False  # it was closed: a damaged length may look like a cut
     if offset == 0:
         return contents.size == 0 or _only_zeros(stream, 0)
     for _ in range(2):

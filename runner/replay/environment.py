@@ -121,17 +121,22 @@ def redo_in_child(
 
 
 def stream_from_child(
-    function: Callable[..., None], path: Path, *arguments: object, **keywords: object
+    function: Callable[..., None],
+    path: Path,
+    *arguments: object,
+    hash_seed: int | None = None,
+    **keywords: object,
 ) -> Iterator[Any]:
     """Yield what a function that runs foreign code passes to `report_progress` in a child process.
 
     Args:
         function: of a module; called with the path and the other arguments.
+        hash_seed: runs in a fresh interpreter with this hash seed.
 
     Raises:
         CannotRedo: the process hangs, crashes or needs more memory.
     """
-    with ChildProcess(MEMORY_BYTES) as child:
+    with ChildProcess(MEMORY_BYTES, hash_seed=hash_seed) as child:
         try:
             yield from child.stream(_quietly, SECONDS, function, path, *arguments, **keywords)
         except TimedOut:

@@ -31,6 +31,7 @@ _RESERVE_BYTES: Final = 64 << 20
 OWN_ONLY: Final = "DUALTAXI_OWN_ONLY"
 """The variable of a process, and of its children, that make only what their user recorded; if not empty."""
 _SAFE_PATH: Final = "PYTHONSAFEPATH"
+_HASH_SEED: Final = "PYTHONHASHSEED"
 Args = ParamSpec("Args")
 Result = TypeVar("Result")
 
@@ -73,7 +74,7 @@ def importing_from(folders: Sequence[str], is_for_good: bool = False) -> Iterato
 
 
 @contextlib.contextmanager
-def starting_processes(with_main: bool = True) -> Iterator[None]:
+def starting_processes(with_main: bool = True, hash_seed: int | None = None) -> Iterator[None]:
     """Start interpreters in the block that import nothing from the current folder.
 
     Python lets `python -c` and `python -m` look there first, and `multiprocessing` starts its processes by
@@ -82,10 +83,13 @@ def starting_processes(with_main: bool = True) -> Iterator[None]:
     Args:
         with_main: whether the script of this process is imported in them, as `multiprocessing` does, for what
             it registers; never if it does not guard its statements, which would run once more there.
+        hash_seed: their hash seed, if it is not to be that of this process.
     """
     with _starting:
-        main, before, path = sys.modules["__main__"], os.environ.get(_SAFE_PATH), sys.path
-        os.environ[_SAFE_PATH] = "1"
+        variables = {_SAFE_PATH: "1"} | ({} if hash_seed is None else {_HASH_SEED: str(hash_seed)})
+        main, path = sys.modules["__main__"], sys.path
+        before = {name: os.environ.get(name) for name in variables}
+        os.environ.update(variables)
         sys.path = _without_current_folder(path)
         if not with_main or not _is_guarded(main):
             sys.modules["__main__"] = types.ModuleType("__main__")
@@ -93,10 +97,11 @@ def starting_processes(with_main: bool = True) -> Iterator[None]:
             yield
         finally:
             sys.modules["__main__"], sys.path = main, path
-            if before is None:
-                del os.environ[_SAFE_PATH]
-            else:
-                os.environ[_SAFE_PATH] = before
+            for name, value in before.items():
+                if value is None:
+                    del os.environ[name]
+                else:
+                    os.environ[name] = value
 
 
 def _is_guarded(main: types.ModuleType) -> bool:
@@ -135,22 +140,29 @@ class ChildProcess:
     Args:
         memory_bytes: how much its calls may allocate; not limited on Windows.
         on_progress: called with what functions pass to `report_progress`.
+        hash_seed: makes it a fresh interpreter with this hash seed.
 
     Raises:
         OSError: the system cannot start another process.
     """
 
     def __init__(
-        self, memory_bytes: int, context: Any = None, on_progress: Callable[[Any], None] = lambda _: None
+        self,
+        memory_bytes: int,
+        context: Any = None,
+        on_progress: Callable[[Any], None] = lambda _: None,
+        hash_seed: int | None = None,
     ) -> None:
         self._memory_bytes = memory_bytes
         self._on_progress = on_progress
+        if hash_seed is not None:
+            context = multiprocessing.get_context("spawn")
         context = context or process_context()
         self._pipe, theirs = context.Pipe()
         is_own_only = os.environ.get(OWN_ONLY, "")
         self._process = context.Process(target=_serve, args=(theirs, memory_bytes, is_own_only), daemon=True)
         try:
-            with starting_processes(with_main=False):
+            with starting_processes(with_main=False, hash_seed=hash_seed):
                 self._process.start()
         except BaseException:
             self._pipe.close()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import runner
-from runner.execution.redo import verify_by_redoing
+from runner.execution.verify import verify
 from runner.integrations import wandb
 from runner.integrations.tensorboard import SummaryWriter
 from runner.recording.schema import SCALAR_TOPIC
@@ -76,7 +76,7 @@ def test_ppo_is_recorded_whole(changes, track, recordings):
     assert (settings["learning_rate"], settings["num_envs"], settings["target_kl"]) == (2.5e-4, 4, None)
     assert run.summary["train_steps"] == 1024
     assert series(run, "losses/value_loss") == ([512, 1024], [512.0, 1024.0])
-    verdict = verify_by_redoing(run.recording)
+    verdict = verify(run.recording)
     assert (verdict.verdict, verdict.reason) == ("reproduced", "")
 
 
@@ -99,7 +99,7 @@ def test_dqn_is_recorded_whole(recordings):
     steps, own = series(run, "losses/td_loss")
     assert own == [500.0, 600.0, 700.0, 800.0, 900.0]
     assert steps == [step + 1 for step in own]
-    assert verify_by_redoing(run.recording).verdict == "reproduced"
+    assert verify(run.recording).verdict == "reproduced"
 
 
 def test_tensors_are_logged_and_pictures_of_them_recorded(recordings):

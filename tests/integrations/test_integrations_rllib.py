@@ -12,7 +12,7 @@ import pytest
 
 import runner
 from runner.errors import RunnerError
-from runner.execution.redo import verify_by_redoing
+from runner.execution.verify import verify
 from runner.recording.reader import open_recording
 from runner.runs.shards import shards_of
 
@@ -84,7 +84,7 @@ def test_env_runners_and_evaluation_make_one_run(recordings):
     ended_by_themselves = int(np.count_nonzero(ended["terminated"] | ended["truncated"]))
     assert ended_by_themselves == results[-1]["env_runners"]["num_episodes_lifetime"]
     assert len(run.checkpoints()) == 2
-    redone = verify_by_redoing(run.recording)
+    redone = verify(run.recording)
     assert (redone.verdict, redone.left_out) == ("reproduced", 0)
     assert redone.steps == run.summary.train_steps + run.summary.eval_steps
 
@@ -121,7 +121,7 @@ def test_an_env_runner_that_is_killed_is_replaced(recordings):
     killed = next(shard for shard in shards.values() if shard.status == "interrupted")
     assert killed.train_steps > 100
     assert sum(shard.train_steps for shard in shards.values()) == run.summary.train_steps
-    assert verify_by_redoing(run.recording).verdict == "reproduced"
+    assert verify(run.recording).verdict == "reproduced"
 
 
 def test_without_env_runners_the_algorithm_steps_itself(recordings):
@@ -211,7 +211,7 @@ def test_agents_with_policies_of_their_own_and_a_shared_one(recordings, game, ma
     assert len(over) == results[-1]["env_runners"]["num_episodes_lifetime"]
     expected = [json.loads(line) for line in ended_episodes.read_text().splitlines()]
     np.testing.assert_allclose(sorted(over["returns"].tolist()), sorted(expected))
-    redone = verify_by_redoing(run.recording, trust=True)
+    redone = verify(run.recording, trust=True)
     assert (redone.verdict, redone.left_out) == ("reproduced", 0)
     assert redone.steps == run.summary.train_steps + run.summary.eval_steps
 
@@ -256,9 +256,7 @@ def test_a_game_is_made_again_from_its_configuration(recordings, is_registered):
     name = "PPO-game" if is_registered else "PPO-RockPaperScissors"
     assert (run.name, run.summary.train_steps) == (name, 100)
     if is_registered:  # by a function that has no name
-        assert (
-            'name a function that makes it: make="module:function"' in verify_by_redoing(run.recording).reason
-        )
+        assert 'name a function that makes it: make="module:function"' in verify(run.recording).reason
         return
-    assert "is imported only if you trust" in verify_by_redoing(run.recording).reason
-    assert verify_by_redoing(run.recording, trust=True).verdict == "reproduced"
+    assert "is imported only if you trust" in verify(run.recording).reason
+    assert verify(run.recording, trust=True).verdict == "reproduced"

@@ -9,8 +9,7 @@ from mpe2 import simple_spread_v3
 
 import runner
 from runner.errors import EnvironmentNotUsable
-from runner.execution.redo import verify_by_redoing
-from runner.execution.verify import check_integrity
+from runner.execution.verify import check_integrity, verify
 from runner.recording.reader import open_recording
 from tests.integrations.supersuit_games import spread
 
@@ -29,7 +28,7 @@ def test_agents_of_games_are_recorded_with_their_last_observations_and_come_out_
     assert len(episodes) == len(last) == 12
     assert (episodes["length"] == 20).all()
     np.testing.assert_array_equal(steps["next_observation"][episodes["last_step"]], last)
-    found = verify_by_redoing(rec.run.recording, trust=True)
+    found = verify(rec.run.recording, trust=True)
     assert (found.verdict, found.steps) == ("reproduced", 300)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -21,9 +20,9 @@ from runner.runs.run import Run
 from runner.util.humanize import UNKNOWN, counted, size
 
 if TYPE_CHECKING:
-    from runner.execution.redo import Redone
     from runner.execution.verification import Verification
     from runner.recording.repair import Repair
+    from runner.replay.differences import Difference
 
 
 @click.command("verify", cls=Command)
@@ -32,10 +31,10 @@ def verify_command(
     rerun: bool | None = option(
         "--rerun/--no-rerun",
         default=None,
-        help="Run it again in the installed environment; by default loops only, where that is possible.",
+        help="Rerun or retrain it in the installed environment; by default loops only, where possible.",
     ),
     sample: int | None = option(
-        "--sample", type=COUNT, metavar="N", help="Do only N episodes of a loop again, evenly spread."
+        "--sample", type=COUNT, metavar="N", help="Rerun only N episodes of a loop, evenly spread."
     ),
     tolerance: float = option(
         "--tolerance",
@@ -50,21 +49,21 @@ def verify_command(
 ) -> None:
     """Check RUN, or a recording by its path: every byte, step, episode, figure and table.
 
-    A run that was trained here is trained again in memory, with the environment in the recording, and
-    compared. The first difference is named: topic, episode, step, field, what was found and what was
-    expected. With --rerun the run is trained with the installed environment: the verdict says whether it can
-    be reproduced here, and if not, at which step it diverges and what differs: packages, processor, code. It
-    also compares how the recording describes its environment: scene and names.
+    A run that was trained here is retrained in memory, with the environment in the recording, and compared.
+    With --rerun it is retrained with the installed environment, and compared with how the recording
+    describes its environment: scene and names.
 
-    A loop's environment is made again, in a process with limits, and takes the recorded resets and actions:
+    A loop's environment is rerun, in a process with limits: it takes the recorded resets and actions, and
     every observation, reward and end is compared. Only installed packages of environments are imported;
-    --trust allows all that the recording names. Where the environment cannot be had, or depends on more than
-    its seed, the verdict says why; that is an error with --rerun only. --no-rerun leaves it out.
+    --trust allows all that the recording names. --no-rerun checks the file only.
 
-    A run that was interrupted before it recorded anything is neither sound nor wrong: there is nothing to
-    verify yet.
+    The verdict is "reproduced" if everything compared is equal, and states what was retrained or rerun;
+    "consistent" if only the file was checked, with the reason why its environment cannot be rerun;
+    "interrupted" if the run did not end, and all up to its end is equal, or consistent; "differs", with the
+    first difference and what has changed since: packages, processor, code; or "damaged" if the bytes of the
+    file are wrong, or its parts contradict each other.
 
-    Exit code 1 if anything is wrong.
+    Exit code 1 if it differs or is damaged; with --rerun also if it cannot be rerun.
 
     Examples:
       dualtaxi verify @latest
@@ -72,8 +71,8 @@ def verify_command(
       dualtaxi verify k3v9m2xq --sample 20 --tolerance 1e-6
       dualtaxi verify backup/recording.mcap --json
     """
-    from runner.execution.redo import verify_by_redoing
-    from runner.execution.verify import damage_of, verify
+    from runner.execution.redo import rerun_loop
+    from runner.execution.verify import check, damage_of
 
     path, run = find_recording(run_name, recordings)
     require_over(run)
@@ -81,115 +80,95 @@ def verify_command(
     with bytes_line("reading") as reading:
         damage = damage_of(path, reading)
     with job_progress("verifying", episodes) as (report, _):
-        verification = verify(path, bool(rerun), report, damage)
-    redone = None
-    if verification.needs_redo and verification.sound and not verification.nothing_yet and rerun is not False:
-        steps = verification.train_steps + verification.eval_steps
-        with count_line("steps done again", 0 if sample else steps) as count:
-            redone = verify_by_redoing(path, sample, tolerance, trust, count)
-    with_installed = bool(rerun) and not verification.needs_redo
+        found = check(path, damage, bool(rerun), report)
+    if rerun is not False:
+        with count_line("steps rerun", 0 if sample else found.train_steps + found.eval_steps) as count:
+            found = rerun_loop(found, sample, tolerance, trust, count)
     if as_json:
-        print_json(
-            _verification_as_json(verification, with_installed) | (_redone_as_json(redone) if redone else {})
-        )
+        print_json(_as_json(found))
     else:
-        draw(facts(_verification(verification, with_installed) | (_redone(redone) if redone else {})))
-    failures = ("differs", "impossible") if rerun else ("differs",)
-    if not verification.sound or (redone is not None and redone.verdict in failures):
+        draw(facts(_rows(found, run)))
+    if not found.sound or (rerun and found.reason):
         raise click.exceptions.Exit(ExitCode.DIFFERENT)
 
 
-def _redone(redone: Redone) -> dict[str, str]:
-    """Return what came of doing a loop again, as rows."""
-    steps, of = counted(redone.steps, "step"), redone.of_episodes
-    episodes = counted(redone.episodes if of is None else of, "episode")
-    if redone.unfinished:
-        episodes += f" ({redone.unfinished:,} unfinished)"
-    compared = f"{episodes if of is None else f'{redone.episodes:,} of {episodes}'}, {steps}"
-    exactness = f"within {redone.tolerance:g}" if redone.tolerance else "every byte"
-    rows = {"verdict": f"reproduced: {compared}, {exactness}"}
-    if redone.verdict == "differs":
-        rows = {"verdict": "differs", "first": str(redone.difference)}
-        rows["compared"] = f"{compared}, {exactness}"
-    elif redone.verdict == "impossible":
-        rows = {"verdict": "sound; it cannot be reproduced here", "reason": redone.reason}
-        rows["first"] = str(redone.difference or "")
-    notes = [f"{name}: its arguments were assumed, as they could not be recorded" for name in redone.assumed]
-    if redone.left_out:
+def _rows(found: Verification, run: Run | None) -> dict[str, str]:
+    """Return a verdict and all that belongs to it, as text by name."""
+    rows = {"recording": str(found.path), "verdict": _verdict(found), "first": found.finding}
+    if found.verdict == "interrupted" and run is not None and run.can_train_again:
+        rows["next"] = f"`{command_for(run, 'resume')}` goes on from there"
+    if found.reason:
+        rows["reason"] = f"cannot be rerun: {found.reason}"
+        rows["for example"] = str(found.difference or "")
+    elif found.act == "checked" and found.is_loop and found.sound:
+        rows["reason"] = "not rerun, as --no-rerun demands"
+    notes = [f"{name}: its arguments were assumed, as they could not be recorded" for name in found.assumed]
+    if found.left_out:
         notes.append(
-            f"{redone.left_out:,} steps were left out: the random generators before them are not known"
+            f"{found.left_out:,} steps were left out: the random generators before them are not known"
         )
-    if redone.cut_off:
-        notes.append(f"the last {redone.cut_off:,} steps were left out: their resets were lost in the kill")
-    rows["done again"] = "\n".join(notes)
-    if redone.verdict != "reproduced":
-        rows["differs"] = "\n".join(
-            f"{name}: {then or 'unknown'} then, {now or 'unknown'} here"
-            for name, (then, now) in redone.versions.items()
-        )
-        if redone.verdict == "differs" and not redone.versions:
-            rows["differs"] = "no version: the same packages and platform as recorded"
-    return rows
-
-
-def _redone_as_json(redone: Redone) -> dict[str, object]:
-    versions = {key: {"then": then, "here": here} for key, (then, here) in redone.versions.items()}
-    verdict = {} if redone.verdict == "impossible" else {"verdict": redone.verdict}
-    return verdict | {"redone": asdict(redone) | {"assumed": list(redone.assumed), "versions": versions}}
-
-
-def _verdict(found: Verification, rerun: bool) -> str:
-    if found.nothing_yet:
-        return "interrupted, nothing to verify yet"
+    if found.cut_off:
+        notes.append(f"the last {found.cut_off:,} steps were left out: their resets were lost in the kill")
+    rows["note"] = "\n".join([*notes, *found.notes])
     if found.sound:
-        return "identical" if rerun else "sound"
-    return "diverged" if rerun and found.difference is not None else "wrong"
-
-
-def _verification(found: Verification, rerun: bool) -> dict[str, str]:
-    verdict = _verdict(found, rerun)
-    if verdict == "diverged" and found.difference is not None and found.difference.step is not None:
-        verdict = f"diverged at step {found.difference.step:,}"
-    rows = {"recording": str(found.path), "verdict": verdict}
-    if found.nothing_yet:
-        return rows | {"next": "`dualtaxi resume` trains the run from the beginning"}
-    if found.sound:
-        rows["compared"] = f"{found.train_steps:,} steps of training, {found.eval_steps:,} of evaluation"
         rows["digest"] = found.content_digest or f"{UNKNOWN} (written when a run ends properly)"
         rows["not compared"] = found.not_compared
-    else:
-        rows["first"] = found.finding
-    rows["note"] = "\n".join(found.notes)
-    rows["differs"] = "\n".join(
-        f"{key}: {then or 'unknown'} then, {now or 'unknown'} here"
-        for key, (then, now) in found.provenance.items()
-    )
-    if rerun and not found.provenance:
-        rows["differs"] = "nothing: the same code, packages and processor"
+    if found.verdict == "differs" or (found.act == "retrained" and found.environment == "installed"):
+        rows["changed"] = "\n".join(
+            f"{key}: {then or 'unknown'} then, {now or 'unknown'} here"
+            for key, (then, now) in found.changes.items()
+        )
+        rows["changed"] = rows["changed"] or "nothing: the same code, packages and platform as recorded"
     return rows
 
 
-def _verification_as_json(found: Verification, rerun: bool) -> dict[str, object]:
+def _verdict(found: Verification) -> str:
+    """Return a verdict, with what was compared, in a sentence."""
+    steps = counted(found.steps, "step")
+    if found.verdict == "damaged":
+        return found.verdict
+    if found.act == "retrained":
+        compared = f"retrained with the {found.environment} environment"
+        if found.sound:
+            compared += f": {counted(found.episodes, 'episode')}, {steps} with evaluations, every byte"
+    elif found.act == "rerun":
+        of = found.of_episodes
+        episodes = counted(found.episodes, "episode")
+        if of is not None:
+            episodes = f"{found.episodes:,} of {counted(of, 'episode')}"
+        if found.unfinished:
+            episodes += f" ({found.unfinished:,} unfinished)"
+        exactness = f"within {found.tolerance:g}" if found.tolerance else "every byte"
+        compared = f"reran {episodes}, {steps}, {exactness}"
+    elif found.verdict == "interrupted" and not found.train_steps + found.eval_steps:
+        compared = "nothing was recorded yet"
+    else:
+        compared = "only the file was checked, which agrees with itself"
+    return f"{found.verdict}: {compared}"
+
+
+def _as_json(found: Verification) -> dict[str, object]:
+    """Return a verdict and all that belongs to it, as JSON."""
+    keys = ("verdict", "act", "train_steps", "eval_steps", "episodes", "unfinished", "steps")
+    more = ("left_out", "cut_off", "of_episodes", "tolerance", "assumed", "notes")
+    texts = {
+        key: getattr(found, key) or None for key in ("reason", "finding", "content_digest", "not_compared")
+    }
+    changes = {key: {"then": then, "here": here} for key, (then, here) in found.changes.items()}
+    values = {key: getattr(found, key) for key in (*keys, *more)}
+    difference = None if found.difference is None else _difference(found.difference)
     return {
         "path": str(found.path.absolute()),
-        "verdict": _verdict(found, rerun),
-        "finding": found.finding or None,
-        "difference": None if found.difference is None else _difference(found.difference),
-        "train_steps": found.train_steps,
-        "eval_steps": found.eval_steps,
-        "content_digest": found.content_digest or None,
-        "notes": list(found.notes),
-        "not_compared": found.not_compared or None,
-        "redone": None,
-        "provenance": {key: {"then": then, "here": here} for key, (then, here) in found.provenance.items()},
+        **values,
+        **texts,
+        "difference": difference,
+        "changes": changes,
     }
 
 
-def _difference(difference: Diverged) -> dict[str, object]:
-    keys = ("topic", "episode", "step", "field", "found", "expected")
-    values = {key: getattr(difference, key) for key in keys}
+def _difference(difference: Diverged | Difference) -> dict[str, object]:
     plain = (str, int, float, list, dict, type(None))
-    return {key: value if isinstance(value, plain) else str(value) for key, value in values.items()}
+    return {key: value if isinstance(value, plain) else str(value) for key, value in vars(difference).items()}
 
 
 _MESSAGES: Final = {

@@ -174,11 +174,11 @@ def test_accepted_changes(command, copied, monkeypatch):
 def test_verify(recorded, recorded_run):
     for name in ("@latest", recorded_run.name, recorded_run.folder, recorded_run.recording):
         values = recorded.json("verify", name)
-        assert values["verdict"] == "sound"
+        assert values["verdict"] == "reproduced"
         assert values["content_digest"] == recorded_run.summary["content_digest"]
     result = recorded("verify", "@latest", "--rerun")
     assert result.exit_code == 0
-    assert "identical" in result.stdout
+    assert "reproduced: retrained with the installed environment: " in result.stdout
     assert not result.stderr
 
 
@@ -191,7 +191,7 @@ def test_verify_names_what_is_wrong(command, copied, tmp_path):
     result = command("verify", path, "--json")
     assert result.exit_code == 1
     values = json.loads(result.stdout)
-    assert values["verdict"] == "wrong"
+    assert values["verdict"] == "differs"
     assert values["difference"] | {"expected": None} == {
         "topic": "/train/step",
         "episode": 1,
@@ -202,7 +202,7 @@ def test_verify_names_what_is_wrong(command, copied, tmp_path):
     }
     result = command("verify", path, "--rerun")
     assert result.exit_code == 1
-    assert "diverged at step 50" in result.stdout
+    assert "differs: " in result.stdout
     assert "/train/step, episode 1, step 50: rewards: found [12.5, 12.5], expected [" in result.stdout
 
 
@@ -349,7 +349,7 @@ def test_evaluate(command, copied):
     assert values["origin"] == {"run": copied.run_id, "step": 200}
     assert values["episodes"] == 0
     assert values["seed"] == 5
-    assert command.json("verify", values["run_id"])["verdict"] == "sound"
+    assert command.json("verify", values["run_id"])["verdict"] == "reproduced"
     assert command("play", values["run_id"], "--eval", "0:6").exit_code == 0
     result = command("evaluate", copied.run_id, "--trials", 3)
     assert f"of run {copied.run_id} after {copied.summary['train_steps']:,} training steps" in result.stdout

@@ -59,7 +59,7 @@ def test_a_recording_is_sound(run):
             run.summary["eval_steps"],
         )
         assert not found.notes
-        assert not found.provenance
+        assert not found.changes
 
 
 def test_a_rewritten_recording_is_sound(run, tmp_path):
@@ -181,13 +181,14 @@ def test_cut_off(run, tmp_path):
     path.write_bytes(run.recording.read_bytes())
     os.truncate(path, int(0.8 * path.stat().st_size))
     found = verify(path)
-    assert "repair" in found.finding
+    assert found.verdict == "interrupted"
+    assert "repair" in found.notes[0]
     assert found.difference is None
     assert 0 < found.train_steps <= run.summary["train_steps"]
     repair(path)
     found = verify(path)
-    assert found.sound
-    assert found.notes == ("the run did not end; verified as far as it got",)
+    assert found.verdict == "interrupted"
+    assert not found.notes
 
 
 def test_a_recording_that_was_cut_off_before_its_first_messages_is_not_wrong(run, tmp_path):
@@ -196,7 +197,7 @@ def test_a_recording_that_was_cut_off_before_its_first_messages_is_not_wrong(run
     for end in (first, first - 1, first + 1, first + 100):
         (tmp_path / "cut.mcap").write_bytes(data[:end])
         found = verify(tmp_path / "cut.mcap")
-        assert (found.nothing_yet, found.finding) == (True, ""), end
+        assert (found.verdict, found.finding, found.steps) == ("interrupted", "", 0), end
 
 
 def test_an_interrupted_recording_is_compared_to_its_end(run, tmp_path):
@@ -297,5 +298,4 @@ def test_a_closed_recording_with_a_damaged_length_is_not_taken_for_an_interrupte
     path = tmp_path / "changed.mcap"
     path.write_bytes(data)
     found = verify(path)
-    assert not found.nothing_yet
-    assert not found.sound
+    assert found.verdict == "damaged"

@@ -42,13 +42,13 @@ def test_a_loop_that_comes_out_again(recordings):
     code, output = verify(recordings, "pole", "--json")
     found = json.loads(output)
     assert (code, found["verdict"], found["finding"]) == (0, "reproduced", None)
-    assert (found["redone"]["steps"], found["redone"]["difference"]) == (300, None)
+    assert (found["steps"], found["difference"]) == (300, None)
 
 
 def test_some_episodes_of_a_loop(recordings):
     code, output = verify(recordings, "pole", "--sample", "3", "--tolerance", "1e-6")
     assert code == 0
-    assert "reproduced: 3 of " in output
+    assert "reproduced: reran 3 of " in output
     assert "within 1e-06" in output
 
 
@@ -60,7 +60,7 @@ def test_a_loop_that_differs_exits_with_1(recordings):
     code, output = verify(recordings, "other", "--trust", "--json")
     found = json.loads(output)
     assert (code, found["verdict"]) == (1, "differs")
-    difference = found["redone"]["difference"]
+    difference = found["difference"]
     assert (difference["phase"], difference["episode"], difference["t"]) == ("train", 0, 0)
     assert (difference["field"], difference["recorded"], difference["got"]) == ("reward", 1.0000001, 1.0)
     assert verify(recordings, "other", "--trust", "--tolerance", "1e-6")[0] == 0
@@ -74,19 +74,21 @@ def test_a_loop_that_cannot_be_done_again_is_an_error_only_if_that_is_demanded(r
     find_run("noisy", recordings).folder.joinpath(MARK_FILE).unlink(missing_ok=True)
     code, output = verify(recordings, "noisy", *words)
     assert code == 0
-    assert "sound; it cannot be reproduced here" in output
+    assert "consistent: only the file was checked" in output
+    assert "cannot be rerun: " in output
+    assert "reran" not in output
     assert reason in " ".join(output.split())
     assert verify(recordings, "noisy", *words, "--rerun")[0] == 1
     code, output = verify(recordings, "noisy", *words, "--json")
     found = json.loads(output)
-    assert (code, found["verdict"], found["redone"]["verdict"]) == (0, "sound", "impossible")
+    assert (code, found["verdict"], found["act"]) == (0, "consistent", "checked")
 
 
 def test_a_loop_that_is_not_to_be_done_again(recordings):
     for name in ("pole", "noisy"):
         code, output = verify(recordings, name, "--no-rerun")
         assert code == 0
-        assert "sound" in output
+        assert "consistent: only the file was checked" in output
         assert "reproduced" not in output
 
 
@@ -102,7 +104,7 @@ def test_damage_is_reported_and_nothing_is_done_again(recordings, tmp_path):
     (tmp_path / "damaged.mcap").write_bytes(data)
     code, output = verify(recordings, str(tmp_path / "damaged.mcap"))
     assert code == 1
-    assert "wrong" in output
+    assert "damaged" in output
     assert "reproduced" not in output
 
 
@@ -137,6 +139,6 @@ def test_a_function_of_a_file_in_the_current_folder_makes_the_environment_of_a_t
     assert "reproduced: 1 episode, " in run(*command, "verify", "own").stdout
     next(tmp_path.glob(f"recordings/*/{MARK_FILE}")).unlink()
     assert "--trust" in run(*command, "verify", "own").stdout
-    assert "reproduced: 1 episode, " in run(*command, "verify", "own", "--trust").stdout
+    assert "reproduced: reran 1 episode, " in run(*command, "verify", "own", "--trust").stdout
     done = run(*command, "export", "film", "own", "--episode", "0", "--trust", "-o", "own.gif")
     assert "pictures drawn again" in done.stdout + done.stderr

@@ -27,8 +27,8 @@ def test_a_rerun_reports_what_differs(tmp_path, monkeypatch):
     monkeypatch.setattr(provenance, "provenance", lambda: other)
     found = verify(whole.recording, rerun=True)
     assert found.sound
-    assert found.provenance == {"package.numpy": (here["package.numpy"], "1.0")}
-    assert not verify(whole.recording).provenance
+    assert found.changes == {"package.numpy": (here["package.numpy"], "1.0")}
+    assert not verify(whole.recording).changes
 
 
 def test_a_rerun_in_another_environment_diverges(tmp_path, monkeypatch):
@@ -42,7 +42,7 @@ def test_a_rerun_in_another_environment_diverges(tmp_path, monkeypatch):
     found = verify(whole.recording, rerun=True)
     assert found.difference.topic in ("/train/step", "/eval/step")
     assert found.difference.step is not None
-    assert found.provenance["environment.next_state"] == ("as recorded", "another")
+    assert found.changes["environment.next_state"] == ("as recorded", "another")
     assert verify(whole.recording).sound
 
 

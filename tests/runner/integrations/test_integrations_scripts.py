@@ -16,7 +16,7 @@ from scripts import SETTINGS, TABLE, learn, make, scalars, texts, the_run
 import runner
 from runner.analysis.series import points_of, read_series
 from runner.errors import ConfigError, EnvironmentNotUsable
-from runner.execution.redo import verify_by_redoing
+from runner.execution.verify import verify
 from runner.integrations import wandb
 from runner.integrations.tensorboard import SummaryWriter
 
@@ -38,7 +38,7 @@ def test_a_script_of_cleanrl_is_recorded_whole_by_the_import(vector):
         for step in range(10, 51, 10)
         for name, value in (("global_step", 4 * step), ("losses/value_loss", 1 / step))
     ]
-    assert verify_by_redoing(run.recording).verdict == "reproduced"
+    assert verify(run.recording).verdict == "reproduced"
 
 
 def test_the_environment_may_be_made_before_the_writer():
@@ -199,7 +199,7 @@ def test_values_without_an_environment_are_a_run_of_their_own():
     run = the_run()
     assert (run.name, run.status, run.summary["train_steps"]) == ("regression", "finished", 0)
     assert scalars(run)[:3] == [("loss/train", 1.0, 0), ("loss/test", 2.0, 0), ("loss/train", 1 / 11, 10)]
-    assert verify_by_redoing(run.recording).reason == "No steps were recorded."
+    assert verify(run.recording).reason == "No steps were recorded."
     with runner.open_recording(run.recording) as recording:
         series = read_series(recording)
     assert series.axis.name == "steps"

@@ -18,7 +18,7 @@ from scripts import SETTINGS, arrays, images, learn, make, scalars, texts, the_r
 import runner
 from runner.cli import cli
 from runner.errors import RunnerError
-from runner.execution.redo import verify_by_redoing
+from runner.execution.verify import verify
 from runner.integrations import shapes, wandb
 from runner.integrations.tensorboard import SummaryWriter
 
@@ -45,7 +45,7 @@ def test_a_script_of_wandb_is_recorded_whole_by_the_import():
     assert run.facts["config"]["config"] == SETTINGS
     assert run.summary["train_steps"] == 100
     assert scalars(run)[-2:] == [("losses/value", 1 / 50, 100), ("global_step", 100.0, 100)]
-    assert verify_by_redoing(run.recording).verdict == "reproduced"
+    assert verify(run.recording).verdict == "reproduced"
     assert wandb.run is None
 
 

@@ -21,7 +21,6 @@ from starlette.testclient import TestClient
 import runner
 from runner.cli import cli
 from runner.errors import CannotRedo, ConfigError, Diverged, RecordingError, RunnerError
-from runner.execution.redo import verify_by_redoing
 from runner.execution.rerecord import rerecord
 from runner.execution.verify import verify
 from runner.export.reports.report import render_report
@@ -118,9 +117,9 @@ def test_the_content_is_that_of_whole_steps_which_come_again(runs, tmp_path):
                     found = np.concatenate([block[name] for block in kept])
                     assert found.tobytes() == np.concatenate([block[name] for block in steps]).tobytes()
     assert verify(actions.recording).sound
-    redone = verify_by_redoing(actions.recording)
+    redone = verify(actions.recording)
     assert (redone.verdict, redone.left_out) == ("reproduced", 0)
-    assert redone.steps == verify_by_redoing(whole.recording).steps
+    assert redone.steps == verify(whole.recording).steps
     after = rerecord(actions)
     assert after.summary["content_digest"] == digest
     assert verify(after.recording).content_digest == digest
@@ -197,7 +196,7 @@ def test_without_actions_nothing_comes_again(tmp_path):
     assert verify(run.recording).sound
     with pytest.raises(RunnerError, match="without its actions"):
         rerecord(run)
-    redone = verify_by_redoing(run.recording)
+    redone = verify(run.recording)
     assert (redone.verdict, redone.reason) == ("impossible", "No steps were recorded.")
     shown = CliRunner().invoke(cli, ["play", run.run_id, "--recordings", str(tmp_path)])
     assert shown.exit_code
@@ -314,7 +313,7 @@ def test_a_killed_loop_keeps_its_actions_up_to_the_last_second(tmp_path):
         process.send_signal(signal.SIGKILL)
         process.wait()
     (run,) = runner.list_runs(tmp_path)
-    redone = verify_by_redoing(run.recording)
+    redone = verify(run.recording)
     assert redone.verdict == "reproduced"
     assert redone.steps > 100
     with pytest.raises(RunnerError, match="cut off"):
@@ -343,7 +342,7 @@ def test_a_disk_without_space_for_both_keeps_the_small_chunks(tmp_path, monkeypa
     assert sorted(path.name for path in run.folder.iterdir()) == ["recording.mcap", "run.json", "trust.json"]
     with open_recording(run.recording) as recording:
         assert len(list(recording.actions("train"))) > 1
-    assert verify_by_redoing(run.recording).verdict == "reproduced"
+    assert verify(run.recording).verdict == "reproduced"
 
 
 def test_a_changed_action_is_found(tmp_path, monkeypatch):

@@ -12,8 +12,7 @@ import pytest
 import runner
 from runner.analysis.diff import diff
 from runner.errors import ConfigError
-from runner.execution.redo import verify_by_redoing
-from runner.execution.verify import check_integrity
+from runner.execution.verify import check_integrity, verify
 from runner.export.pictures import Source, pictures
 from runner.recording.reader import open_recording
 from tests.runner.loops.making import dualtaxi
@@ -63,7 +62,7 @@ def test_a_game_in_turns_comes_out_again(name, is_seeded, tmp_path):
     for episode, total in zip(episodes, got, strict=True):
         np.testing.assert_allclose(episode["returns"], list(total.values()))
     assert all(int(step["acted"]).bit_count() == 1 for step in steps)
-    found = verify_by_redoing(rec.run.recording)
+    found = verify(rec.run.recording)
     assert (found.verdict, found.episodes, found.steps) == ("reproduced", 3, len(steps))
 
 

@@ -15,7 +15,6 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
-from runner.execution.redo import verify_by_redoing
 from runner.execution.verify import verify
 from runner.loops.fold import fold_if_over
 from runner.recording.reader import open_recording
@@ -58,7 +57,7 @@ def test_a_run_is_the_same_whichever_process_is_faster(tmp_path):
         assert times == sorted(times)
         assert len(times) == 3 + sum(-(-steps // 50) for steps in (250, 270, 340, 900))
     assert not shards_of(runs[0])
-    assert verify_by_redoing(runs[0].recording).verdict == "reproduced"
+    assert verify(runs[0].recording).verdict == "reproduced"
 
 
 def test_episodes_are_put_in_order_of_the_steps_of_their_processes(tmp_path):
@@ -106,7 +105,7 @@ def test_vectors_and_single_environments_share_a_run(tmp_path, mode):
         steps = recording.done()["train_steps"]
         taken = 120 * 3 + 90 * 2 + 80
         assert steps < taken if mode == AutoresetMode.NEXT_STEP else steps == taken
-    redone = verify_by_redoing(rec.run.recording)
+    redone = verify(rec.run.recording)
     assert (redone.verdict, redone.steps, redone.left_out) == ("reproduced", steps + 100, 0)
 
 
@@ -214,7 +213,7 @@ def test_a_killed_shard_loses_its_last_second_at_most(tmp_path, after):
         if lasted > 1.1:
             assert steps > 100
             assert victim.status == "interrupted"
-    assert verify_by_redoing(run.recording, sample=5).verdict == "reproduced"
+    assert verify(run.recording, sample=5).verdict == "reproduced"
 
 
 def fail(how: str) -> None:
@@ -279,7 +278,7 @@ def test_the_last_process_folds_when_the_owner_was_killed(tmp_path):
     assert run.status == "interrupted"
     assert run.summary.train_steps > 150
     assert not shards_of(run)
-    assert verify_by_redoing(run.recording).verdict == "reproduced"
+    assert verify(run.recording).verdict == "reproduced"
 
 
 def test_the_next_command_folds_when_all_were_killed(tmp_path):
@@ -341,7 +340,7 @@ def test_games_of_several_agents_share_a_run(tmp_path):
         step(rec, 1)
         with runner.record_parallel(simple_tag_v3.parallel_env(max_cycles=30), join=rec.run) as two:
             step(two, 5)
-    redone = verify_by_redoing(rec.run.recording)
+    redone = verify(rec.run.recording)
     assert (redone.verdict, redone.steps, redone.episodes) == ("reproduced", 120, 4)
     assert verify(rec.run.recording).sound
 
@@ -356,4 +355,4 @@ def test_events_of_a_table_are_counted_over_all_processes(tmp_path):
         assert recording.episodes("train")["penalties"].sum() > 0
         assert recording.result.rewards_off_table == 0
     assert verify(rec.run.recording).sound
-    assert verify_by_redoing(rec.run.recording).verdict == "reproduced"
+    assert verify(rec.run.recording).verdict == "reproduced"

@@ -11,7 +11,7 @@ from gymnasium.vector import AsyncVectorEnv
 
 import runner
 from runner.errors import ConfigError, RunnerError
-from runner.execution.redo import verify_by_redoing
+from runner.execution.verify import verify
 from runner.recording.reader import open_recording
 from runner.runs.listing import list_runs, run_at
 from runner.runs.shards import RUN_VARIABLE, shards_of
@@ -133,5 +133,5 @@ def test_evaluations_right_after_each_other_are_recorded_in_full(tmp_path):
             evaluator.at_step(100 * evaluation)
             play(evaluator, 20, seed=evaluation)
         evaluator.close()
-    redone = verify_by_redoing(rec.run.recording)
+    redone = verify(rec.run.recording)
     assert (redone.verdict, redone.steps) == ("reproduced", 60)

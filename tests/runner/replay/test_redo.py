@@ -18,7 +18,7 @@ from gymnasium.wrappers.vector import NormalizeObservation as NormalizeVector
 
 import runner
 from runner.errors import RecordingError
-from runner.execution.redo import verify_by_redoing
+from runner.execution.verify import verify
 from runner.export.pictures import Source, source_of
 from runner.recording.reader import open_recording
 from runner.replay.environment import redo, redo_in_child
@@ -304,6 +304,6 @@ def test_a_run_that_was_killed_comes_out_again_with_both_of_its_environments(tmp
     steps, difference = redone(killed)
     assert difference is None
     assert sum(recorded) - 60 < steps <= sum(recorded)
-    verdict = verify_by_redoing(killed)
+    verdict = verify(killed)
     assert (verdict.verdict, verdict.steps) == ("reproduced", steps)
     assert verdict.cut_off == sum(recorded) - steps

@@ -13,7 +13,7 @@ import pytest
 
 import runner
 from runner.errors import CannotRedo
-from runner.execution.redo import verify_by_redoing
+from runner.execution.verify import verify
 from runner.export.pictures import Source, source_of
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import open_recording
@@ -265,8 +265,8 @@ def test_an_environment_of_bad_habits_ends_with_the_reason(make, seconds, reason
     path = record(make(), tmp_path, 60, make=make)
     with pytest.raises(CannotRedo, match=reason):
         list(redo_in_child(path, trust=True))
-    found = verify_by_redoing(path, trust=True)
-    assert found.verdict == "impossible"
+    found = verify(path, trust=True)
+    assert found.verdict == "consistent"
     assert reason in found.reason
 
 
@@ -285,20 +285,20 @@ def test_an_environment_that_cannot_draw_says_so(make, reason, tmp_path):
 
 
 def test_a_loop_is_verified_by_doing_it_again(pole):
-    found = verify_by_redoing(pole)
+    found = verify(pole)
     with open_recording(pole) as recording:
         episodes = recording.count(recording.topic("/train/episode"))
     assert (found.verdict, found.steps, found.difference) == ("reproduced", 600, None)
     assert found.episodes in (episodes, episodes + 1)
-    sample = verify_by_redoing(pole, sample=4)
+    sample = verify(pole, sample=4)
     assert (sample.verdict, sample.episodes, sample.of_episodes) == ("reproduced", 4, episodes)
     assert 0 < sample.steps < 600
 
 
 def test_state_outside_of_the_seed_is_named(tmp_path):
     path = record(loops.noisy(), tmp_path, 40, make=loops.noisy)
-    found = verify_by_redoing(path, trust=True)
-    assert found.verdict == "impossible"
+    found = verify(path, trust=True)
+    assert found.verdict == "consistent"
     assert "more than its seed" in found.reason
     assert (found.difference.episode, found.difference.t, found.difference.field) == (0, 0, "reward")
 
@@ -310,7 +310,7 @@ def test_an_environment_of_another_version_differs(tmp_path, monkeypatch):
     versions = runner.loops.makers.package_versions()
     monkeypatch.setattr("runner.loops.makers.package_versions", lambda _=(): versions | {"gymnasium": "0.9"})
     path = record(loops.counter(), tmp_path, 40, make=loops.counter)
-    found = verify_by_redoing(path, trust=True)
+    found = verify(path, trust=True)
     assert (found.verdict, found.steps) == ("differs", 1)
     assert (found.difference.field, found.difference.recorded, found.difference.got) == ("reward", 2.0, 1.0)
-    assert found.versions == {"gymnasium": ("0.9", gymnasium.__version__)}
+    assert found.changes == {"gymnasium": ("0.9", gymnasium.__version__)}
