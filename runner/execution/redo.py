@@ -30,7 +30,7 @@ from runner.runs.provenance import Differences
 from runner.util.processes import report_progress
 
 Report = Callable[[int], None]
-_OUTSIDE: Final = (
+OUTSIDE: Final = (
     "The environment gives other results each time for the same seed and actions: it depends on more than "
     "its seed, such as the global random generators, the clock, the order of a set, or threads."
 )
@@ -52,11 +52,13 @@ def rerun_loop(
     A difference counts if it comes out again in other processes, with other hash seeds and a later clock.
 
     Args:
-        checked: the result of checking the file, which is returned if it is not sound, or not of a loop.
+        checked: the result of checking the file, which is returned if it is not sound, not of a loop, or of
+            one that was interrupted before its first step.
         sample: how many episodes to rerun, at even distances; None for all that happened.
         tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
     """
-    if not (checked.is_loop and checked.sound):
+    is_empty = checked.verdict == "interrupted" and not checked.train_steps + checked.eval_steps
+    if is_empty or not (checked.is_loop and checked.sound):
         return checked
     with open_recording(checked.path) as recording:
         if reason := why_not_redone(recording, trust):
@@ -73,7 +75,7 @@ def rerun_loop(
                 found = message
         reason, is_different = found.reason, found.difference is not None
         if is_different and not reason and not all(_differs_again(found, trust, k) for k in _HASH_SEEDS):
-            reason = _OUTSIDE
+            reason = OUTSIDE
     except CannotRedo as error:
         return replace(checked, reason=str(error))
     return replace(checked, reason=reason, difference=found.difference) if reason else found

@@ -115,7 +115,8 @@ def check(
     if damage is None:
         return found
     if is_cut and found.sound:
-        return replace(found, verdict="interrupted", content_digest="", notes=(*found.notes, str(damage)))
+        note = str(damage).removeprefix(f"{path}: ")
+        return replace(found, verdict="interrupted", content_digest="", notes=(*found.notes, note))
     if found.sound:
         return replace(found, verdict="damaged", finding=f"{damage}{unreadable}", content_digest="")
     return replace(found, verdict="damaged", notes=(*found.notes, str(damage)))

@@ -17,12 +17,14 @@ from runner.analysis.diff import RunDiff, diff
 from runner.analysis.diff.sections import sections
 from runner.analysis.diff.settings import changes_in
 from runner.environments.gym_types import Env
-from runner.errors import ConfigError
+from runner.errors import CannotRedo, ConfigError
+from runner.execution.redo import OUTSIDE
 from runner.export.reports.diff import render_diff
 from runner.loops.env import record
 from runner.loops.makers import maker_of
 from runner.recording.maker import EnvironmentMaker
-from runner.recording.reader import open_recording
+from runner.recording.reader import Recording, open_recording
+from runner.replay.differences import Difference
 from runner.replay.environment import redo
 from runner.runs.run import Run
 from runner.util.arrays import Array
@@ -94,15 +96,22 @@ def compare_environment(golden: Path, make: Callable[[], Env], tolerance: float)
 
     Raises:
         RecordingError: the golden run cannot be read.
-        CannotRedo: the actions cannot be taken in this environment.
+        CannotRedo: the actions cannot be taken in this environment, or it depends on more than its seed.
     """
     with open_recording(golden) as recording:
-        for steps in redo(recording, make=make, tolerance=tolerance):
-            if steps.difference is not None:
-                with closing(make()) as env:
-                    here = maker_of(env)
-                return "\n".join([str(steps.difference), *_changes(recording.maker, here)])
-    return ""
+        first = _first_difference(recording, make, tolerance)
+        if first is None:
+            return ""
+        if _first_difference(recording, make, tolerance) != first:
+            raise CannotRedo(f"{OUTSIDE}\n{first}")
+        with closing(make()) as env:
+            here = maker_of(env)
+        return "\n".join([str(first), *_changes(recording.maker, here)])
+
+
+def _first_difference(recording: Recording, make: Callable[[], Env], tolerance: float) -> Difference | None:
+    steps = redo(recording, make=make, tolerance=tolerance)
+    return next((block.difference for block in steps if block.difference is not None), None)
 
 
 def _changes(recorded: EnvironmentMaker | None, here: EnvironmentMaker) -> list[str]:

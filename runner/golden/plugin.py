@@ -122,7 +122,7 @@ class Golden:
             if not self._is_update:
                 page = self._write_page(file, difference.page)
                 pytest.fail(
-                    f"not the golden run {file.name}.\n{difference.text}\npage: {page}\n{_UPDATE}",
+                    f"differs from the golden run {file.name}.\n{difference.text}\npage: {page}\n{_UPDATE}",
                     pytrace=False,
                 )
         export_mcap(run, file, anonymous=True, force=True)
@@ -147,24 +147,26 @@ class Golden:
                 machines differ; 0 compares bytes.
             name: tells several golden runs of one test apart.
         """
-        from runner.errors import RunnerError
+        from runner.errors import CannotRedo, RunnerError
         from runner.export.mcap import export_mcap
         from runner.golden.comparison import compare_environment, record_environment
 
         file = self._file(name, ".mcap")
         if not self._is_update:
             self._require(file)
+        verdict = "the environment differs from"
         try:
             text = compare_environment(file, make, tolerance) if file.exists() else "there is none"
         except RunnerError as error:
             text = str(error)
+            verdict = "cannot be rerun:" if isinstance(error, CannotRedo) else "damaged:"
         if text and self._is_update:
             file.parent.mkdir(parents=True, exist_ok=True)
             run = record_environment(make, episodes, max_steps, self.recordings)
             export_mcap(run, file, anonymous=True, force=True)
         elif text:
             pytest.fail(
-                f"the environment is not that of the golden run {file.name}.\n{text}\n{_UPDATE}",
+                f"{verdict} the golden run {file.name}.\n{text}\n{_UPDATE}",
                 pytrace=False,
             )
 

@@ -1,14 +1,18 @@
-"""One thread for all open loops of this process, which flushes them twice a second; and what a fork ends."""
+"""One thread that flushes all open loops of this process twice a second; and what a fork or SIGTERM ends."""
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
 import threading
 import time
 import weakref
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from runner.recording.recorder import FLUSH_SECONDS
+
+_RETRY_SECONDS: Final = 0.01
 
 
 class Flushable(Protocol):
@@ -39,7 +43,11 @@ class Flusher:
         self._lock = threading.Lock()
 
     def add(self, loop: Flushable) -> None:
-        """Flush a loop from now on, as long as its `flush` returns True."""
+        """Flush a loop from now on, as long as its `flush` returns True; close it before SIGTERM ends it."""
+        is_main = threading.current_thread() is threading.main_thread()
+        if is_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:  # else the user has a handler
+            with contextlib.suppress(ValueError):  # not the main interpreter
+                signal.signal(signal.SIGTERM, _end_by_signal)
         with self._lock:
             self.loops.add(loop)
             self._to_flush.add(loop)
@@ -71,10 +79,25 @@ def open_loops() -> list[Any]:
     return sorted(loops, key=lambda loop: loop.started)
 
 
+def _end_by_signal(number: int, _frame: object) -> None:
+    """Close the recordings of this process as interrupted, then let the signal end it as it would have."""
+    loops = open_loops()
+    if any(loop.lock._is_owned() for loop in loops):  # this thread is recording: it must complete that first
+        threading.Timer(_RETRY_SECONDS, os.kill, (os.getpid(), number)).start()
+        return
+    signal.signal(number, signal.SIG_DFL)  # a second signal ends it at once
+    for loop in loops:
+        with contextlib.suppress(Exception):  # the run then has the status failed, with the reason
+            loop.close("interrupted")
+    os.kill(os.getpid(), number)
+
+
 def _after_fork() -> None:
     """In a forked process: it has no such thread, and the recordings belong to the other process."""
     loops = list(FLUSHER.loops)
     FLUSHER.clear()
+    if signal.getsignal(signal.SIGTERM) is _end_by_signal:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
     for loop in loops:
         loop.disown()
 

@@ -13,8 +13,8 @@ from runner.cli.options import json_option, recordings_option, run_argument, tru
 from runner.cli.output import draw, facts, print_json
 from runner.cli.parameter_types import COUNT
 from runner.cli.progress import bytes_line, count_line
-from runner.cli.runs import command_for, find_recording, job_progress, require_over
-from runner.errors import Diverged, ExitCode
+from runner.cli.runs import command_for, find, find_recording, job_progress, require_over
+from runner.errors import Diverged, ExitCode, RunnerError
 from runner.runs.locking import locked
 from runner.runs.run import Run
 from runner.util.humanize import UNKNOWN, counted, size
@@ -72,15 +72,23 @@ def verify_command(
       dualtaxi verify backup/recording.mcap --json
     """
     from runner.execution.redo import rerun_loop
+    from runner.execution.verification import Verification
     from runner.execution.verify import check, damage_of
 
-    path, run = find_recording(run_name, recordings)
-    require_over(run)
-    episodes = (run.episodes_to_do or 0) if run else 0
-    with bytes_line("reading") as reading:
-        damage = damage_of(path, reading)
-    with job_progress("verifying", episodes) as (report, _):
-        found = check(path, damage, bool(rerun), report)
+    try:
+        path, run = find_recording(run_name, recordings)
+    except RunnerError:
+        run = find(run_name, recordings)
+        if run.status != "interrupted":
+            raise
+        found = Verification(run.recording, "interrupted")  # it ended before it had a recording
+    else:
+        require_over(run)
+        episodes = (run.episodes_to_do or 0) if run else 0
+        with bytes_line("reading") as reading:
+            damage = damage_of(path, reading)
+        with job_progress("verifying", episodes) as (report, _):
+            found = check(path, damage, bool(rerun), report)
     if rerun is not False:
         with count_line("steps rerun", 0 if sample else found.train_steps + found.eval_steps) as count:
             found = rerun_loop(found, sample, tolerance, trust, count)
@@ -105,10 +113,12 @@ def _rows(found: Verification, run: Run | None) -> dict[str, str]:
     notes = [f"{name}: its arguments were assumed, as they could not be recorded" for name in found.assumed]
     if found.left_out:
         notes.append(
-            f"{found.left_out:,} steps were left out: the random generators before them are not known"
+            f"{counted(found.left_out, 'step')} left out: the random generators before them are not known"
         )
     if found.cut_off:
-        notes.append(f"the last {found.cut_off:,} steps were left out: their resets were lost in the kill")
+        notes.append(
+            f"the last {counted(found.cut_off, 'step')} left out: their resets were lost in the kill"
+        )
     rows["note"] = "\n".join([*notes, *found.notes])
     if found.sound:
         rows["digest"] = found.content_digest or f"{UNKNOWN} (written when a run ends properly)"

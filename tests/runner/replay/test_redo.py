@@ -305,5 +305,5 @@ def test_a_run_that_was_killed_comes_out_again_with_both_of_its_environments(tmp
     assert difference is None
     assert sum(recorded) - 60 < steps <= sum(recorded)
     verdict = verify(killed)
-    assert (verdict.verdict, verdict.steps) == ("reproduced", steps)
+    assert (verdict.verdict, verdict.act, verdict.steps) == ("interrupted", "rerun", steps)
     assert verdict.cut_off == sum(recorded) - steps
