@@ -22,7 +22,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import runner
 from runner.cli.episode import Episode
 from runner.errors import ConfigError, RecordingError
-from runner.execution.redo import verify_by_redoing
+from runner.execution.verify import verify
 from runner.export.episodes import named_episode
 from runner.export.pictures import describer
 from runner.recording.maker import EnvironmentMaker, VectorMaker, parse_maker
@@ -187,11 +187,11 @@ def test_an_environment_of_an_own_class_is_made_with_its_arguments(wrap, tmp_pat
     maker = maker_of(rec)
     assert (maker.reason, maker.assumed) == ("", ())
     assert json.loads(maker.spec)["kwargs"] == {"length": 7, "reward": 0.5}
-    assert verify_by_redoing(rec.run.recording).verdict == "reproduced"
+    assert verify(rec.run.recording).verdict == "reproduced"
     copied = shutil.copy(rec.run.recording, tmp_path / "copied.mcap")
-    assert verify_by_redoing(copied, trust=True).verdict == "reproduced"
-    untrusted = verify_by_redoing(copied)
-    assert untrusted.verdict == "impossible"
+    assert verify(copied, trust=True).verdict == "reproduced"
+    untrusted = verify(copied)
+    assert untrusted.verdict == "consistent"
     assert "--trust" in untrusted.reason
 
 
@@ -227,10 +227,10 @@ def test_no_reason_holds_an_address_of_memory(tmp_path):
 
 def test_assumed_arguments_never_make_a_difference(tmp_path):
     same = record_steps(runner.record(Rounded(make_pole(), 3), tmp_path))
-    assert verify_by_redoing(same.run.recording, trust=True).verdict == "reproduced"
+    assert verify(same.run.recording, trust=True).verdict == "reproduced"
     other = record_steps(runner.record(Padded(make_pole(), 3), tmp_path))
-    outcome = verify_by_redoing(other.run.recording, trust=True)
-    assert (outcome.verdict, outcome.difference is None) == ("impossible", False)
+    outcome = verify(other.run.recording, trust=True)
+    assert (outcome.verdict, outcome.difference is None) == ("consistent", False)
     assert "Padded could not be recorded" in outcome.reason
     assert 'make="module:function"' in outcome.reason
 

@@ -15,7 +15,7 @@ import runner
 from dualtaxi import Rewards
 from dualtaxi.parallel import DualTaxiParallelEnv
 from runner.errors import EnvironmentNotUsable
-from runner.execution.redo import verify_by_redoing
+from runner.execution.verify import verify
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import Recording, open_recording
@@ -324,5 +324,5 @@ def test_a_game_is_made_with_the_arguments_it_had(tmp_path):
     game = DualTaxiParallelEnv(max_steps=30, rewards=rewards, slip=0.25)
     with runner.record_parallel(game, tmp_path) as rec:
         parallel(rec, 2)
-    outcome = verify_by_redoing(rec.run.recording, trust=True)
+    outcome = verify(rec.run.recording, trust=True)
     assert (outcome.verdict, outcome.steps, outcome.assumed) == ("reproduced", 60, ())
