@@ -39,7 +39,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "report": ("report", "Write one self-contained page about one or several runs."),
         "diff": ("compare", "Show what differs between two runs, and where they diverge."),
         "compare": ("compare", "Compare groups of runs, with statistics over seeds."),
-        "verify": ("verify", "Check every step of a run by doing it again."),
+        "verify": ("verify", "Check every step of a run: retrain it, or rerun its environment."),
         "checkpoints": ("checkpoints", "List the checkpoints that a loop recorded."),
         "checkpoint": ("checkpoints", "Write a checkpoint of a run into a file."),
         "values": ("checkpoints", "Compute what a checkpoint's agent returns along a recorded episode."),

@@ -137,7 +137,9 @@ def _verdict(found: Verification) -> str:
     steps = counted(found.steps, "step")
     if found.verdict == "damaged":
         return found.verdict
-    if found.act == "retrained":
+    if found.verdict == "interrupted" and not found.train_steps + found.eval_steps:
+        compared = "nothing was recorded yet"
+    elif found.act == "retrained":
         compared = f"retrained with the {found.environment} environment"
         if found.sound:
             compared += f": {counted(found.episodes, 'episode')}, {steps} with evaluations, every byte"
@@ -150,8 +152,6 @@ def _verdict(found: Verification) -> str:
             episodes += f" ({found.unfinished:,} unfinished)"
         exactness = f"within {found.tolerance:g}" if found.tolerance else "every byte"
         compared = f"reran {episodes}, {steps}, {exactness}"
-    elif found.verdict == "interrupted" and not found.train_steps + found.eval_steps:
-        compared = "nothing was recorded yet"
     else:
         compared = "only the file was checked, which agrees with itself"
     return f"{found.verdict}: {compared}"

@@ -76,6 +76,20 @@ class Counter(gymnasium.Env[Any, Any]):
         return 1.0
 
 
+class Ordered(Counter):
+    """Rewards depend on the order of a set of texts."""
+
+    def reward(self) -> float:
+        return float(sum(place * ord(text) for place, text in enumerate(set("abcdefghijklmnop"))))
+
+
+class Clocked(Counter):
+    """Rewards depend on the day."""
+
+    def reward(self) -> float:
+        return float(time.time() // 86_400)
+
+
 class Wide(Counter):
     """Draws large pictures at once."""
 
@@ -88,6 +102,16 @@ class Wide(Counter):
     def render(self) -> np.ndarray:
         """Return a picture of 9 MB."""
         return self._picture
+
+
+def ordered() -> Ordered:
+    """Return one whose rewards depend on the hash seed."""
+    return Ordered()
+
+
+def clocked() -> Clocked:
+    """Return one whose rewards depend on the clock, coarsely."""
+    return Clocked()
 
 
 def counter() -> Counter:

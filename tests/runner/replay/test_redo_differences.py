@@ -303,6 +303,17 @@ def test_state_outside_of_the_seed_is_named(tmp_path):
     assert (found.difference.episode, found.difference.t, found.difference.field) == (0, 0, "reward")
 
 
+@pytest.mark.parametrize("make", [loops.ordered, loops.clocked])
+def test_the_order_of_a_set_and_a_coarse_clock_are_no_difference(make, tmp_path, monkeypatch):
+    """Recorded on another day, with another hash seed; each rerun in one process differs in the same way."""
+    monkeypatch.setattr(type(make()), "reward", lambda self: -1.0)
+    path = record(make(), tmp_path, 20, make=make)
+    found = verify(path, trust=True)
+    assert (found.verdict, found.act, found.finding) == ("consistent", "checked", "")
+    assert "more than its seed" in found.reason
+    assert (found.difference.field, found.difference.recorded) == ("reward", -1.0)
+
+
 def test_an_environment_of_another_version_differs(tmp_path, monkeypatch):
     monkeypatch.setattr(
         loops.Counter, "reward", lambda self: 2.0
