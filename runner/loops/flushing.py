@@ -92,15 +92,30 @@ def _end_by_signal(number: int, _frame: object) -> None:
     os.kill(os.getpid(), number)
 
 
+_mask: set[int] = set()
+"""The signals that were blocked before the last fork."""
+
+
+def _before_fork() -> None:
+    """Keep SIGTERM waiting for a forked process until it has no handler: before, it would be lost."""
+    global _mask  # noqa: PLW0603 - passed between the hooks of one fork
+    _mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
+
+
+def _unblock() -> None:
+    signal.pthread_sigmask(signal.SIG_SETMASK, _mask)
+
+
 def _after_fork() -> None:
     """In a forked process: it has no such thread, and the recordings belong to the other process."""
     loops = list(FLUSHER.loops)
     FLUSHER.clear()
     if signal.getsignal(signal.SIGTERM) is _end_by_signal:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    _unblock()
     for loop in loops:
         loop.disown()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
+    os.register_at_fork(before=_before_fork, after_in_parent=_unblock, after_in_child=_after_fork)

@@ -136,7 +136,7 @@ def test_a_function_of_a_file_in_the_current_folder_makes_the_environment_of_a_t
     done = run(sys.executable, "own_pole.py")
     assert done.returncode == 0, done.stderr
     command = (sys.executable, "-P", "-m", "runner")  # without the current folder, as `dualtaxi`
-    assert "reproduced: 1 episode, " in run(*command, "verify", "own").stdout
+    assert "reproduced: reran 1 episode, " in run(*command, "verify", "own").stdout
     next(tmp_path.glob(f"recordings/*/{MARK_FILE}")).unlink()
     assert "--trust" in run(*command, "verify", "own").stdout
     assert "reproduced: reran 1 episode, " in run(*command, "verify", "own", "--trust").stdout
