@@ -104,7 +104,7 @@ def _rows(found: Verification, run: Run | None) -> dict[str, str]:
     """Return a verdict and all that belongs to it, as text by name."""
     rows = {"recording": str(found.path), "verdict": _verdict(found), "first": found.finding}
     if found.verdict == "interrupted" and run is not None and run.can_train_again:
-        rows["next"] = f"`{command_for(run, 'resume')}` goes on from there"
+        rows["next"] = f"`{command_for(run, 'resume')}` continues from there"
     if found.reason:
         rows["reason"] = f"cannot be rerun: {found.reason}"
         rows["for example"] = str(found.difference or "")
