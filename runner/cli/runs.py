@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 # --- finding ----------------------------------------------------------------------------------------------
 
 
-def find(name: str, recordings: Path | None) -> Run:
-    """Return the run of a name or path in a recordings folder."""
-    return folded(find_run(name, recordings, report=say))
+def find(name: str, recordings: Path | None, newest: bool = False) -> Run:
+    """Return the run of a name or path in a recordings folder; with `newest`, the newest of several."""
+    return folded(find_run(name, recordings, report=say, newest=newest))
 
 
 def find_recorded(name: str, recordings: Path | None) -> Run:
-    """Return the run of a name with its recording, restored into the cache if it is archived."""
-    return recorded(find(name, recordings))
+    """Return the newest run of a name with its recording, restored into the cache if it is archived."""
+    return recorded(find(name, recordings, newest=True))
 
 
 def find_all_recorded(names: Iterable[str], recordings: Path | None) -> list[Run]:

@@ -11,7 +11,7 @@ import functools
 import inspect
 import os
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Final, Self, Unpack
+from typing import Any, Final, Protocol, Self, Unpack
 
 import numpy as np
 
@@ -158,9 +158,13 @@ class Recording(BaseCallback):  # type: ignore[misc]
                 f"found that {type(self.model).__name__}.learn does not call BaseAlgorithm._setup_learn, as "
                 "others do. Record its environments instead, by runner.record(envs)."
             )
+        self._write_into(self.recorded)
+
+    def _write_into(self, recorded: Logs) -> None:
+        """Let the model's logger write into a recording."""
         formats = self.logger.output_formats
         formats[:] = [one for one in formats if not isinstance(one, _LogWriter)]
-        self._writer = _LogWriter(self.recorded)
+        self._writer = _LogWriter(recorded)
         formats.append(self._writer)
 
     def _on_training_start(self) -> None:
@@ -176,7 +180,7 @@ class Recording(BaseCallback):  # type: ignore[misc]
             if self.num_timesteps < self.model._total_timesteps:  # else there is one after the last update
                 self._checkpoint()
             self._next_checkpoint = self.num_timesteps + self._checkpoint_every
-        return not self.recorded.should_stop
+        return self._envs is None or not self.recorded.should_stop
 
     def _on_training_end(self) -> None:
         has_updated = self.model._n_updates != self._updates
@@ -213,6 +217,13 @@ class Recording(BaseCallback):  # type: ignore[misc]
         self.recorded.checkpoint("policy", self.model.policy.state_dict())
 
 
+class Logs(Protocol):
+    """Takes numbers and texts."""
+
+    def log(self, name: str, value: object) -> None:
+        """Log a number or a text under a name."""
+
+
 class _LogWriter(KVWriter):  # type: ignore[misc]
     """Records what the library's logger writes: numbers and texts.
 
@@ -220,7 +231,7 @@ class _LogWriter(KVWriter):  # type: ignore[misc]
     the first update after each time that it writes are recorded, and those of the last, at their own steps.
     """
 
-    def __init__(self, recorded: RecordedVector) -> None:
+    def __init__(self, recorded: Logs) -> None:
         self._recorded = recorded
         self._of_updates: set[str] = set()
         """The names of the numbers of updates."""

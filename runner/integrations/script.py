@@ -263,7 +263,7 @@ class ScriptRun:
     @property
     def has_environment(self) -> bool:
         """Whether it records an environment that the script did not hand over."""
-        return self._watched is not None
+        return isinstance(self._watched, WatchedEnvironment)
 
     @property
     def waits_for_environment(self) -> bool:

@@ -14,6 +14,7 @@ import os
 import re
 import socket
 import sys
+import weakref
 from collections.abc import Callable, Mapping
 from datetime import datetime
 from functools import wraps
@@ -299,6 +300,7 @@ def _settings(table: str) -> dict[str, object]:
 
 _forwarded: SummaryWriter | None = None
 """Takes what the script writes with another library's writer."""
+_left_out: weakref.WeakSet[object] = weakref.WeakSet()
 
 
 def forward() -> bool:
@@ -320,10 +322,15 @@ def forward() -> bool:
     return has_writers
 
 
+def do_not_forward(writer: object) -> None:
+    """Leave out what is written with this writer of another library, as it is recorded otherwise."""
+    _left_out.add(writer)
+
+
 def _forwarding(name: str, method: Callable[..., object]) -> Callable[..., object]:
     @wraps(method)
     def both(self: object, *arguments: object, **named: object) -> object:
-        if _forwarded is not None and not _forwarded.script.closed:
+        if _forwarded is not None and not _forwarded.script.closed and self not in _left_out:
             getattr(_forwarded, name)(*arguments, **named)
         return method(self, *arguments, **named)
 

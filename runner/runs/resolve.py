@@ -32,6 +32,7 @@ def find_run(
     recordings: str | os.PathLike[str] | None = None,
     exclude: str = "",
     report: Report = lambda _: None,
+    newest: bool = False,
 ) -> Run:
     """Return the run with an id, a unique prefix of an id, a name, a path or `@latest`.
 
@@ -41,7 +42,8 @@ def find_run(
         name: the name.
         recordings: the recordings folder: $DUALTAXI_RECORDINGS, or ./recordings, by default.
         exclude: the id of a run that never matches.
-        report: called with messages about the index.
+        report: called with messages about the index, and about a choice.
+        newest: whether a name that several runs have is the newest of them.
 
     Raises:
         RunNotFound: no run matches, or several do.
@@ -58,7 +60,12 @@ def find_run(
     candidates = matches(quick=True) or matches(quick=False)
     if not candidates:
         raise look([folder], lambda index: not_found(name, index, folder), report, cached=True)
-    return choose(name, candidates)._replace(root=os.fspath(folder)).run()  # the path as the user gave it
+    chosen = choose(name, candidates, newest)
+    if chosen.name == name != chosen.run_id:
+        count = sum(candidate.name == name for candidate in candidates)
+        if count > 1:
+            report(f"{count:,} runs are named {name}: the newest is taken, {chosen.run_id}.")
+    return chosen._replace(root=os.fspath(folder)).run()  # the path as the user gave it
 
 
 def run_of_id(run_id: str, recordings: Path) -> Run | None:
@@ -109,10 +116,11 @@ def of_name(name: str, index: Index) -> list[Candidate]:
     return [run for run in reversed(matching(name, index)) if run.name == name]
 
 
-def choose(name: str, candidates: Sequence[Candidate]) -> Candidate:
+def choose(name: str, candidates: Sequence[Candidate], newest: bool = False) -> Candidate:
     """Return the run that a name stands for, of those that `matching` returned, which are not empty.
 
-    An id comes before a name, and a name that one run has before the beginnings of ids.
+    An id comes before a name, and a name that one run has before the beginnings of ids; with `newest`, also
+    a name that several have.
 
     Raises:
         RunNotFound: the name is ambiguous.
@@ -120,7 +128,7 @@ def choose(name: str, candidates: Sequence[Candidate]) -> Candidate:
     exact = [run for run in candidates if run.run_id == name]
     named = [run for run in candidates if run.name == name]
     for group in (exact, named, candidates):
-        if len(group) == 1:
+        if len(group) == 1 or (newest and group is named and named):
             return group[0]
     listed = [
         f"  {run.run_id}  {run_title(run.name, run.seed)}  {run.created:%Y-%m-%d %H:%M} UTC"
@@ -128,9 +136,9 @@ def choose(name: str, candidates: Sequence[Candidate]) -> Candidate:
     ]
     if len(candidates) > _MAX_LISTED:
         listed.append(f"  and {len(candidates) - _MAX_LISTED:,} more")
-    newest = f", or the newest of this name by {name}{LATEST}" if named else ""
+    hint = f", or the newest of this name by {name}{LATEST}" if named else ""
     raise RunNotFound(
-        "\n".join([f"{name!r} matches {len(candidates)} runs; name one by its id{newest}:", *listed])
+        "\n".join([f"{name!r} matches {len(candidates)} runs; name one by its id{hint}:", *listed])
     )
 
 

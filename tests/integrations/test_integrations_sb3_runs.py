@@ -15,7 +15,10 @@ from stable_baselines3.common.vec_env import (
 
 import runner
 from runner.errors import ConfigError
+from runner.integrations import wandb
 from runner.integrations.sb3 import Recording
+from runner.integrations.wandb.integration.sb3 import WandbCallback
+from runner.recording.schema import SCALAR_TOPIC
 from tests.integrations.sb3_models import SMALL, assert_equal_weights, logged, verified, weights
 
 
@@ -145,3 +148,27 @@ def test_a_training_that_is_requested_to_stop_ends_and_is_finished(recordings):
     assert 100 < model.num_timesteps < 1_000_000
     assert recording.run.status == "finished"
     assert recording.run.summary["train_steps"] == model.num_timesteps
+
+
+@pytest.mark.parametrize("has_environment", [True, False])
+def test_the_callback_of_wandb_records_into_its_run(recordings, has_environment):
+    run = wandb.init(
+        project="sb3", config={"env": "CartPole-v1"}, sync_tensorboard=True, monitor_gym=has_environment
+    )
+    model = PPO("MlpPolicy", "CartPole-v1", seed=1, tensorboard_log=f"runs/{run.id}", **SMALL)
+    with pytest.warns(RuntimeWarning, match="gradients are not recorded"):
+        callback = WandbCallback(gradient_save_freq=100, model_save_path=f"models/{run.id}", verbose=2)
+    model.learn(128, callback=callback)
+    wandb.log({"after": 1.0})
+    run.finish()
+    (found,) = runner.list_runs(recordings)
+    assert (found.run_id, found.status, found.name) == (run.id, "finished", "sb3")
+    assert found.facts["config"]["config"]["env"] == "CartPole-v1"
+    assert found.summary["train_steps"] == (128 if has_environment else 0)
+    assert (recordings.parent / "models" / run.id / "model.zip").is_file()
+    with runner.open_recording(found.recording) as recording:
+        names = [scalar["name"] for scalar in recording.decoded(SCALAR_TOPIC)]
+    assert names.count("train/loss") == 128 // SMALL["n_steps"]
+    assert names[-1] == "after"
+    if has_environment:
+        assert "reproduced" in verified(found)

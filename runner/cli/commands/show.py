@@ -65,7 +65,7 @@ def show_command(
     from runner.analysis.summary import describe_run
     from runner.runs.catalogue.index import look
 
-    run = restored(find(run_name, recordings))
+    run = restored(find(run_name, recordings, newest=True))
     if code:
         _print_code(run, as_json)
         return

@@ -96,9 +96,15 @@ def test_an_unknown_run_is_refused_with_the_nearest(recorded):
     assert "Did you mean 'tiny'?" in result.stderr
 
 
-def test_an_ambiguous_name_is_refused_with_all_matches(command, tiny):
+def test_a_name_of_several_runs_is_the_newest_unless_a_command_changes_the_run(command, tiny):
     ids = [command.json("run", tiny)["run_id"] for _ in range(2)]
-    result = command("show", "tiny")
+    for verb in ("show", "verify"):
+        result = command(verb, "tiny")
+        assert result.exit_code == 0, result.stderr
+        assert ids[1] in result.stdout
+        assert f"2 runs are named tiny: the newest is taken, {ids[1]}." in result.stderr
+        assert "named tiny" not in command(verb, "tiny@latest").stderr
+    result = command("label", "tiny", "--tag", "keep")
     assert result.exit_code == 2
     assert all(run_id in result.stderr for run_id in ids)
 

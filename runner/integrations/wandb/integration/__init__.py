@@ -1,0 +1,1 @@
+"""What `wandb.integration` has for libraries that the runner records."""
