@@ -33,7 +33,7 @@ from runner.errors import RecordingError
 from runner.export.encoded import picture_note
 from runner.export.episodes import first_state, last_episode, last_whole_evaluation, typical_trial
 from runner.export.plots.curves import Plot
-from runner.export.plots.heatmaps import EXPLANATION, heatmap_plots
+from runner.export.plots.heatmaps import EXPLANATION, constants_in, heatmap_plots
 from runner.export.plots.machine import machine_facts, machine_plots
 from runner.export.plots.tasks import task_charts
 from runner.export.reports.compare import tasks_legend
@@ -224,7 +224,7 @@ def distributions(path: Path, axis: str) -> bytes:
         result, notes = histograms(recording, axis_of(axis))
     if not result:
         return b""
-    text = " ".join([EXPLANATION, *notes])
+    text = " ".join([EXPLANATION, *constants_in(result), *notes])
     return str(partials().charts("distributions", "Distributions", text, heatmap_plots(result))).encode()
 
 

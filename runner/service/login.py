@@ -30,7 +30,9 @@ class LoginView(View):
 
 @router.get("/login")
 def ask(request: Request, next: Annotated[str, Query(max_length=4000)] = "/") -> Response:  # noqa: A002
-    """Ask for a token."""
+    """Ask for a token, where one is needed."""
+    if not request.app.state.settings.needs_token:
+        return RedirectResponse(_local(next), HTTPStatus.SEE_OTHER)
     return page(request, LoginView(next))
 
 
@@ -47,9 +49,7 @@ def login(request: Request, sent: Form) -> Response:
         session = sessions.begin(token)
     except RunnerError as error:
         return page(request, LoginView(target, message_of(error, request)), status_of(error))
-    # Only a path of this service: browsers take `//host` and `/\host` for addresses of other sites.
-    is_local = target.startswith("/") and not target.startswith(("//", "/\\")) and target.isprintable()
-    response = RedirectResponse(target if is_local else "/", HTTPStatus.SEE_OTHER)
+    response = RedirectResponse(_local(target), HTTPStatus.SEE_OTHER)
     response.set_cookie(COOKIE, session, max_age=SESSION_SECONDS, **_cookie_options(request))
     return response
 
@@ -63,6 +63,13 @@ def logout(request: Request) -> Response:
     response = RedirectResponse("/login", HTTPStatus.SEE_OTHER)
     response.delete_cookie(COOKIE, **_cookie_options(request))
     return response
+
+
+def _local(target: str) -> str:
+    """Return an address if it is a path of this service, or else that of the first page."""
+    # Browsers take `//host` and `/\host` for addresses of other sites.
+    is_local = target.startswith("/") and not target.startswith(("//", "/\\")) and target.isprintable()
+    return target if is_local else "/"
 
 
 def _cookie_options(request: Request) -> dict[str, Any]:

@@ -237,11 +237,10 @@ def parallel_chart(picture: Picture) -> Chart:
     lines, places = np.array(columns).T, np.arange(len(columns), dtype=np.float64)
     x = Scale(-0.1, len(columns) - 0.75, 10.0, 580.0)
     chart = Chart(x, Scale(-0.05, 1.05, 186.0, 24.0), 590.0, 216.0, "The trials in parallel coordinates")
-    colours = palette.ramp_colours(len(lines))
-    for number in range(len(lines) - 1, -1, -1):
-        _trial_line(chart, lines[number], colours[number], 0.9, 0.7)
+    for number, opacity in reversed(list(enumerate(np.linspace(0.9, 0.35, len(lines)).tolist()))):
+        _trial_line(chart, lines[number], _TRIAL, 0.9, opacity)
     _trial_line(chart, lines[0], _BEST, 2.2, 1.0)
-    title = "Each trial is a line, the best one thick; dark lines are better than light ones"
+    title = "Each trial is a line, the best one thick; strong lines are better than faint ones"
     chart.text(10.0, 14.0, title, size=9.5, bold=True)
     names = [*(axis.path for axis in picture.axes), picture.objective]
     for place, name in zip(chart.x(places).tolist(), names, strict=True):

@@ -122,7 +122,9 @@ def few_seeds(groups: Sequence[Group], seeds: Mapping[str, int]) -> list[str]:
         return []
     listed_groups = ", ".join(f"{group.label} ({seeds[group.label]})" for group in few)
     loops = all(not run.can_train_again for group in few for run in group.runs)
-    more = "record more, each with a seed of its own" if loops else "`--set 'seeds={count: 10}'` runs ten"
+    more = (
+        "record more, each with a seed of its own" if loops else "the setting `seeds: {count: 10}` runs ten"
+    )
     return [
         f"fewer than {FEW_SEEDS} seeds in {listed_groups}: bootstrap intervals of so few are "
         "too narrow (at 4 seeds one of 95 % covers 86 % of the time), so take them as a hint; " + more

@@ -30,8 +30,14 @@ EXPLANATION: Final = (
 
 
 def heatmap_plots(histograms: list[Histogram]) -> list[Plot]:
-    """Return the heat maps for a page."""
-    return [Plot(title_of(each), heatmap_chart(each).svg(), False) for each in histograms]
+    """Return the heat maps for a page, of what is not constant."""
+    varying = [histogram for histogram in histograms if len(histogram.names) != 1]
+    return [Plot(title_of(histogram), heatmap_chart(histogram).svg(), False) for histogram in varying]
+
+
+def constants_in(histograms: list[Histogram]) -> list[str]:
+    """Return a sentence on each quantity that has one value, of which a heat map shows nothing."""
+    return [f"{title_of(each)}: always {each.names[0]}." for each in histograms if len(each.names) == 1]
 
 
 def title_of(histogram: Histogram) -> str:

@@ -160,7 +160,7 @@ class RunExporter:
         columns = instances(
             rr.Points2D,
             positions=repeated_point(n, scene.columns / 2, scene.rows / 2),
-            labels=texts(["no steps exported here: see --episodes, --evaluations and --all"] * n),
+            labels=texts(["no steps of this time were exported"] * n),
         )
         sender.send("text", [rr.TimeColumn("step", sequence=[start for start, _ in gaps])], columns)
         sender.clear("text", [stop for _, stop in gaps if stop <= last])

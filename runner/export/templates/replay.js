@@ -215,7 +215,7 @@ class Replay {
       const after = at.findIndex((step) => step > now), j = after < 0 ? at.length - 1 : Math.max(0, after - 1);
       const far = Math.abs(at[j] - now), steps = `${far.toLocaleString("en")} ${far === 1 ? "step" : "steps"}`;
       const row = Replay.make("tr");
-      row.append(Replay.make("th", name), Replay.make("td", values[j]), Replay.make("td", far ? `${steps} ${at[j] > now ? "later" : "before"}` : "now"));
+      row.append(Replay.make("th", name), Replay.make("td", values[j]), Replay.make("td", far ? `${steps} ${at[j] > now ? "later" : "before"}` : (this.episode.first ?? 0) + i ? "now" : "before the first step"));
       row.firstChild.scope = "row";
       return row;
     });

@@ -74,7 +74,7 @@ class Compared:
     """Path, title and address."""
     here: str
     can_explain: bool
-    """Whether mixtures of both can be trained."""
+    """Whether mixtures of both can be trained: jobs that differ in more than their seed."""
 
     @property
     def title(self) -> str:
@@ -304,9 +304,9 @@ def _compared(runs: list[Run], here: str) -> Compared:
     ]
     if not any(map(has_tables, runs)):
         tabs = [tab for tab in tabs if tab[0] != "/tables"]
-    return Compared(
-        compared, tabs if len(runs) == 2 else [], here, len(runs) == 2 and all(map(has_tables, runs))
-    )
+    differ = len({repr(_flat(each)) for each in runs}) > 1
+    can_explain = len(runs) == 2 and all(map(has_tables, runs)) and differ
+    return Compared(compared, tabs if len(runs) == 2 else [], here, can_explain)
 
 
 def _flat(run: Run) -> dict[str, str]:

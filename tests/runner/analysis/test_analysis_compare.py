@@ -150,7 +150,7 @@ def test_few_seeds_are_warned_of_and_have_no_iqm_below_four():
     comparison = result(two_groups([10, 20, 30], [10, 20, 30]))
     assert "fewer than 10 seeds" in comparison.notes[0]
     assert math.isnan(comparison.metrics[0].groups[0].iqm.value)
-    assert "`--set 'seeds={count: 10}'` runs ten" in comparison.notes[0]
+    assert "the setting `seeds: {count: 10}` runs ten" in comparison.notes[0]
     assert result(two_groups([1] * 10, [2] * 10)).notes == []
     of_loops = result(two_groups([10, 20], [10, 20], made_by="runner.record"))
     assert of_loops.notes[0].endswith("as a hint; record more, each with a seed of its own")

@@ -10,7 +10,7 @@ import runner
 from runner.analysis.axes import EPISODES, STEPS, UPDATES
 from runner.analysis.histograms import histograms
 from runner.errors import RecordingError
-from runner.export.plots.heatmaps import heatmap_plots
+from runner.export.plots.heatmaps import constants_in, heatmap_plots
 from runner.recording import schema
 from runner.recording.reader import open_recording
 
@@ -57,8 +57,18 @@ def found_in(folder, axis=STEPS):
     with open_recording(run.recording) as recording:
         found, notes = histograms(recording, axis)
     maps = "".join(plot.svg for plot in heatmap_plots(found))
-    assert all(f">{name}</text>" in maps for each in found if len(each.names) < 10 for name in each.names)
+    drawn = [each for each in found if 1 < len(each.names) < 10]
+    assert all(f">{name}</text>" in maps for each in drawn for name in each.names)
     return {(each.quantity, each.line): each for each in found}, notes
+
+
+def test_a_constant_is_a_sentence_and_no_picture(tmp_path):
+    recorded(tmp_path, gymnasium.make("CartPole-v1"))
+    (run,) = runner.list_runs(tmp_path)
+    with open_recording(run.recording) as recording:
+        found, _ = histograms(recording, STEPS)
+    assert constants_in(found) == ["Rewards in training: always 1."]
+    assert "Rewards in training" not in [plot.title for plot in heatmap_plots(found)]
 
 
 def counted(histogram, start, stop, value):

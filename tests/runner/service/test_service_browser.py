@@ -292,6 +292,24 @@ def test_nothing_sticks_out_of_any_page(page, width):
     browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
+def test_a_narrow_comparison_cuts_no_word(page):
+    size = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    browser = page("/compare?run=first&run=second")
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    browser.refresh()
+    lines = browser.execute_script(
+        """
+        const cells = [...document.querySelectorAll(".against td")];
+        return cells.filter((cell) => !/\\s/.test(cell.textContent)).map((cell) => {
+          const words = document.createRange();
+          words.selectNodeContents(cell);
+          return words.getClientRects().length;
+        })"""
+    )
+    browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert set(lines) == {1}
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_everything_has_a_name_and_text_stands_out(page, scheme):
     """Names for screen readers; contrast of at least 4.5 to 1, as WCAG 2 wants it (level AA)."""

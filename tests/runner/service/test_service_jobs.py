@@ -77,6 +77,8 @@ def test_a_configuration_is_run_seed_by_seed_as_from_the_command_line(client, su
 
     states = [data["state"] for _, event, data in seen if event == "state"]
     assert states == ["queued", "running", "finished"]
+    page = client.get(f"/queue/{number}", headers={"Accept": "text/html"}).text
+    assert page.count("finished</li>") == page.count("job finished</li>") + 2, "of the job and of each run"
     assert [data["run_id"] for _, event, data in seen if event == "run"] == [run.run_id for run in here]
     log = [data["text"] for _, event, data in seen if event == "log" and data.get("seed") == 1]
     assert log[0] == "training 200 episodes with q_learning"

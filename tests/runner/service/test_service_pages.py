@@ -20,6 +20,7 @@ from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import reader
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
+from runner.runs.run import RUN_FILE
 from runner.service.processes import ProcessPool
 from tests.runner.loops.making import make, play
 from tests.waiting import until
@@ -145,6 +146,16 @@ def test_the_page_of_a_run_waits_for_no_child_process(client, monkeypatch):
     monkeypatch.setattr(ProcessPool, "submit_within", hang)
     for name in ("first", "second"):
         assert client.get(f"/runs/{name}").status_code == 200
+
+
+def test_only_differences_in_settings_can_be_explained(client, recordings):
+    pair = "/compare?run=first&run=second"
+    assert "Explain the difference" not in page_of(client, pair), "only their seeds differ"
+    run = find_run("second", recordings)
+    facts = json.loads((run.folder / RUN_FILE).read_text())
+    facts["config"]["discount"] = 0.5
+    (run.folder / RUN_FILE).write_text(json.dumps(facts))
+    assert "Explain the difference" in page_of(client, pair)
 
 
 def test_every_page_is_well_formed_and_has_nothing_inline(client):

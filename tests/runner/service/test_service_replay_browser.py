@@ -54,6 +54,12 @@ def test_pictures_appear_and_follow_the_slider(page, name):
     wait(browser, lambda: browser.current_url.endswith("?t=1"))
 
 
+def test_what_was_logged_after_the_episode_before_is_not_of_the_first_frame(page):
+    browser = page("/runs/pole/replay/train/1?t=0")
+    (logged,) = wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, ".logged tr"))
+    assert logged.text == "loss 1 before the first step"
+
+
 def test_two_loops_are_played_in_step(page):
     browser = page("/compare/replay?run=pole&run=framed&at=2:1")
     wait(browser, lambda: len(shown_pictures(browser)) == 2)

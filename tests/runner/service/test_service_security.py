@@ -360,6 +360,23 @@ def test_the_command_creates_lists_and_revokes_tokens(monkeypatch, tmp_path):
     assert kept.find(secret) is None
 
 
+@pytest.mark.parametrize(("target", "where"), [("/disk", "/disk"), ("//evil.example", "/"), ("", "/")])
+def test_no_token_is_asked_for_where_none_is_needed(client, target, where):
+    answer = client.get("/login", params={"next": target}, follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (303, where)
+
+
+def test_the_login_fits_a_narrow_screen(browser, recordings, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    Tokens(tmp_path / "dualtaxi" / "tokens.json").create("laptop", (READ,))
+    size = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    with Served(recordings, "--require-token") as served:
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        browser.get(f"{served.url}/login")
+        assert browser.execute_script("return document.documentElement.scrollWidth") == 390
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
 def test_headers_of_a_trusted_proxy_are_used(recordings, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     tokens = Tokens(tmp_path / "dualtaxi" / "tokens.json")

@@ -46,7 +46,7 @@ function watch() {
   });
   on("log", (data) => line(data.time, data.text));
   on("state", (data) => {
-    line(data.time, data.state + (data.error ? `: ${data.error}` : ""));
+    line(data.time, `job ${data.state}` + (data.error ? `: ${data.error}` : ""));
     state.textContent = data.state;
     state.className = `status ${data.state}`;
     if (!["queued", "running"].includes(data.state)) { source.close(); location.reload(); }
