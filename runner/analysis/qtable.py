@@ -6,7 +6,7 @@ recorded by `snapshot`, of each name the latest.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NotRequired, TypedDict
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from runner.environments.naming import action_names, actions_in_words, numbered, state_of, states_in_words
 from runner.errors import NotInRecording, RunnerError
 from runner.recording import schema
+from runner.recording.messages import Snapshot
 from runner.recording.reader import Recording
 from runner.replay.history import history_of
 from runner.replay.steps import last_step, step_of_episode
@@ -93,20 +94,36 @@ def describe_tables(
     return description, one_array(replay.tables)
 
 
+def recorded_tables(recording: Recording) -> Iterator[Snapshot]:
+    """Yield the arrays of [states, actions] that a loop recorded in training, in order.
+
+    Raises:
+        RunnerError: states or actions of the loop have no numbers.
+    """
+    shape = _shape(recording)
+    for array in recording.arrays():
+        if array.values.shape == shape and array.phase == "train":
+            yield array
+
+
+def _shape(recording: Recording) -> tuple[int, int]:
+    """Return the numbers of states and of actions of a loop."""
+    if not recording.has_states:
+        recording.require_job("a Q-table", "A loop has one where states and actions are Discrete.")
+    return recording.spaces["observation"]["n"], recording.spaces["action"]["n"]
+
+
 def _describe_snapshots(
     recording: Recording, step: int | None, state: int | str | None
 ) -> tuple[TablesDescription, NDArray[np.float64]]:
     """Return the latest tables that a loop recorded, or those at a step."""
-    shape = tuple(recording.spaces[name].get("n") for name in ("observation", "action"))
-    if None in shape or not recording.has_states:
-        recording.require_job("a Q-table", "A loop has one where states and actions are Discrete.")
-    arrays = [array for array in recording.arrays() if array.values.shape == shape and array.phase == "train"]
+    arrays = list(recorded_tables(recording))
     last = max([recording.count(schema.TRAIN_STEP), *(array.step for array in arrays)])
     latest = {array.name: array for array in arrays if step is None or array.step <= step <= last}
     if not latest:
         raise NotInRecording(
             f"{recording.path}: found no table after {last if step is None else step:,} of {last:,} training "
-            f"steps, expected an array of shape {list(shape)}, such as a loop records by "
+            f"steps, expected an array of shape {list(_shape(recording))}, such as a loop records by "
             '`rec.snapshot("q", q)`.'
         )
     tables = {name: array.values.astype(np.float64) for name, array in latest.items()}
@@ -116,6 +133,7 @@ def _describe_snapshots(
         "tables": [{**summarize(name, q), "snapshot_step": latest[name].step} for name, q in tables.items()],
     }
     if state is not None:
+        shape = _shape(recording)
         states = states_in_words(recording.mdp) if recording.tabular else range(shape[0])
         number = numbered(str(state), list(map(str, states)), "a state", 1)
         taken = _actions_taken(recording, number, max(array.step for array in latest.values()))

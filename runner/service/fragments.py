@@ -212,8 +212,8 @@ def maps(path: Path) -> bytes:
     """Return the maps of policy and values at stages of learning, as HTML."""
     with open_recording(path) as recording:
         rows = []
-        drawing = svg.drawing_of(recording.mdp) if recording.has_tables else None
-        if recording.has_tables:
+        drawing = svg.drawing_of(recording.mdp) if recording.tabular else None
+        if recording.tabular:
             rows = maps_of(recording.mdp, recording.agents, stages_of(recording), _typical_start(recording))
         return str(partials().maps(rows, drawing is not None and drawing.width > svg.BROAD)).encode()
 

@@ -13,10 +13,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.qtable import recorded_tables
 from runner.drawing.svg_maps import pair_map, policy_map
 from runner.environments.mdp import Mdp
 from runner.environments.naming import spoken, states_in_words
 from runner.errors import RecordingError
+from runner.recording.messages import Snapshot
 from runner.recording.reader import Recording
 from runner.replay.steps import step_of_episode
 from runner.replay.tables import tables_at
@@ -54,24 +56,28 @@ def stages_of(recording: Recording) -> list[Stage]:
     """Return the tables before, in the middle of and after learning; fewer where they are the same.
 
     The middle is the snapshot nearest to half of the episodes; without one between the first and the last,
-    the steps up to there are replayed, if they were recorded.
+    the steps up to there are replayed, if they were recorded. A loop's are those of its first table's name.
     """
     by_step: dict[int, Stage] = {}
-    for table in recording.snapshots():
+    name = ""
+    for table in recording.snapshots() if recording.has_tables else recorded_tables(recording):
+        if isinstance(table, Snapshot) and table.name != (name := name or table.name):
+            continue
         stage = by_step.setdefault(table.step, Stage("", table.episode, table.step, []))
-        stage.tables.append(table.values)
+        stage.tables.append(np.asarray(table.values, np.float64))
     whole = [stage for stage in by_step.values() if len(stage.tables) == len(recording.agents)]
     if not whole:
         return []
     first, last = whole[0], whole[-1]
     half = (first.episode + last.episode) // 2
     between = sorted(whole[1:-1], key=lambda stage: abs(stage.episode - half))
-    middle = between[0] if between else _replayed(recording, half)
-    named = [("before learning", first)]
+    middle = between[0] if between else _replayed(recording, half) if recording.has_tables else None
+    named = [("before learning" if recording.has_tables else "at the first snapshot", first)]
     if middle:
         is_half = abs(middle.episode - half) <= _HALFWAY * (last.episode - first.episode)
         named.append(("in the middle" if is_half else "during learning", middle))
-    named.append(("after learning" if recording.status == "finished" else "at the last snapshot", last))
+    is_end = recording.has_tables and recording.status == "finished"
+    named.append(("after learning" if is_end else "at the last snapshot", last))
     unique = {
         stage.step: replace(stage, title=f"{title}: {stage.episode:,} episodes") for title, stage in named
     }

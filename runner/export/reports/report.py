@@ -250,7 +250,7 @@ def _episodes(recording: Recording, chosen: Sequence[Choice]) -> dict[tuple[int,
 
 def _maps(recording: Recording, episode: tuple[int, ...] | None) -> list[MapRow]:
     """Return the maps, for the situation in which an episode begins."""
-    if not recording.has_tables:
+    if not recording.tabular:
         return []
     mdp = recording.mdp
     start = int(mdp.start.argmax())

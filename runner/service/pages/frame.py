@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from typing import Final
 
 from runner.analysis.evaluations import loop_summary
+from runner.analysis.qtable import recorded_tables
 from runner.errors import RecordingError
 from runner.export.reports.rendering import View
 from runner.recording import schema
@@ -64,7 +66,7 @@ def head_of(run: Run) -> RunHead:
         "episodes": has_episodes,
         "evaluations": has_episodes,
         "rerun": has_episodes,
-        "learned": has_tables(run),
+        "learned": has_tables(run) or _has_recorded_tables(run),
         "when": has_tables(run),
         "why": has_tables(run),
         "pictures": bool(run.summary.messages.get(schema.IMAGE_TOPIC.name))
@@ -85,6 +87,15 @@ def head_of(run: Run) -> RunHead:
 def has_tables(run: Run) -> bool:
     """Return whether the Q-tables of a run are known, without opening its recording."""
     return run.can_train_again
+
+
+def _has_recorded_tables(run: Run) -> bool:
+    """Return whether a loop recorded tables that can be drawn as maps; only one with arrays is opened."""
+    if not run.summary.messages.get(schema.ARRAY_TOPIC.name):
+        return False
+    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
+        return recording.tabular and next(recorded_tables(recording), None) is not None
+    return False
 
 
 def loop_results(run: Run) -> Summary:

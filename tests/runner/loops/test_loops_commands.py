@@ -184,6 +184,17 @@ def test_the_table_of_a_loop_is_its_latest_snapshot(tmp_path):
     for words, message in (("--step", "5"), "no table after 5 of 60"), (("--step", "61"), "61 of 60"):
         refused = dualtaxi(tmp_path, "qtable", "table", *words)
         assert (refused.exit_code, message in refused.output) == (2, True)
+    dualtaxi(tmp_path, "report", "table", "-o", tmp_path / "report.html")
+    settings = Settings(recordings=(tmp_path,))
+    with TestClient(create_app(settings), base_url="http://localhost") as client:
+        head = client.get(f"/runs/{rec.run.run_id}").text
+        page = client.get(f"/runs/{rec.run.run_id}/learned").text
+        table = client.get(f"/api/v1/runs/{rec.run.run_id}/qtable", params={"step": 30, "state": 0}).json()
+    assert f"/runs/{rec.run.run_id}/learned" in head
+    for text in ((tmp_path / "report.html").read_text(), page):
+        assert "Greedy actions of player" in text
+        assert "At the last snapshot" in text
+    assert table == {key: value for key, value in found.items() if key != "files"}
 
 
 def test_an_evaluation_of_a_loop_is_played(folder):
