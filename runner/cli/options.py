@@ -99,7 +99,7 @@ trust_option: Final = option(
     "--trust",
     is_flag=True,
     callback=_trusted,
-    help="Import what the recording names, also from the current folder: run code that you trust only.",
+    help="Import what a recording of others names, also from the current folder: it runs their code.",
 )
 checkpoint_option: Final = option(
     "--checkpoint", metavar="[NAME]@STEP", help="The last checkpoint at or before this step, of this name."

@@ -30,6 +30,7 @@ from runner.debugging.game import Game, Plan, interactions_of, mixture_bounds, s
 from runner.debugging.mixtures import Measured, Measurement, Mixtures, Readings, measure
 from runner.errors import RunnerError, RunNotFound, nearest
 from runner.execution.initial_tables import resolve_initial_q
+from runner.replay.trust import require_may_train
 from runner.runs.locking import acquired
 from runner.runs.resolve import find_run
 from runner.runs.run import Run, recordings_folder
@@ -67,6 +68,7 @@ def explain(
     report: Report = lambda *_: None,
     planned: Callable[[Plan], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
+    trust: bool = False,
 ) -> Explanation:
     """Train mixtures of two configurations, and return which settings make the difference between them.
 
@@ -86,12 +88,15 @@ def explain(
             counted; at last with the episodes of the two short runs that show the first step.
         planned: called with what will be trained, before it is.
         stop: called several times a second; return True to stop.
+        trust: whether environments of runs may be made that `runner.replay.trust` refuses.
 
     Raises:
+        CannotRedo: an environment may not be made.
         RunnerError: nothing differs, or too much; they cannot be mixed; a mixture does not have the metric.
         KeyboardInterrupt: it was interrupted, or `stop` returned True.
     """
-    question = ask(a, b, metric=metric, at=at, seeds=seeds, recordings=recordings_folder(recordings))
+    folder = recordings_folder(recordings)
+    question = ask(a, b, metric=metric, at=at, seeds=seeds, recordings=folder, trust=trust)
     pool: Workers[Measurement, Measured]
     with worker_pool(workers, ray, 2**MAX_ALL) as pool:
         return answer(question, pool, report, planned, stop)
@@ -119,7 +124,14 @@ class Question:
 
 
 def ask(
-    a: Source, b: Source, *, metric: str | None, at: int | None, seeds: int, recordings: Path
+    a: Source,
+    b: Source,
+    *,
+    metric: str | None,
+    at: int | None,
+    seeds: int,
+    recordings: Path,
+    trust: bool = False,
 ) -> Question:
     """Return what is to be explained; arguments and errors as for `explain`."""
     if not 1 <= seeds <= MAX_SEEDS:
@@ -127,7 +139,7 @@ def ask(
     if at is not None and at < 1:
         raise RunnerError(f"at: found {at}, expected a number of training episodes from 1 on.")
     (side_a, config_a, first), (side_b, config_b, other) = (
-        _resolved(source, recordings) for source in (a, b)
+        _resolved(source, recordings, trust) for source in (a, b)
     )
     mixing = mix(config_a, config_b, at, exact=(metric or "").startswith("exact."))
     notes = list(mixing.notes)
@@ -204,7 +216,7 @@ def answer(
         lock.release()
 
 
-def _resolved(source: Source, recordings: Path) -> tuple[Side, ExperimentConfig, int]:
+def _resolved(source: Source, recordings: Path, trust: bool) -> tuple[Side, ExperimentConfig, int]:
     """Return a name, the configuration and the seed of a run or a configuration.
 
     Raises:
@@ -235,6 +247,7 @@ def _resolved(source: Source, recordings: Path) -> tuple[Side, ExperimentConfig,
             f"here with other settings. `dualtaxi diff {source.run_id} OTHER` shows in what two loops differ "
             "and where they diverge, and `dualtaxi compare` compares many."
         )
+    require_may_train(source.recording, source.file.config, trust)
     config = from_mapping(source.file.config)
     return Side(source.name, source.run_id), resolve_initial_q(config, recordings), source.seed
 

@@ -35,6 +35,7 @@ from runner.replay.makers import why_not_redone
 from runner.replay.recorded import Piece, pieces
 from runner.replay.steps import last_step
 from runner.replay.tables import tables_at
+from runner.replay.trust import require_may_train
 from runner.replay.whole_steps import blank_steps, fill_in
 from runner.runs import run as runs
 from runner.runs.locking import locked
@@ -78,8 +79,7 @@ def rerecord(
         run: the run.
         report: called with the progress of a job, a few times a second.
         stop: called every few milliseconds while a job is trained; return True to stop.
-        trust: whether the environment may be imported that a loop's recording names, if no installed package
-            registers it.
+        trust: whether an environment may be made that `runner.replay.trust` refuses.
         count: called with the number of steps of a loop that were done, a few times a second.
 
     Raises:
@@ -107,6 +107,7 @@ def rerecord(
                     for done in stream_from_child(_rerecord_loop, current.recording, fresh, trust):
                         count(done)
                 else:
+                    require_may_train(current.recording, current.file.config, trust)
                     _rerecord_job(current, fresh, report, stop)
                 fresh.replace(current.recording)
         finally:
@@ -127,6 +128,7 @@ def evaluate(
     seed: int = 0,
     report: Report = lambda _: None,
     stop: Stop = lambda: False,
+    trust: bool = False,
 ) -> Run:
     """Play a run's greedy policy at some step in new episodes, recorded as a run of its own.
 
@@ -139,11 +141,14 @@ def evaluate(
         seed: the new run's seed.
         report: called with the progress a few times a second.
         stop: called every few milliseconds; return True to stop.
+        trust: whether an environment may be made that `runner.replay.trust` refuses.
 
     Raises:
+        CannotRedo: the environment may not be made.
         RunnerError: there is no such table, or the new run cannot be recorded.
     """
     config = evaluation_of(run, recordings, step, trials, start, seed)
+    require_may_train(run.recording, config.to_mapping(), trust)
     fresh = runs.create_run(recordings, config, seed, parent=run)
     with unless_empty(fresh):
         return run_job(Job(config, seed), fresh, report, stop)

@@ -36,6 +36,7 @@ from runner.recording.reader import Recording, open_recording
 from runner.recording.records import Contents
 from runner.recording.reference import Reference
 from runner.recording.writer import RecordingFile, storage_error
+from runner.replay.trust import require_may_train
 from runner.runs.code import CodeCollector
 from runner.runs.listing import run_at
 from runner.runs.locking import locked
@@ -62,7 +63,11 @@ def is_finished(run: Run) -> bool:
 
 
 def resume(
-    run: Run, accept_changes: bool = False, report: Report = lambda _: None, stop: Stop = lambda: False
+    run: Run,
+    accept_changes: bool = False,
+    report: Report = lambda _: None,
+    stop: Stop = lambda: False,
+    trust: bool = False,
 ) -> Run:
     """Resume a run; return it, finished or interrupted. A finished run is returned as it is.
 
@@ -72,8 +77,10 @@ def resume(
             this is recorded. The recorded steps are compared all the same.
         report: called with the progress a few times a second.
         stop: called every few milliseconds; return True to stop.
+        trust: whether an environment may be made that `runner.replay.trust` refuses.
 
     Raises:
+        CannotRedo: the environment may not be made.
         RunnerError: the run is running; something decisive differs; or its folder cannot be used.
         Diverged: what is recorded is not what the job gives.
     """
@@ -85,6 +92,7 @@ def resume(
     with locked(run) as current:
         if is_finished(current):
             return _with_finished_status(current)
+        require_may_train(current.recording, current.file.config, trust)
         return _resume(current, accept_changes, report, stop)
 
 

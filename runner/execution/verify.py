@@ -19,7 +19,15 @@ from runner.config import from_mapping
 from runner.config.job import Job
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
-from runner.errors import ConfigError, CutOff, Diverged, EnvironmentNotUsable, RecordingError, RunnerError
+from runner.errors import (
+    CannotRedo,
+    ConfigError,
+    CutOff,
+    Diverged,
+    EnvironmentNotUsable,
+    RecordingError,
+    RunnerError,
+)
 from runner.execution.initial_tables import recorded_tables
 from runner.execution.redo import rerun_loop
 from runner.execution.session import Report, Session, recorder_for
@@ -40,6 +48,7 @@ from runner.recording.integrity import check_integrity, refuse_foreign, survey
 from runner.recording.reader import Recording, open_recording
 from runner.recording.records import Report as BytesReport
 from runner.recording.reference import Reference
+from runner.replay.trust import require_may_train
 from runner.runs.listing import run_at
 from runner.runs.provenance import Differences, differing_provenance
 
@@ -62,13 +71,13 @@ def verify(
         sample: how many episodes of a loop to rerun, at even distances; None for all that happened.
         tolerance: absolute and relative, for a loop's floating-point observations and rewards; 0 compares
             bytes.
-        trust: whether what the recording of a loop names may be imported.
+        trust: whether an environment may be made that `runner.replay.trust` refuses.
         report: called with the progress of a job's training a few times a second.
 
     Raises:
         RecordingError: there is no such file, or it is not a dualtaxi recording.
     """
-    found = check(path, damage_of(path), bool(rerun), report)
+    found = check(path, damage_of(path), bool(rerun), report, trust)
     return found if rerun is False else rerun_loop(found, sample, tolerance, trust)
 
 
@@ -91,6 +100,7 @@ def check(
     damage: RecordingError | None,
     installed: bool = False,
     report: Report = lambda _: None,
+    trust: bool = False,
 ) -> Verification:
     """Check a recording's file; retrain its job, but do not rerun the environment of a loop.
 
@@ -99,11 +109,12 @@ def check(
         damage: the result of `damage_of`.
         installed: retrain with the installed environment instead of the recorded one.
         report: called with the progress a few times a second.
+        trust: whether an installed environment may be made that `runner.replay.trust` refuses.
     """
     is_cut = isinstance(damage, CutOff) and not _states_its_end(path)
     try:
         with open_recording(path) as recording:
-            found = _check_content(recording, installed, report)
+            found = _check_content(recording, installed, report, trust)
             unreadable = "" if damage is None or is_cut else _first_unreadable(recording)
     except (RecordingError, ConfigError) as error:
         if is_cut and not survey(path).chunks:
@@ -142,7 +153,7 @@ def _first_unreadable(recording: Recording) -> str:
     return ""
 
 
-def _check_content(recording: Recording, installed: bool, report: Report) -> Verification:
+def _check_content(recording: Recording, installed: bool, report: Report, trust: bool) -> Verification:
     verification = Verification(recording.path)
     if recording.lost:
         holes = "; ".join(
@@ -157,10 +168,10 @@ def _check_content(recording: Recording, installed: bool, report: Report) -> Ver
     job = Job(from_mapping(recording.config), recording.seed or 0)
     if recording.job != job.identity:
         return with_difference(verification, Diverged("metadata run", "job", recording.job, job.identity))
-    return _retrain(recording, job, installed, report)
+    return _retrain(recording, job, installed, report, trust)
 
 
-def _retrain(recording: Recording, job: Job, installed: bool, report: Report) -> Verification:
+def _retrain(recording: Recording, job: Job, installed: bool, report: Report, trust: bool) -> Verification:
     env, complete = job.config.env, recording.status == "finished"
     verification = Verification(
         recording.path,
@@ -169,8 +180,10 @@ def _retrain(recording: Recording, job: Job, installed: bool, report: Report) ->
         environment="installed" if installed else "recorded",
     )
     try:
+        if installed:
+            require_may_train(recording.path, recording.config, trust)
         mdp = load_mdp(env.id, env.kwargs, job.config.rewards) if installed else recording.mdp
-    except EnvironmentNotUsable as error:
+    except (CannotRedo, EnvironmentNotUsable) as error:
         verdict: Verdict = "consistent" if complete else "interrupted"
         return Verification(recording.path, verdict, reason=str(error))
     learner = Learner(job.config, mdp, job.seed, recorded_tables(recording))

@@ -18,6 +18,7 @@ from runner.export.contents import Ranges, whole_ranges
 from runner.export.minari_episodes import Episode, episodes_in
 from runner.recording.gym_spaces import restore_space
 from runner.recording.reader import Recording
+from runner.replay.trust import require_may_train
 from runner.util.arrays import Array
 from runner.util.extras import require
 
@@ -181,6 +182,8 @@ def _environment_spec(
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            made = {"id": env_id, "kwargs": kwargs, "rewards": recording.config.get("rewards")}
+            require_may_train(recording.path, {"env": made, "rewards": made["rewards"]})
             env = gymnasium.make(env_id, **kwargs)
             env.close()
     except Exception as error:  # an environment may raise anything

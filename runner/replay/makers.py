@@ -28,10 +28,10 @@ from runner.replay.specifications import (
     vector_wrappers,
 )
 from runner.replay.trust import (
-    PACKAGES,
-    TRUST,
+    advice,
     is_left_out,
     name_of,
+    packages,
     require_listed_game,
     require_listed_wrapper,
     require_registered_arguments,
@@ -61,7 +61,7 @@ def why_not_made(maker: EnvironmentMaker | None, trust: bool) -> str:
     if maker.make and trust:
         return why_not_imported(maker.make, trust)
     if maker.make and (maker.reason or not maker.spec):
-        return f"The environment is made by {maker.make}. {TRUST}"
+        return f"The environment is made by {maker.make}. {advice()}"
     if maker.reason or not maker.spec:
         return maker.reason or "The recording does not state how its environment was made."
     try:
@@ -205,15 +205,15 @@ def _registered(maker: EnvironmentMaker, trust: bool) -> tuple[EnvironmentSpec, 
     import gymnasium
 
     spec = parse_spec(maker.spec)
-    if not trust and maker.registered_by not in ("", *PACKAGES):
-        raise CannotRedo(f"{spec.id} is registered by {maker.registered_by}. {TRUST}")
+    if not trust and maker.registered_by not in ("", *packages()):
+        raise CannotRedo(f"{spec.id} is registered by {maker.registered_by}. {advice()}")
     if maker.registered_by:
         importlib.import_module(maker.registered_by)
     registered = gymnasium.registry.get(spec.id)
     if registered is None and trust and spec.entry_point:
         registered = gymnasium.envs.registration.EnvSpec(spec.id, entry_point=_creator(spec.entry_point))
     if registered is None and spec.id == spec.entry_point.partition(":")[2]:
-        raise CannotRedo(f"The environment is made by {spec.entry_point}. {TRUST}")
+        raise CannotRedo(f"The environment is made by {spec.entry_point}. {advice()}")
     if registered is None:
         raise CannotRedo(
             f"{spec.id} is not registered with Gymnasium {gymnasium.__version__} here, by "
@@ -237,7 +237,7 @@ def _made_game(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
     module, function, kwargs, wrappers = parse_game(maker.spec)
     if not trust:
         if wrappers:
-            raise CannotRedo(f"The environment is wrapped by {wrappers[0][1]}. {TRUST}")
+            raise CannotRedo(f"The environment is wrapped by {wrappers[0][1]}. {advice()}")
         require_listed_game(f"{module}:{function}", kwargs)
     make = _attribute(f"{module}:{function}")
     kwargs = {key: value for key, value in kwargs.items() if key != "render_mode"}

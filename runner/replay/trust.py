@@ -3,7 +3,7 @@
 A recording is hostile input. One that this user recorded is known by its mark (`runner.runs.marks`); all that
 it names may be imported, as with `--trust`. Of any other one, an environment is made only if its id is
 registered here by one of `PACKAGES`, with the recorded entry point, numbers and listed words as arguments,
-and wrappers of `WRAPPERS`. A process in which `OWN_ONLY` is set makes nothing of others at all.
+and wrappers of `WRAPPERS`. A server (`OWN_ONLY`) makes no environment of a loop that its user did not record.
 """
 
 from __future__ import annotations
@@ -131,11 +131,24 @@ _GAMES: Final = re.compile(
 )
 """What makes PettingZoo's games: by its convention, a function of one of two names in the game's module."""
 _MAX_ITEMS: Final = 10_000
-TRUST: Final = "You did not record this run on this machine, so that is made only with --trust."
+MORE_PACKAGES: Final = "DUALTAXI_PACKAGES"
+"""The variable with further packages of environments that the user lists, separated by commas."""
 SERVED: Final = (
     "The run was not recorded by the user who runs this server, so its environment is not made here. "
     "Pictures that are recorded with a run are always shown: runner.record(env, frames_every=1)."
 )
+
+
+def packages() -> tuple[str, ...]:
+    """Return the packages whose environments are made without trust."""
+    return *PACKAGES, *filter(None, os.environ.get(MORE_PACKAGES, "").split(","))
+
+
+def advice() -> str:
+    """Return what the user can do where something is not made."""
+    if os.environ.get(OWN_ONLY):
+        return f"A server makes nothing else for its clients; its owner can list packages in {MORE_PACKAGES}."
+    return "You did not record this run on this machine, so that is made only with --trust."
 
 
 @contextlib.contextmanager
@@ -155,7 +168,7 @@ def trusting(
         CannotRedo: this process makes nothing but what its user recorded.
     """
     mark = None if environment is None else own_mark(recording, environment)
-    if mark is None and not trust and os.environ.get(OWN_ONLY):
+    if isinstance(environment, EnvironmentMaker) and not (mark or trust) and os.environ.get(OWN_ONLY):
         raise CannotRedo(SERVED)
     folders = [*(mark.folders if mark else ()), *([str(Path.cwd())] if trust else [])]
     script = (mark.script, mark.script_digest) if mark else ("", "")
@@ -185,9 +198,9 @@ def require_listed(env_id: str, kwargs: Mapping[str, object]) -> None:
     import gymnasium
 
     module, _, name = env_id.rpartition(":")
-    if module and module not in PACKAGES:
+    if module and module not in packages():
         raise CannotRedo(
-            f"The environment {env_id} needs {module}, which is not a known package of environments. {TRUST}"
+            f"The environment {env_id} is of {module}, no known package of environments. {advice()}"
         )
     if module:
         with contextlib.suppress(ImportError):  # the environment's own error says more
@@ -206,9 +219,9 @@ def require_registered_arguments(
     """
     entry_point = name_of(registered.vector_entry_point if vector else registered.entry_point)
     package = _top(entry_point)
-    if package not in PACKAGES:
+    if package not in packages():
         raise CannotRedo(
-            f"The environment {name} is {entry_point}, of no known package of environments. {TRUST}"
+            f"The environment {name} is {entry_point}, of no known package of environments. {advice()}"
         )
     require_plain(f"keyword argument of {name}", kwargs, registered.kwargs, package)
 
@@ -230,7 +243,7 @@ def require_plain(
             value = list(value.values())  # noqa: PLW2901 - their names are checked there
         if not (is_registered or is_word or _is_map(package, key, value) or _is_plain(value)):
             raise CannotRedo(
-                f"Found the {what} {key}={str(value)[:200]!r}, expected numbers or a known word. {TRUST}"
+                f"Found the {what} {key}={str(value)[:200]!r}, expected numbers or a known word. {advice()}"
             )
 
 
@@ -263,7 +276,7 @@ def require_listed_game(entry_point: str, kwargs: Mapping[str, object]) -> None:
         CannotRedo: it is another one, or its arguments are not plain.
     """
     if not _GAMES.fullmatch(entry_point):
-        raise CannotRedo(f"The environment is made by {entry_point}, which is not a known game. {TRUST}")
+        raise CannotRedo(f"The environment is made by {entry_point}, which is not a known game. {advice()}")
     require_plain("keyword argument", kwargs, {}, _top(entry_point))
 
 
@@ -280,7 +293,7 @@ def require_listed_wrapper(entry_point: str, kwargs: Mapping[str, object]) -> No
         if getattr(importlib.import_module(module), name, None) is listed:
             require_plain(f"argument of the wrapper {name}", kwargs, {})
             return
-    raise CannotRedo(f"The environment needs the wrapper {entry_point}, which is not a known one. {TRUST}")
+    raise CannotRedo(f"The environment needs the wrapper {entry_point}, which is not a known one. {advice()}")
 
 
 def is_left_out(entry_point: str) -> bool:
@@ -294,8 +307,8 @@ def why_not_imported(module: str, trust: bool) -> str:
     path, root = module.partition(":")[0], _top(module)
     if root == MAIN:
         return why_not_defined()
-    if not trust and root not in PACKAGES and path not in WRAPPERS:
-        return f"The environment needs {module}, which is not a known package of environments. {TRUST}"
+    if not trust and root not in packages() and path not in WRAPPERS:
+        return f"The environment needs {module}, which is not a known package of environments. {advice()}"
     try:
         exists = root in sys.modules or importlib.util.find_spec(root) is not None
     except (ImportError, ValueError):

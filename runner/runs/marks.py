@@ -14,7 +14,6 @@ import hashlib
 import hmac
 import json
 import os
-import re
 import secrets
 import sys
 import sysconfig
@@ -25,7 +24,7 @@ from pathlib import Path
 from typing import Final
 
 from runner.recording.maker import EnvironmentMaker
-from runner.util.files import open_regular, read_object, write_object
+from runner.util.files import open_regular, read_object
 from runner.util.values import JsonView
 
 MARK_FILE: Final = "trust.json"
@@ -34,8 +33,6 @@ _KEY_BYTES: Final = 32
 _MAX_BYTES: Final = 1 << 20
 _NOT_COVERED: Final = ("packages", "platform", "machine", "action_names", "agent_action_names")
 """Fields of a maker that do not say how the environment is made."""
-_MODULE: Final = re.compile(r"([^\W\d]\w*)(?:\.\w+)*:[^\W\d]")
-"""The top package in `package.module:name`, anywhere in JSON."""
 _marks_nothing = False
 
 
@@ -57,7 +54,12 @@ def environment_of_job(config: JsonView) -> JsonView:
     """Return what makes the environment of a job with this configuration."""
     env = config.get("env")
     env = env if isinstance(env, Mapping) else {}
-    return {"id": env.get("id"), "kwargs": env.get("kwargs"), "rewards": config.get("rewards")}
+    kwargs = env.get("kwargs")
+    return {
+        "id": env.get("id"),
+        "kwargs": kwargs if isinstance(kwargs, Mapping) else {},
+        "rewards": config.get("rewards"),
+    }
 
 
 def mark(folder: Path, environment: EnvironmentMaker | JsonView | None) -> None:
@@ -136,8 +138,9 @@ def marking_nothing(is_strange: bool = True) -> Iterator[None]:
 
 def _canonical(environment: EnvironmentMaker | JsonView) -> str:
     """Return JSON of what makes an environment; empty values are left out, as earlier versions had fewer."""
-    values = environment if isinstance(environment, Mapping) else asdict(environment)
-    covered = {name: value for name, value in values.items() if value and name not in _NOT_COVERED}
+    if isinstance(environment, EnvironmentMaker):
+        environment = vars(environment) | {"vector": environment.vector and vars(environment.vector)}
+    covered = {name: value for name, value in environment.items() if value and name not in _NOT_COVERED}
     return json.dumps(covered, sort_keys=True)
 
 
@@ -145,12 +148,14 @@ def _own_places(text: str) -> tuple[list[str], str]:
     """Return the user's folders in `sys.path` if the environment needs a module there, and its script."""
     main = sys.modules.get("__main__")
     script = getattr(main, "__file__", None)
-    modules = {top: sys.modules.get(top) for top in set(_MODULE.findall(text))}
+    named = {part.partition(":")[0].partition(".")[0] for part in text.split('"') if ":" in part}
+    modules = {top: sys.modules.get(top) for top in named}  # of texts such as `package.module:name`
     if script and Path(script).stem in modules:  # `make="train:make_env"` names the script by its module
         modules[Path(script).stem] = main
     if not any(_is_users(place) for module in modules.values() for place in _places(module)):
         return [], ""
-    folders = [os.path.abspath(path) for path in sys.path if _is_users(path or str(Path.cwd()))]  # noqa: PTH100
+    paths = (os.path.abspath(path) for path in sys.path)  # noqa: PTH100 - links stay what they are
+    folders = [path for path in paths if _is_users(path) and Path(path).is_dir()]
     return folders, os.path.abspath(script) if script and "__main__" in modules else ""  # noqa: PTH100
 
 
@@ -187,7 +192,8 @@ def _seal(values: Mapping[str, object], key: bytes) -> str:
 def _write(folder: Path, marked: Mark, key: bytes) -> None:
     values = asdict(marked) | {"environments": list(marked.environments), "folders": list(marked.folders)}
     with contextlib.suppress(OSError, ValueError):  # a path may be no text
-        write_object(folder / MARK_FILE, values | {"seal": _seal(values, key)}, 0o600)
+        text = json.dumps(values | {"seal": _seal(values, key)})
+        (folder / MARK_FILE).write_text(text, encoding="utf-8")
 
 
 def _key(is_needed: bool) -> bytes | None:

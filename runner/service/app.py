@@ -35,6 +35,7 @@ from runner.service.tokens import Sessions, Tokens
 from runner.service.uploads import Upload, Uploads
 from runner.sweep import sweeps_in
 from runner.util import __version__
+from runner.util.processes import OWN_ONLY
 
 API: Final = "/api/v1"
 THREADS: Final = 8
@@ -123,6 +124,8 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         LOG.info("upload", extra=fields | {"bytes": upload.size, "problem": upload.problem})
 
     with contextlib.ExitStack() as stack:
+        os.environ[OWN_ONLY] = "1"  # before any child process
+        stack.callback(os.environ.pop, OWN_ONLY, None)
         stack.callback(app.state.catalogue.close)
         app.state.catalogue.prepare()
         app.state.jobs = stack.enter_context(

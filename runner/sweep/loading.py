@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -18,7 +18,7 @@ from runner.config.model import SECTION_OF
 from runner.config.problems import found, problems_in, refuse
 from runner.config.schema import Schema, without_references
 from runner.config.shipped import config_path
-from runner.errors import EnvironmentNotUsable
+from runner.errors import CannotRedo, EnvironmentNotUsable
 from runner.sweep.model import Range, Sweep, SweepFile
 
 MAX_NAME: Final = 50
@@ -26,6 +26,7 @@ MAX_NAME: Final = 50
 _LEARNERS: Final = {"mode", "tables", "rewards"}
 _MAX_COMBINATIONS: Final = 64
 """Maximum number of combinations tried to find values that are valid together."""
+Require = Callable[[str, Mapping[str, object]], None]
 
 
 def load_sweep(path: str | os.PathLike[str], name: str | None = None) -> Sweep:
@@ -39,13 +40,14 @@ def load_sweep(path: str | os.PathLike[str], name: str | None = None) -> Sweep:
     return _with_checked_parameters(_sweep(document, name, file.stem, file.parent), document)
 
 
-def from_text(text: str, source: str) -> Sweep:
+def from_text(text: str, source: str, require: Require = lambda *_: None) -> Sweep:
     """Return the sweep that the text of a file describes, which cannot name another file as its base.
 
     `source` is the file's name, for messages and as the default name of the sweep; errors as of `load_sweep`.
+    `require` is called with the id and the arguments of each environment, before it is made; it may refuse.
     """
     document = read_yaml(text, source)
-    return _with_checked_parameters(_sweep(document, None, Path(source).stem, None), document)
+    return _with_checked_parameters(_sweep(document, None, Path(source).stem, None), document, require)
 
 
 def from_values(values: Mapping[str, object]) -> Sweep:
@@ -157,7 +159,7 @@ def _part(document: Document, key: str) -> Document:
     return Document(document.value.get(key), places)
 
 
-def _with_checked_parameters(sweep: Sweep, document: Document) -> Sweep:
+def _with_checked_parameters(sweep: Sweep, document: Document, require: Require = lambda *_: None) -> Sweep:
     """Return the sweep; try every bound and choice of each parameter, with values of the others that fit."""
     errors = []
     for path, parameter in sweep.file.parameters.items():
@@ -165,7 +167,7 @@ def _with_checked_parameters(sweep: Sweep, document: Document) -> Sweep:
             try:
                 experiment = _valid_experiment(sweep, path, sample, document)
                 if number == 0 or path.startswith("env."):
-                    _check_environment(experiment, path, document)
+                    _check_environment(experiment, path, document, require)
             except ConfigError as error:
                 errors.append(error)
     if errors:
@@ -209,10 +211,11 @@ def _experiment(sweep: Sweep, values: Mapping[str, object], document: Document) 
     return experiment_in(within, (), sweep.name, named_by=repr(sweep.name))
 
 
-def _check_environment(experiment: ExperimentConfig, path: str, document: Document) -> None:
+def _check_environment(experiment: ExperimentConfig, path: str, document: Document, require: Require) -> None:
     from runner.environments.loading import load_mdp
 
     try:
+        require(experiment.env.id, experiment.env.kwargs)
         load_mdp(experiment.env.id, experiment.env.kwargs, experiment.rewards)
-    except EnvironmentNotUsable as error:
+    except (CannotRedo, EnvironmentNotUsable) as error:
         raise refuse([Problem(("parameters", path), str(error))], document) from None

@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli.command import Command, argument, option
-from runner.cli.options import json_option, markdown_option, ray_option, recordings_option, workers_option
+from runner.cli.options import (
+    json_option,
+    markdown_option,
+    ray_option,
+    recordings_option,
+    trust_option,
+    workers_option,
+)
 from runner.cli.output import draw, facts, print_json, print_sections, require_one_form, say
 from runner.cli.parameter_types import COUNT
 from runner.cli.progress import total_line
@@ -57,6 +64,7 @@ def explain_command(
     dry_run: bool = option(
         "--dry-run", is_flag=True, help="Show what would be trained and how long it takes, and stop."
     ),
+    trust: bool = trust_option,
     as_markdown: bool = markdown_option,
     as_json: bool = json_option,
     recordings: Path | None = recordings_option,
@@ -102,6 +110,7 @@ def explain_command(
                 recordings=recordings,
                 report=report,
                 planned=planned,
+                trust=trust,
             )
     except _Planned as stopped:
         plan = stopped.plan

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 def resume_command(
     run_name: str = run_argument,
     accept_changes: bool = accept_changes_option,
+    trust: bool = trust_option,
     recordings: Path | None = recordings_option,
     as_json: bool = json_option,
 ) -> None:
@@ -62,7 +63,7 @@ def resume_command(
     run = find(run_name, recordings)
     was_finished = is_finished(run)
     with job_progress("", run.episodes_to_do or 0) as (report, interrupt):
-        run = resume(run, accept_changes, report, interrupt)
+        run = resume(run, accept_changes, report, interrupt, trust)
     if as_json:
         print_json(run_as_json(run))
     elif not was_finished:
@@ -104,7 +105,7 @@ def rerecord_command(
             run = rerecord(run, trust=trust, count=count)
     else:
         with job_progress("", run.episodes_to_do or 0) as (report, interrupt):
-            run = rerecord(run, report, interrupt)
+            run = rerecord(run, report, interrupt, trust=trust)
     if as_json:
         print_json(run_as_json(run))
     elif not had_steps:
@@ -192,9 +193,8 @@ def evaluate_command(
     to_play = None if start == "each" else trials or TRIALS
     start_state: Start = int(start) if start.isdecimal() else "random"
     with job_progress("", 0) as (report, interrupt):
-        run = evaluate(
-            source, recordings_folder(recordings), step, to_play, start_state, seed, report, interrupt
-        )
+        folder = recordings_folder(recordings)
+        run = evaluate(source, folder, step, to_play, start_state, seed, report, interrupt, trust)
     origin = run.file.config["initial_q"]
     if as_json:
         print_json(run_as_json(run) | {"origin": origin})

@@ -54,8 +54,8 @@ def verify_command(
     describes its environment: scene and names.
 
     A loop's environment is rerun, in a process with limits: it takes the recorded resets and actions, and
-    every observation, reward and end is compared. Only installed packages of environments are imported;
-    --trust allows all that the recording names. --no-rerun checks the file only.
+    every observation, reward and end is compared. Of a run that you did not record, only listed environments
+    are made, unless you say --trust. --no-rerun checks the file only.
 
     The verdict is "reproduced" if everything compared is equal, and states what was retrained or rerun;
     "consistent" if only the file was checked, with the reason why its environment cannot be rerun;
@@ -88,7 +88,7 @@ def verify_command(
         with bytes_line("reading") as reading:
             damage = damage_of(path, reading)
         with job_progress("verifying", episodes) as (report, _):
-            found = check(path, damage, bool(rerun), report)
+            found = check(path, damage, bool(rerun), report, trust)
     if rerun is not False:
         with count_line("steps rerun", 0 if sample else found.train_steps + found.eval_steps) as count:
             found = rerun_loop(found, sample, tolerance, trust, count)

@@ -24,6 +24,7 @@ from runner.execution.branching import branch_job, branch_name
 from runner.execution.estimate import estimate, step_limit
 from runner.execution.initial_tables import resolve_initial_q
 from runner.recording.reader import open_recording
+from runner.replay.trust import require_listed
 from runner.runs.run import Run
 from runner.service.errors import Busy
 from runner.service.jobs.store import Kind
@@ -84,6 +85,7 @@ def _check_config(text: str, source: str, document: Document, recordings: Path) 
     config = from_text(text, source)
     _refuse_paths({("initial_q",): document.value.get("initial_q")}, document)
     with _problems_at(("env",), document):
+        require_listed(config.env.id, config.env.kwargs)
         load_mdp(config.env.id, config.env.kwargs, config.rewards)
     with _problems_at(("initial_q",), document):
         config = resolve_initial_q(config, recordings)
@@ -103,7 +105,7 @@ def _problems_at(key: tuple[str, ...], document: Document) -> Iterator[None]:
 
 def _check_sweep(text: str, source: str, document: Document, recordings: Path) -> CheckedJob:
     require_optuna()
-    sweep = sweep_from_text(text, source)
+    sweep = sweep_from_text(text, source, require_listed)
     base, parameters = document.value["base"], document.value["parameters"]
     starts: dict[tuple[str | int, ...], object] = {("base", "initial_q"): base.get("initial_q")}
     for path, choices in parameters.items():
