@@ -1,4 +1,4 @@
-"""A run's evaluations, reports, episodes and steps as pandas frames, and as arrays by column.
+"""A run's evaluations, reports, episodes, steps and logged values as pandas frames, and as arrays by column.
 
     import runner
 
@@ -29,6 +29,7 @@ from runner.errors import RecordingError
 from runner.recording.extras import filled
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
+from runner.recording.schema import SCALAR_TOPIC
 from runner.replay.steps import steps_of
 from runner.runs.run import Run
 from runner.util.arrays import Array
@@ -112,6 +113,22 @@ def steps(
         return _frame({name: list(each) if each.ndim > 1 else each for name, each in columns.items()})
 
 
+def logged(run: Source) -> pd.DataFrame:
+    """Return a row for each number that a loop logged, in the order logged.
+
+        runner.frames.logged(run).pivot_table(index="step", columns="name", values="value")
+
+    Columns: phase, step (steps of the phase before it; without an environment the script's own step),
+    episode, name, value.
+
+    Raises:
+        MissingExtra: pandas is not installed.
+        RecordingError: the recording cannot be read.
+    """
+    with _opened(run) as recording:
+        return _frame(logged_columns(recording))
+
+
 def transition_table(
     env_id: str = "dualtaxi:DualTaxi-v1", kwargs: Mapping[str, object] | None = None, rewards: str = "team"
 ) -> pd.DataFrame:
@@ -157,6 +174,16 @@ def episode_columns(
     columns |= _plain_columns(records, ("terminated", "truncated", "last_step"))
     columns |= _by_name(records["returns"], [f"return.{agent}" for agent in recording.agents])
     return columns | _by_name(records["events"], recording.event_names)
+
+
+def logged_columns(recording: Recording) -> dict[str, Sequence[object]]:
+    """Return the columns of `logged`, a list each."""
+    names = ("phase", "step", "episode", "name", "value")
+    columns: dict[str, list[object]] = {name: [] for name in names}
+    for scalar in () if recording.has_reports else recording.decoded(SCALAR_TOPIC):
+        for name in names:
+            columns[name].append(scalar[name])
+    return dict(columns)
 
 
 def step_columns(

@@ -187,6 +187,15 @@ def is_usable(values: NDArray[np.float64]) -> NDArray[np.bool_]:
     return abs(values) <= LARGEST  # false for NaN
 
 
+def spread_of(values: NDArray[np.float64]) -> dict[str, float]:
+    """Return the sample's standard deviation, lowest and highest value; nothing for fewer than two values."""
+    usable = values[is_usable(values)]
+    if len(usable) < 2:
+        return {}
+    lowest, highest = float(usable.min()), float(usable.max())
+    return {"standard_deviation": float(usable.std(ddof=1)), "lowest": lowest, "highest": highest}
+
+
 def finite_mean(values: NDArray[np.float64]) -> float | None:
     """Return the mean of the values that are finite and no larger than `LARGEST`; None without any."""
     if not values.size:

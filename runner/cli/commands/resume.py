@@ -222,6 +222,8 @@ def _evaluate_checkpoint(
 ) -> None:
     """Play a checkpoint of a loop, and print the run that it was recorded in."""
     from runner.loops.policies import play_checkpoint
+    from runner.recording.metrics import spread_of
+    from runner.recording.reader import open_recording
     from runner.runs.checkpoints import find_checkpoint
 
     checkpoint = find_checkpoint(source.checkpoints(), reference, f"run {source.run_id}")
@@ -229,15 +231,24 @@ def _evaluate_checkpoint(
     with count_line("episodes", trials) as report:
         run = play_checkpoint(source, checkpoint, policy, folder, trials, seed, trust, report)
     origin = run.file.config["config"]["origin"]
+    with open_recording(run.recording) as recording:
+        played = recording.episodes("eval")
+    spreads = {"return": spread_of(played["returns"].sum(axis=1)), "length": spread_of(played["length"])}
     if as_json:
-        print_json(run_as_json(run) | {"origin": origin})
+        print_json(run_as_json(run) | {"origin": origin, "spread": spreads})
         return
+    spread = {
+        name: f", standard deviation {number(own['standard_deviation'])}, "
+        f"{number(own['lowest'])} to {number(own['highest'])}"
+        for name, own in spreads.items()
+        if own
+    }
     evaluation = run.summary.last_evaluation
     means = {} if evaluation is None else evaluation.values
     results = {
         "played": f"{checkpoint.reference} of run {source.run_id}, {checkpoint.digest[:16]}, by {policy}",
-        "mean return": number(means.get("mean_return")),
-        "mean length": number(means.get("mean_length")),
+        "mean return": number(means.get("mean_return")) + spread.get("return", ""),
+        "mean length": number(means.get("mean_length")) + spread.get("length", ""),
         "next": command_for(run, "show"),
     }
     draw(facts(run_facts(run) | results))

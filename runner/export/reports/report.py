@@ -32,6 +32,7 @@ from runner.export.reports.rendering import LegendEntry, View, embedded, render,
 from runner.recording import schema
 from runner.recording.metrics import METRICS, Metric
 from runner.recording.reader import Recording, open_recording
+from runner.recording.run_file import RecentTraining
 
 Choice = tuple[str, int, int]
 """An episode to show: ("train", number, 0), or ("eval", training episodes before it, trial)."""
@@ -68,6 +69,8 @@ class ReportedRun:
     """The program that recorded a loop; empty for a job."""
     last: EvaluationRecord | None
     """The last evaluation."""
+    recent: RecentTraining
+    """The last training episodes."""
     random_policy: str
     """A sentence on what a random policy achieves; empty if unknown."""
     has_steps: bool
@@ -162,11 +165,12 @@ def _run(
         seed=recording.seed,
         title=recording.title,
         status=recording.status,
-        environment=environment["env_id"].rpartition(":")[2],
+        environment=environment["env_id"].rpartition(":")[2] if recording.has_environment else "",
         agents=[spoken(agent) for agent in environment["agents"]],
         is_random=recording.has_tables and recording.config["algorithm"] == "random",
         made_by="" if recording.can_train_again else recording.config["made_by"],
         last=evaluations[-1] if evaluations else None,
+        recent=recording.recent_training(),
         random_policy=random_policy_sentence(recording),
         has_steps=recording.has_steps,
         evaluations=evaluations_section(recording, evaluations) if evaluations else None,
@@ -206,6 +210,8 @@ def _facts(recording: Recording) -> dict[str, str]:
             "Evaluation": f"{trial_steps:,} steps recorded",
             "Job": recording.job,
         }
+    elif not recording.has_environment:
+        facts = {"Recorded": f"logged values, by {config['made_by']}"}
     else:
         spaces = {name: space["type"] for name, space in recording.spaces.items()}
         parallel = f", {recording.environments} in parallel" if recording.environments > 1 else ""

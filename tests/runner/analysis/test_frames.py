@@ -3,6 +3,7 @@
 import math
 import sys
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -134,3 +135,19 @@ def test_without_pandas_the_error_names_the_extra(run, monkeypatch):
             make(run)
     with runner.open_recording(run.recording) as recording:
         assert len(evaluation_records(recording)) == 4
+
+
+def test_logged_values_are_rows_in_their_order(tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path, seed=1) as env:
+        env.reset(seed=1)
+        for number in range(3):
+            env.step(0)
+            env.log({"loss": 1 / (number + 1), "updates": number})
+    frame = frames.logged(env.run)
+    assert list(frame) == ["phase", "step", "episode", "name", "value"]
+    wide = frame.pivot_table(index="step", columns="name", values="value")
+    assert wide["loss"].to_dict() == {1: 1.0, 2: 1 / 2, 3: 1 / 3}
+
+
+def test_a_job_logs_nothing(run):
+    assert frames.logged(run).empty

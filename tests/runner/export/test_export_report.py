@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -13,11 +14,13 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
 
+import runner
 from runner.cli import cli
 from runner.drawing.svg import Drawing, trail_points, transform
 from runner.environments.naming import agent_actions_in_words, states_in_words
 from runner.export.episodes import ranked_trials
 from runner.export.reports.report import render_report
+from runner.integrations.tensorboard import SummaryWriter
 from runner.recording.reader import open_recording
 from tests.runner.export.outline import Outline, check_page
 
@@ -252,3 +255,26 @@ def test_controls_and_pictures_have_names_for_screen_readers(opened):
         nodes = [node for node in shown if node["role"]["value"] == role]
         assert nodes, role
         assert all(node["name"]["value"] for node in nodes), role
+
+
+def test_a_loop_without_evaluations_is_introduced_by_its_last_episodes(tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path, seed=1) as env:
+        env.action_space.seed(1)
+        env.reset(seed=1)
+        for _ in range(100):
+            if any(env.step(env.action_space.sample())[2:4]):
+                env.reset()
+    page, _ = render_report([env.run.recording])
+    recent = env.run.summary.recent_training
+    expected = f"The last {recent.episodes} training episodes returned {recent.mean_return:.1f} on average"
+    assert expected in " ".join(page.split())
+
+
+def test_a_run_of_values_alone_is_introduced_as_such(tmp_path):
+    with SummaryWriter(
+        str(tmp_path / "runs" / "values"), recordings=tmp_path / "made", monitor_gym=False
+    ) as writer:
+        writer.add_scalar("loss", 0.5, 1)
+    page, _ = render_report([writer.run.recording])
+    assert "Logged values, recorded by" in page
+    assert "over <b>none" not in page

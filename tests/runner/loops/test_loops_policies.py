@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import gymnasium
@@ -87,6 +88,9 @@ def test_a_checkpoint_is_played_in_the_recorded_environment(folder):
     found = json.loads(done.stdout)
     assert found["last_evaluation"]["mean_return"] == 500
     assert found["last_evaluation"]["trials"] == 3
+    assert found["spread"]["return"] == {"standard_deviation": 0.0, "lowest": 500.0, "highest": 500.0}
+    shown = dualtaxi(folder, "evaluate", origin.run_id, *words)
+    assert re.search(r"mean return +500\.0, standard deviation 0\.0, 500\.0 to 500\.0", shown.output)
     checkpoint = origin.checkpoints()[-1]
     expected = {"run": origin.run_id, "checkpoint": "policy", "step": max(steps), "digest": checkpoint.digest}
     assert found["origin"] == expected
