@@ -65,6 +65,8 @@ def folded(run: Run) -> Run:
         say(f"Run {run.run_id} is shown without {what}: {error}")
         return run
     say(f"Added {what} to run {run.run_id}, whose processes had been killed.")
+    if run.summary.unfolded:
+        say(f"Not all of it is in the run: {run.summary.error}")
     return run
 
 

@@ -163,6 +163,10 @@ def _check_content(recording: Recording, installed: bool, report: Report, trust:
         )
         finding = f"{recording.path}: {holes}: lost in a repair. `dualtaxi resume` retrains the job."
         return replace(verification, verdict="damaged", finding=finding)
+    if unfolded := recording.result.unfolded:
+        processes = [f"{name or 'the process that began it'}: {what}" for name, what in unfolded.items()]
+        finding = f"{recording.path}: lacks what processes recorded: {' '.join(processes)}"
+        return replace(verification, verdict="damaged", finding=finding)
     if not recording.can_train_again:
         return verify_loop(recording)
     job = Job(from_mapping(recording.config), recording.seed or 0)

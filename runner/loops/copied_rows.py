@@ -149,8 +149,8 @@ class CopiedExtras:
 
     def copy(
         self, source: Source, phase: str, numbers: NDArray[np.int64], new_step: int, new_position: int
-    ) -> None:
-        """Copy the extras of some steps, which follow each other in the run.
+    ) -> int:
+        """Copy the extras of some steps, which follow each other in the run; return how many had some.
 
         Args:
             numbers: of the steps, as their process counted them.
@@ -159,14 +159,14 @@ class CopiedExtras:
         """
         own = self._own[source.number, phase]
         if not own:
-            return
+            return 0
         values = {self._names[source.number, name]: each for name, each in own.at(numbers).items()}
         given = {
             name: ~np.ma.getmaskarray(each).reshape(len(numbers), -1)[:, 0] for name, each in values.items()
         }
         rows = np.flatnonzero(np.logical_or.reduce(list(given.values())))
         if not len(rows):
-            return
+            return 0
         if not self._is_described:
             begin_layout(self._recorder, self._layout, new_position + int(rows[0]) + 1)
             self._is_described = True
@@ -176,3 +176,4 @@ class CopiedExtras:
             for name in self._layout.names:
                 block["given"][name] = given[name][rows[part]] if name in given else False
                 block["values"][name] = values[name].data[rows[part]] if name in given else 0
+        return len(rows)

@@ -7,11 +7,13 @@ as if one loop had done all of it, and does not depend on which process was fast
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, BinaryIO, Final
@@ -21,8 +23,9 @@ from numpy.typing import NDArray
 
 from runner.client.outbox import forget_upload
 from runner.config.loading import recorded_packing
-from runner.errors import truncated_message
+from runner.errors import RecordingError, RunnerError, StorageError, truncated_message
 from runner.loops.copied_rows import Copied, CopiedExtras, CopiedMessages, CopiedRows
+from runner.loops.fold_check import Content, left_out
 from runner.loops.outcomes import Outcomes
 from runner.loops.shard_sources import PHASES, Source, open_sources
 from runner.recording import schema
@@ -39,12 +42,13 @@ from runner.recording.messages import (
 )
 from runner.recording.metadata import dtypes_of, json_object, write_result
 from runner.recording.recorder import Recorder
+from runner.recording.run_file import parse_result
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import create_recording
 from runner.runs.listing import run_at
 from runner.runs.marks import merge_marks
-from runner.runs.run import RECORDING_FILE, SHARDS_FOLDER, Run
-from runner.runs.shards import ENDS_AS, are_over, handed_over, shards_locked, shards_of
+from runner.runs.run import RECORDING_FILE, SHARDS_FOLDER, UNFOLDED_FOLDER, Run
+from runner.runs.shards import ENDS_AS, are_over, handed_over, shard_folders, shards_locked, shards_of
 from runner.util.arrays import Array
 from runner.util.files import storage_errors
 
@@ -54,6 +58,8 @@ _NOT_COPIED: Final = frozenset({"run", "result", "repair"})
 OWNER_WAITS: Final = 5.0
 """Seconds for which the process that began a run waits, at its end, for the others to end."""
 _POLL_SECONDS: Final = 0.05
+_OWN_UNFOLDED: Final = "recording.unfolded.mcap"
+"""What the process that began a run recorded, if not all of it is in the run's recording."""
 
 Report = Callable[[int, int], None]
 """Takes the steps copied so far, and how many there are."""
@@ -78,31 +84,54 @@ def fold_if_over(run: Run, seconds: float = 0.0, report: Report = lambda *_: Non
         run = run_at(run.folder)
         if not are_over(run):
             return handed_over(run)
-        with storage_errors(run.folder, "free some disk; `dualtaxi repair` folds its shards in then"):
-            return _fold(run, report)
+        try:
+            with storage_errors(run.folder, "free some disk; `dualtaxi repair` folds its shards in then"):
+                return _fold(run, report)
+        except RunnerError:
+            if run.file.status != "interrupted":  # it is not complete without its shards
+                with contextlib.suppress(StorageError):
+                    run.update(status="interrupted", **{ENDS_AS: _ending_of_run(run)})
+            raise
 
 
 def _fold(run: Run, report: Report) -> Run:
     fresh = run.folder / f".{RECORDING_FILE}.folding"
     fresh.unlink(missing_ok=True)
     with ExitStack() as stack:
-        sources = open_sources(run, stack)
+        sources, unusable = open_sources(run, stack)
         if not sources:
+            if unusable:
+                raise RecordingError(" ".join(unusable.values()))
             return run
         if sources[0].recording.shards:  # it was folded by a process that was killed before it said so
             text = sources[0].recording.metadata("result").get("json")
             summary = json_object(text, f"{run.recording}: the result")
         else:
-            summary = _Fold(run, sources, report).write(fresh)
+            fold = _Fold(run, sources, unusable, report)
+            summary = fold.write(fresh)
+            fold.content.check(fresh)
+    summary = {**run.file.summary, **summary}
+    unfolded = parse_result(summary, []).unfolded
     if fresh.exists():
+        if "" in unfolded and run.recording.exists():
+            shutil.copy2(run.recording, run.folder / _OWN_UNFOLDED)
         fresh.replace(run.folder / RECORDING_FILE)
     forget_upload(run)
     facts = {key: value for key, value in run.facts.items() if key != ENDS_AS}
-    summary = {**run.file.summary, **summary}
-    folded = Run(run.folder, facts).update(status=_ending_of_run(run), summary=summary)
-    merge_marks(run.folder, [shard.folder for shard in shards_of(run)])
-    shutil.rmtree(run.folder / SHARDS_FOLDER)
+    ending = _ending_of_run(run, unfolded)
+    folded = Run(run.folder, facts).update(status=ending, summary=summary)
+    merge_marks(run.folder, [folder for folder in shard_folders(run) if folder.name not in unfolded])
+    _remove_folded(run, unfolded)
     return folded
+
+
+def _remove_folded(run: Run, unfolded: Mapping[str, str]) -> None:
+    """Remove the shards of a run that was folded; keep those of which something is left out."""
+    for folder in shard_folders(run):
+        if folder.name in unfolded:
+            (run.folder / UNFOLDED_FOLDER).mkdir(exist_ok=True)
+            folder.rename(run.folder / UNFOLDED_FOLDER / folder.name)
+    shutil.rmtree(run.folder / SHARDS_FOLDER)
 
 
 class _Fold:
@@ -110,10 +139,16 @@ class _Fold:
 
     Args:
         sources: of its processes; that which began it comes first, unless it recorded nothing.
+        left_out: why the recordings of other processes cannot be folded, by name.
     """
 
-    def __init__(self, run: Run, sources: Sequence[Source], report: Report) -> None:
+    def __init__(
+        self, run: Run, sources: Sequence[Source], left_out: Mapping[str, str], report: Report
+    ) -> None:
         self._run, self._sources, self._report = run, sources, report
+        self._left_out = left_out
+        self._read: dict[int, Counter[str]] = {source.number: Counter() for source in sources}
+        """The messages read of each process, by topic."""
         self._first = first = sources[0].recording
         self._mdp = first.mdp if first.tabular else None
         self._outcomes = Outcomes(self._mdp)
@@ -127,7 +162,8 @@ class _Fold:
         """Write the new recording; return the summary of the run."""
         first, started = self._first, time.monotonic()
         facts = self._facts()
-        packing = recorded_packing(first.config)
+        dtypes, packing = dtypes_of(facts, str(fresh)), recorded_packing(first.config)
+        self.content = Content(dtypes)
         with create_recording(fresh, schema.KINDS[first.kind]) as file:
             file.add_metadata("run", facts)
             for name in first.metadata_names:
@@ -139,7 +175,7 @@ class _Fold:
                 file.add_attachment(name, media_type, data)
             self._recorder = recorder = Recorder(
                 file,
-                dtypes_of(facts, str(fresh)),
+                dtypes,
                 packing=packing,
                 watch=self._outcomes.take_records,
             )
@@ -155,9 +191,15 @@ class _Fold:
             result |= {"episodes": recorder.counts["/train/episode"], "steps_recorded": True}
             if self._mdp is not None:
                 result["rewards_off_table"] = off_table
-            if errors := self._errors():
+            unfolded = dict(self._left_out)
+            for source in self._sources:
+                if parts := left_out(source, self._read[source.number]):
+                    unfolded[source.name] = f"{parts} are in the run."
+            if unfolded:
+                result["unfolded"] = unfolded
+            if errors := self._errors() + [_kept(name, reason) for name, reason in unfolded.items()]:
                 result["error"] = truncated_message("; ".join(errors))
-            write_result(file, _ending_of_run(self._run), result)
+            write_result(file, _ending_of_run(self._run, unfolded), result)
             before = self._run.file.summary.seconds or 0.0
             return result | {"seconds": before + round(time.monotonic() - started, 3), "bytes": file.size}
 
@@ -251,7 +293,8 @@ class _Fold:
 
     def _copy_units(self) -> int:
         """Copy all resets, steps and extras; return how many rewards the environment's table excludes."""
-        recorder, copied = self._recorder, Copied(self._first.kind, self._mdp)
+        recorder, first = self._recorder, self._first
+        copied = Copied(first.kind, self._mdp)
         kind = CopiedMessages if copied.kind == "variable" else CopiedRows
         rows = {phase: kind(recorder, copied, phase) for phase in PHASES}
         extras = CopiedExtras(recorder, self._sources)
@@ -266,10 +309,15 @@ class _Fold:
             unit["new_reset"] = own.resets
             unit["new_step"] = own.place[0]
             unit["new_position"] = sum(recorder.steps.values()) + own.filled
-            own.put_reset(source.reset(phase, unit), source.environment + int(unit["environment"]))
+            reset, read = source.reset(phase, unit), self._read[source.number]
+            own.put_reset(reset, source.environment + int(unit["environment"]))
+            self.content.take(first.topic(f"/{phase}/reset"), reset)
+            read[f"/{phase}/reset"] += 1
             unit["new_episode"] = own.begun + 1
             for steps, numbers in source.steps(phase, unit):
-                extras.copy(source, phase, numbers, own.place[0], sum(recorder.steps.values()) + own.filled)
+                self.content.take(first.topic(f"/{phase}/step"), steps)
+                position = sum(recorder.steps.values()) + own.filled
+                read[f"/{phase}/extra"] += extras.copy(source, phase, numbers, own.place[0], position)
                 own.put(steps)
                 copied_steps += len(numbers)
                 self._report(copied_steps, total)
@@ -313,9 +361,10 @@ class _Fold:
 
     def _messages(self, source: Source, topic: Topic) -> Iterator[tuple[int, bytes]]:
         """Yield position and payload in the run of a process's messages of a topic."""
-        phase = topic.phase
+        phase, read = topic.phase, self._read[source.number]
         if topic.message == schema.RESET_STATE:
             for state in source.recording.reset_states(phase):
+                read[topic.name] += 1
                 units = source.units[phase][source.units[phase]["reset"] == state.reset]
                 for unit in units:
                     environment = source.environment + state.environment
@@ -323,6 +372,7 @@ class _Fold:
                     yield int(unit["new_position"]), moved.to_payload()
             return
         for fields in source.recording.decoded(topic):
+            read[topic.name] += 1
             position = int(fields.pop("log_time")) // STEP_NANOSECONDS
             if topic.message == schema.INFO:
                 yield from self._info(source, phase, fields)
@@ -372,7 +422,15 @@ class _Fold:
             yield place, encode(topic.message, fields)
 
 
-def _ending_of_run(run: Run) -> str:
-    """Return how a run ended whose processes are gone."""
+def _kept(name: str, reason: str) -> str:
+    """Return a sentence on a recording that was kept, as not all of it is in the run."""
+    who, where = (
+        (name, f"{UNFOLDED_FOLDER}/{name}") if name else ("the process that began the run", _OWN_UNFOLDED)
+    )
+    return f"{who}: {reason} Its recording is kept in {where}"
+
+
+def _ending_of_run(run: Run, unfolded: Mapping[str, str] | None = None) -> str:
+    """Return how a run ended whose processes are gone; it is not finished without what is `unfolded`."""
     status = str(run.facts.get(ENDS_AS) or run.file.status)
-    return status if status in ("finished", "failed") else "interrupted"
+    return status if status == "failed" or (status == "finished" and not unfolded) else "interrupted"

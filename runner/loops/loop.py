@@ -305,7 +305,11 @@ class Loop(Generic[R]):
                     raise
                 self.warn_once(f"run {self.run.run_id}: its status could not be written: {failure}")
         try:
-            self._loop_run.fold()
+            whole = self._loop_run.fold()
+            if whole.summary.unfolded:
+                warn_user(
+                    f"run {whole.run_id}: not all that its processes recorded is in it: {whole.summary.error}"
+                )
         except RunnerError as failure:
             run = self.options.join or self.run
             warn_user(

@@ -219,13 +219,14 @@ class LoopRun:
         SYNCER.add(self._file.path, partial(_mark_unsynced, self.run.folder))
         self.run = self.run.update(status=status, summary=summary, provenance=self._code.made_by(self.run))
 
-    def fold(self) -> None:
-        """Put together what several processes recorded, if this was the last one."""
+    def fold(self) -> Run:
+        """Put together what several processes recorded, if this was the last one; return the whole run."""
         if os.environ.get(RUN_VARIABLE) == self._absolute:
             del os.environ[RUN_VARIABLE]
         joined = self._options.join
         whole = fold_if_over(joined or self.run, 0 if joined else OWNER_WAITS)
         self.run = self.run if joined else whole
+        return whole
 
     def finish_following(self) -> None:
         """Send the rest to the server, if the run is sent to one."""

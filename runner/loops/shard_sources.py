@@ -5,23 +5,27 @@ A unit is a reset of one environment, and the steps that it took up to its next 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import contextlib
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
-from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.integrity import check_integrity, is_merely_cut_off
 from runner.recording.messages import Message
 from runner.recording.reader import Recording, open_recording
-from runner.recording.repair import DamagedFile
+from runner.recording.repair import can_be_repaired
+from runner.recording.row_reader import FOREVER
 from runner.recording.schema import STEP_NANOSECONDS
+from runner.runs.listing import run_in
 from runner.runs.run import RECORDING_FILE, Run
-from runner.runs.shards import shards_of
+from runner.runs.shards import shard_folders
 from runner.util.arrays import Ints, Records
 from runner.util.files import open_regular
 
@@ -57,12 +61,21 @@ class Source:
         number: its place among the processes of the run.
         environment: the number of its first environment among those of the run.
         is_placed: whether its process stated after how many training steps of the run it recorded.
+        stated: the number of messages of each topic, as its process stated it at its end; empty if it was
+            killed.
     """
 
     def __init__(
-        self, name: str, recording: Recording, number: int, environment: int, is_placed: bool
+        self,
+        name: str,
+        recording: Recording,
+        number: int,
+        environment: int,
+        is_placed: bool,
+        stated: Mapping[str, int],
     ) -> None:
         self.name, self.recording, self.number, self.environment = name, recording, number, environment
+        self.stated = stated
         self.is_placed = is_placed
         self.n = recording.environments
         self.stops = {phase: self._stop(phase) for phase in PHASES}
@@ -83,10 +96,28 @@ class Source:
         return self.recording.kind != "variable"
 
     def _stop(self, phase: str) -> int:
-        """Return the steps of a phase, up to the first that a repair could not save."""
-        lost = self.recording.lost.get(f"/{phase}/step")
-        stop = self.recording.whole_steps(phase)
-        return min(stop, lost[0][0] // self.n * self.n) if lost else stop
+        """Return the steps of a phase, up to the first that is lost or may lack its reset."""
+        (step, _), (reset, last_reset) = (self._first_gap(phase, name) for name in ("step", "reset"))
+        stop = min(self.recording.whole_steps(phase), step)
+        return (stop if reset == FOREVER else min(stop, last_reset)) // self.n * self.n
+
+    def _first_gap(self, phase: str, name: str) -> tuple[int, int]:
+        """Return the number of the first message that a repair lost, `FOREVER` without one.
+
+        And the `step` of the last message before it.
+        """
+        topic, number, last = self._topic(phase, name), 0, 0
+        lost = self.recording.lost.get(topic.name)
+        if self._is_fixed and not lost:
+            return FOREVER, 0
+        for rows in self.recording.rows(topic.name):
+            numbers = rows[schema.NUMBERED_BY[topic.message]]
+            after = np.flatnonzero(numbers != number + np.arange(len(rows)))
+            before = rows[: after[0]] if after.size else rows
+            number, last = number + len(before), int(before["step"][-1]) if len(before) else last
+            if after.size:
+                return number, last
+        return (number, last) if lost else (FOREVER, 0)
 
     def _only_resets(self, phase: str) -> NDArray[np.int64]:
         maker = self.recording.maker
@@ -196,32 +227,82 @@ class Source:
         return unit
 
 
-def open_sources(run: Run, stack: ExitStack) -> list[Source]:
+def open_sources(run: Run, stack: ExitStack) -> tuple[list[Source], dict[str, str]]:
     """Open what each process of a run recorded; leave out those that joined and recorded nothing.
 
+    Returns also why the recordings of other processes cannot be folded at all, by name.
+
     Raises:
-        RecordingError: a recording is damaged, and holds messages.
+        RecordingError: a recording is damaged, and can be repaired.
     """
     sources: list[Source] = []
+    left_out: dict[str, str] = {}
     first = 0
-    for name, part in [("", run), *((shard.run_id, shard) for shard in shards_of(run))]:
+    for folder in [run.folder, *shard_folders(run)]:
+        name = folder.name if folder != run.folder else ""
+        part, path = run_in(folder), folder / RECORDING_FILE
+        stated = part.summary.messages if part is not None else {}
         try:
-            recording = stack.enter_context(open_recording(part.folder / RECORDING_FILE))
-        except RecordingError:
-            if _has_messages(part.folder / RECORDING_FILE):
+            recording = stack.enter_context(_open_whole(path))
+        except RecordingError as error:
+            if can_be_repaired(path):
                 raise
+            if any(stated.values()) or _is_foreign(path):
+                expected = f"expected {sum(stated.values()):,} messages" if stated else "expected a recording"
+                left_out[name] = f"{str(error).removeprefix(f'{path}: ').rstrip('.')}; {expected}."
             continue
-        has_content = any(recording.has_messages(topic.name) for topic in recording.topics if topic.digested)
-        if name and not has_content:
+        if sources and (other := _difference(recording, sources[0].recording)):
+            left_out[name] = other
             continue
-        sources.append(Source(name, recording, len(sources), first, part.facts.get("placed") is True))
+        if name and not any(
+            recording.has_messages(topic.name) for topic in recording.topics if topic.digested
+        ):
+            if any(stated.values()):
+                left_out[name] = f"found no messages, expected {sum(stated.values()):,}."
+            continue
+        is_placed = part is not None and part.facts.get("placed") is True
+        sources.append(Source(name, recording, len(sources), first, is_placed, stated))
         first += recording.environments
-    return sources
+    return sources, left_out
 
 
-def _has_messages(path: Path) -> bool:
-    """Return whether a damaged recording holds any message."""
-    if not path.is_file() or not path.stat().st_size:
-        return False
-    with open_regular(path) as stream:
-        return any(opcode == Opcode.CHUNK for opcode, _, _ in DamagedFile(stream, path).good_records())
+def _open_whole(path: Path) -> Recording:
+    """Open a recording of which every byte is good, up to its end or to where it was cut off.
+
+    Raises:
+        RecordingError: it is damaged.
+    """
+    try:
+        check_integrity(path)
+    except RecordingError:
+        if not is_merely_cut_off(path):
+            raise
+    return open_recording(path)
+
+
+def _difference(recording: Recording, first: Recording) -> str:
+    """Return why a recording cannot be put together with the first one; empty if it can."""
+    found, expected = (
+        {"kind": one.kind, "agents": list(one.agents), **_comparable(one.spaces)}
+        for one in (recording, first)
+    )
+    if found == expected:
+        return ""
+    key = next(key for key in expected if found.get(key) != expected[key])
+    return f"found {key} {found.get(key)}, expected {expected[key]} as in the other processes."
+
+
+def _comparable(description: Any) -> Any:
+    """Return the description of spaces without dtypes and bounds, which actions may widen."""
+    if isinstance(description, dict):
+        widened = ("dtype", "low", "high")
+        return {key: _comparable(value) for key, value in description.items() if key not in widened}
+    return [*map(_comparable, description)] if isinstance(description, list) else description
+
+
+def _is_foreign(path: Path) -> bool:
+    """Return whether a file begins with anything but a recording, or nothing."""
+    with contextlib.suppress(OSError), open_regular(path) as stream:
+        start = stream.read(len(MCAP0_MAGIC))
+        return any(start) and not MCAP0_MAGIC.startswith(start)
+    return False

@@ -11,7 +11,7 @@ import contextlib
 import json
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -43,7 +43,7 @@ from runner.recording.records import (
 from runner.recording.schema import Topic
 from runner.recording.writer import RecordingFile
 from runner.util.files import open_regular
-from runner.util.values import is_whole
+from runner.util.values import JsonView, is_whole
 
 _CHUNK_TIMES_AND_SIZE: Final = struct.Struct("<QQQ")
 _MAX_MESSAGES: Final = 2**62
@@ -73,8 +73,13 @@ class Repair:
         return not self.lost and not self.lost_bytes
 
 
-def repair(path: Path, report: Report = lambda *_: None) -> Repair:
+def repair(path: Path, report: Report = lambda *_: None, stated: JsonView | None = None) -> Repair:
     """Make a recording whole; the file is not touched until its successor is complete and read back.
+
+    Args:
+        path: the recording.
+        report: called with the bytes read so far, and of how many.
+        stated: the summary of the run, if it has one: what a file that was cut lacks of it counts as lost.
 
     Raises:
         RecordingError: it is not a dualtaxi recording, or its description is damaged.
@@ -84,12 +89,12 @@ def repair(path: Path, report: Report = lambda *_: None) -> Repair:
         check_integrity(path, report)
         done = Repair(path, was_whole=True)
         with contextlib.suppress(RecordingError), open_recording(path) as recording:
-            done.lost = recording.lost
+            done.lost = recording.lost or _missing(_stated_counts(stated or {}), recording.message_counts)
         return done
     fresh = path.with_suffix(".repairing")
     try:
         fresh.unlink(missing_ok=True)
-        done = _salvage(path, fresh, report)
+        done = _salvage(path, fresh, report, _stated_counts(stated or {}))
         _read_back(fresh, done, report)
         if done.lost:
             number = 1
@@ -105,7 +110,20 @@ def repair(path: Path, report: Report = lambda *_: None) -> Repair:
     return done
 
 
-def _salvage(path: Path, fresh: Path, report: Report) -> Repair:
+def can_be_repaired(path: Path) -> bool:
+    """Return whether a damaged recording holds messages that a repair can keep."""
+    described, has_messages = set(), False
+    with contextlib.suppress(RecordingError, OSError), open_regular(path) as stream:
+        for opcode, _, body in DamagedFile(stream, path).good_records():
+            has_messages |= opcode == Opcode.CHUNK
+            if opcode == Opcode.METADATA:
+                described.add(metadata_of(body)[0])
+            if has_messages and described >= REQUIRED_RECORDS:
+                return True
+    return False
+
+
+def _salvage(path: Path, fresh: Path, report: Report, stated: Mapping[str, int]) -> Repair:
     try:
         stream = open_regular(path)
     except OSError as error:
@@ -113,7 +131,7 @@ def _salvage(path: Path, fresh: Path, report: Report) -> Repair:
     with stream:
         # The kind decides what the new file begins with, so it is looked for in a reading of its own.
         topics = schema.KINDS[_kind(DamagedFile(stream, path), path)]
-        return _Salvage(path, DamagedFile(stream, path), topics).write(fresh, report)
+        return _Salvage(path, DamagedFile(stream, path), topics, stated).write(fresh, report)
 
 
 def _kind(file: DamagedFile, path: Path) -> str:
@@ -149,7 +167,9 @@ def _read_back(fresh: Path, done: Repair, report: Report) -> None:
 class _Salvage:
     """Copies the good records of a damaged file into a new one."""
 
-    def __init__(self, path: Path, damaged: DamagedFile, topics: Sequence[Topic]) -> None:
+    def __init__(
+        self, path: Path, damaged: DamagedFile, topics: Sequence[Topic], stated: Mapping[str, int]
+    ) -> None:
         self._path = path
         self._topics = topics
         self._damaged = damaged
@@ -161,8 +181,8 @@ class _Salvage:
         self._extra_columns: list[tuple[int, str]] = []
         self._extra_widths: set[int] = set()
         self._result: dict[str, str] | None = None
-        self._counts: dict[str, int] = {}
-        """Messages of each topic, according to the result."""
+        self._counts = stated
+        """Messages of each topic, according to the result, or else as the run states them."""
 
     def write(self, fresh: Path, report: Report) -> Repair:
         """Write the new file."""
@@ -241,10 +261,8 @@ class _Salvage:
     def _finish(self, file: RecordingFile) -> None:
         """Record what was lost, or else the result again, and finish the file."""
         done = self._done
-        if self._result is not None:
-            for topic in self._topics:
-                if self._next[topic] < (count := self._counts.get(topic.name, 0)):
-                    done.lost.setdefault(topic.name, []).append([self._next[topic], count])
+        for name, holes in _missing(self._counts, {topic.name: n for topic, n in self._next.items()}).items():
+            done.lost.setdefault(name, []).extend(holes)
         done.lost_bytes = self._damaged.lost_bytes
         if self._damaged.torn_chunk is not None:
             done.torn_steps = self._steps_in(self._damaged.torn_chunk)
@@ -264,13 +282,21 @@ class _Salvage:
         return ticks if [size] == [ticks * width for width in widths] else 0
 
 
+def _missing(stated: Mapping[str, int], found: Mapping[str, int]) -> dict[str, list[list[int]]]:
+    """Return the messages missing after those found of each topic, as `Repair.lost`."""
+    return {name: [[found[name], n]] for name, n in stated.items() if name in found and found[name] < n}
+
+
 def _recorded_counts(result: dict[str, str]) -> dict[str, int]:
     """Return how many messages of each topic were recorded, according to a result.
 
     Raises:
         RecordingError: it does not say.
     """
-    values = json_object(result.get("json"), "the metadata 'result'")
+    return _stated_counts(json_object(result.get("json"), "the metadata 'result'"))
+
+
+def _stated_counts(values: JsonView) -> dict[str, int]:
     counts = values.get("messages", {})
     if not isinstance(counts, dict) or not all(is_whole(n, 0, _MAX_MESSAGES) for n in counts.values()):
         raise RecordingError("the metadata 'result' does not say how many messages there were")

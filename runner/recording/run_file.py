@@ -90,6 +90,8 @@ class Summary(JsonView):
     bytes: int | None = None
     """Size of the recording."""
     error: str | None = None
+    unfolded: Mapping[str, str] = field(default_factory=dict)
+    """Name of a process whose recording was kept, as not all of it could be put into the run, to what is."""
     values_by_key: JsonView = field(default_factory=dict, repr=False)
 
     def __getitem__(self, key: str) -> Any:
@@ -317,6 +319,7 @@ _SUMMARY: Final = {
     "seconds": _optional(_LENGTH),
     "bytes": _COUNT,
     "error": _optional(_TEXT),
+    "unfolded": Check(_maps_to(_is_text), "an object of texts"),
 }
 _ARCHIVE: Final = {"target": _TEXT, "digest": _optional(_TEXT), "done": _optional(_OBJECT)}
 _REQUIRED: Final = ("name", "seed", "status", "created")

@@ -69,6 +69,11 @@ class TopicReader(RunDescription):
         return self._index.finished
 
     @property
+    def message_counts(self) -> dict[str, int]:
+        """The number of messages of each topic, as the summary of a finished recording counts them."""
+        return {topic.name: self._index.message_counts.get(topic.channel, 0) for topic in self.topics}
+
+    @property
     def size(self) -> int:
         """Bytes of the file."""
         return os.fstat(self._stream.fileno()).st_size

@@ -41,6 +41,8 @@ STOP_FILE: Final = "stop"
 """Its presence requests that the loop stops."""
 SHARDS_FOLDER: Final = "shards"
 """The folder, in that of a run, of what processes that joined it record until the run is over."""
+UNFOLDED_FOLDER: Final = "unfolded"
+"""The folder, in that of a run, of those shards whose content is not all in the run's recording."""
 UNLISTED: Final = Path(".explain", "runs")
 """The folder, in that of recordings, of runs that are found by their ids alone: those of explanations."""
 _MADE_BY: Final = ("host", "git", "dualtaxi")

@@ -98,11 +98,14 @@ def new_shard(joined: Run, name: str | None, config: JsonView, seed: int | None,
 
 def shards_of(run: Run) -> list[Run]:
     """Return the shards of a run that are not folded into it yet, ordered by name, w2 before w10."""
+    return [shard for folder in shard_folders(run) if (shard := run_in(folder)) is not None]
+
+
+def shard_folders(run: Run) -> list[Path]:
+    """Return the folders of the shards of a run, whether they can be read or not, in the same order."""
     folder = run.folder / SHARDS_FOLDER
-    if run.stands_alone or not folder.is_dir():
-        return []
-    shards = (run_in(folder / entry) for entry in run_entries(folder))
-    return sorted((shard for shard in shards if shard is not None), key=lambda shard: _order(shard.run_id))
+    names = [] if run.stands_alone else run_entries(folder)
+    return [folder / name for name in sorted(names, key=_order)]
 
 
 def _order(name: str) -> list[tuple[int, str]]:

@@ -13,10 +13,11 @@ from runner.cli.options import json_option, recordings_option, run_argument, tru
 from runner.cli.output import draw, facts, print_json
 from runner.cli.parameter_types import COUNT
 from runner.cli.progress import bytes_line, count_line
-from runner.cli.runs import command_for, find, find_recording, job_progress, require_over
+from runner.cli.runs import command_for, find, find_recording, folded, job_progress, require_over
 from runner.errors import Diverged, ExitCode, RunnerError
 from runner.runs.locking import locked
 from runner.runs.run import Run
+from runner.runs.shards import shards_in_words, shards_of
 from runner.util.humanize import UNKNOWN, counted, size
 
 if TYPE_CHECKING:
@@ -84,6 +85,8 @@ def verify_command(
         found = Verification(run.recording, "interrupted")  # it ended before it had a recording
     else:
         require_over(run)
+        if run is not None and (shards := shards_in_words(run)):
+            raise RunnerError(f"run {run.run_id} is not complete: {shards} of it could not be added.")
         episodes = (run.episodes_to_do or 0) if run else 0
         with bytes_line("reading") as reading:
             damage = damage_of(path, reading)
@@ -223,7 +226,7 @@ def repair_command(
     Every good chunk is copied to a new file, also those after a damaged place; the file is read back and
     counted before it replaces the old one, which is not touched until then. If something in the middle was
     lost, the damaged file is kept next to it. The command reports what was lost; `dualtaxi resume` brings it
-    back.
+    back. What other processes recorded of the run, and could not be added to it, is repaired and added too.
 
     Exit code 1 if anything was lost, also in an earlier repair.
 
@@ -232,29 +235,43 @@ def repair_command(
       dualtaxi repair backup/recording.mcap
     """
     from runner.recording.integrity import refuse_foreign
-    from runner.recording.repair import repair
+    from runner.recording.repair import can_be_repaired, repair
 
     path, run = find_recording(run_name, recordings)
     refuse_foreign(path)
-    lock = contextlib.nullcontext() if run is None else locked(run)
-    with lock, bytes_line("repairing") as report:
-        repaired = repair(path, report)
-        if run is not None and repaired.lost and run.status == "finished":
-            # Resuming the run must arrive at the digest that it had.
-            run.update(status="interrupted", proof=run.summary.content_digest)
+    parts = [(path, run)]
+    if run is not None:
+        parts += [(shard.recording, shard) for shard in shards_of(run) if can_be_repaired(shard.recording)]
+    done: list[tuple[Repair, Run | None]] = []
+    for part, own in parts:
+        lock = contextlib.nullcontext() if own is None else locked(own)
+        with lock, bytes_line("repairing") as report:
+            repaired = repair(part, report, own.summary if own is not None else None)
+            if own is not None and repaired.lost and own.status == "finished":
+                # Resuming the run must arrive at the digest that it had.
+                own.update(status="interrupted", proof=own.summary.content_digest)
+        done.append((repaired, own))
     if as_json:
-        keys = ("was_whole", "lossless", "kept", "lost", "torn_steps", "lost_bytes")
-        original = repaired.original and str(repaired.original.absolute())
-        values = {key: getattr(repaired, key) for key in keys}
-        print_json({"path": str(repaired.path.absolute()), **values, "original": original})
+        first, *others = [_repair_as_json(repaired) for repaired, _ in done]
+        print_json(first | ({"shards": others} if others else {}))
     else:
-        draw(facts(_repair(repaired, run)))
-    if not repaired.lossless:
+        draw(*(facts(_repair(repaired, own)) for repaired, own in done))
+    whole = run if run is None else folded(run)
+    if not all(repaired.lossless for repaired, _ in done) or (whole and whole.summary.unfolded):
         raise click.exceptions.Exit(ExitCode.DIFFERENT)
+
+
+def _repair_as_json(repaired: Repair) -> dict[str, object]:
+    keys = ("was_whole", "lossless", "kept", "lost", "torn_steps", "lost_bytes")
+    original = repaired.original and str(repaired.original.absolute())
+    values = {key: getattr(repaired, key) for key in keys}
+    return {"path": str(repaired.path.absolute()), **values, "original": original}
 
 
 def _repair(repaired: Repair, run: Run | None) -> dict[str, str]:
     rows = {"recording": str(repaired.path)}
+    if run is not None and run.summary.unfolded:
+        rows["not in it"] = run.summary.error or ""
     if repaired.was_whole and repaired.lossless:
         return rows | {"verdict": "whole; there was nothing to do"}
     if repaired.was_whole:

@@ -1,0 +1,88 @@
+"""Whether a fold lost anything: what it left out, and the new recording compared with what was copied."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from blake3 import blake3
+
+from runner.errors import RecordingError
+from runner.loops.shard_sources import Source
+from runner.recording import schema
+from runner.recording.reader import open_recording
+from runner.recording.rewriting import content_of
+from runner.recording.schema import Topic
+
+_NEW: Final = frozenset({"step", "episode", "t", "reset", "environment", "log_time", "publish_time"})
+"""The fields that a fold numbers anew."""
+_NOT_COPIED: Final = (*schema.MACHINE_TOPICS, schema.EXTRA_COLUMNS_TOPIC)
+"""What is of one process only, or written anew; so are episodes, which follow from the steps."""
+
+
+class Content:
+    """Digests of the values in steps and resets, by topic and field: a fold must not change them.
+
+    Args:
+        dtypes: of the folded recording, in which values are compared.
+    """
+
+    def __init__(self, dtypes: Mapping[Topic, np.dtype[np.void]]) -> None:
+        self._dtypes = dtypes
+        self.digests: dict[tuple[str, str], Any] = defaultdict(blake3)
+
+    def take(self, topic: Topic, rows: Any) -> None:
+        """Take the next steps or resets: records, a record, or a list of messages."""
+        if topic in self._dtypes:
+            for name in {field.name for field in topic.message.fields} - _NEW:
+                dtype = self._dtypes[topic][name].base
+                self.digests[topic.name, name].update(np.ascontiguousarray(rows[name], dtype).tobytes())
+            return
+        for message in rows if isinstance(rows, list) else [rows]:
+            for name in message.keys() - _NEW:
+                self.digests[topic.name, name].update(repr(message[name]).encode())
+
+    def check(self, path: Path) -> None:
+        """Compare a folded recording with what was copied into it, after checking every byte of it.
+
+        Raises:
+            RecordingError: it is damaged, or holds other values.
+        """
+        content_of(path)
+        found = Content(self._dtypes)
+        with open_recording(path) as recording:
+            for topic in recording.topics:
+                if topic.name.endswith(("/step", "/reset")):
+                    is_fixed = topic in self._dtypes
+                    for rows in recording.blocks(topic) if is_fixed else recording.decoded(topic):
+                        found.take(topic, rows)
+        for (topic_name, name), digest in self.digests.items():
+            if found.digests[topic_name, name].digest() != digest.digest():
+                raise RecordingError(
+                    f"{path}: {topic_name}: {name}: found other values than its processes recorded; "
+                    "their recordings are kept as they are."
+                )
+
+
+def left_out(source: Source, read: Mapping[str, int]) -> str:
+    """Return how much of what a process recorded is in the run, if not all of it is.
+
+    Args:
+        read: the number of messages by topic that the fold read.
+    """
+    steps, others = [], []
+    for topic in source.recording.topics:
+        if topic.name.endswith("/episode") or topic in _NOT_COPIED:
+            continue
+        found, there = read.get(topic.name, 0), source.stated.get(topic.name, 0)
+        there = max([there, *(stop for _, stop in source.recording.lost.get(topic.name, []))])
+        if topic.message in schema.STEP_MESSAGES:
+            found, there = source.stops[topic.phase], max(there, source.recording.step_count(topic.phase))
+            if found < there:
+                steps.append(f"{found:,} of {there:,} {schema.PHASE_NAMES[topic.phase]} steps")
+        elif found < there:
+            others.append(f"{found:,} of {there:,} messages of {topic.name}")
+    return ", ".join(steps or others)
