@@ -101,6 +101,7 @@ class BatchRows(VectorRows):
             done += count
             if self._filled == self._room:
                 self.commit()
+                self._recorder.write_if_full()
 
     def continues_with(self, observations: object) -> bool:
         """Return whether these are the observations [N, ...] after the last step or reset of the phase."""

@@ -72,6 +72,7 @@ class Loop(Generic[R]):
         self._loop_run = LoopRun(described, options, maker)
         self.started = self._loop_run.started
         self._recorder = self._loop_run.recorder
+        self._recorder.when_full = self._write
         self._make_rows = make_rows
         self._rows: dict[str, R] = {}
         self.active: R | None = None
@@ -327,6 +328,13 @@ class Loop(Generic[R]):
         self.messages.commit()
         self._loop_run.commit()
 
+    def _write(self) -> None:
+        """Write everything, and go on."""
+        self._commit()
+        self._recorder.flush()
+        for rows in self._rows.values():
+            rows.open()
+
     def flush(self) -> bool:
         """Write what is half a second old, also while the loop does something else.
 
@@ -344,11 +352,8 @@ class Loop(Generic[R]):
             if not self._loop_run.is_settled and not self.messages.has_logged and age < _UNDECIDED_SECONDS:
                 self.run.beat()  # the description waits for the dtype of the first action
                 return True
-            self._commit()
-            self._recorder.flush()
+            self._write()
             self._recorder.release()
-            for rows in self._rows.values():
-                rows.open()
         except BaseException:  # raised again in the loop's own thread, with its next step
             return False
         finally:

@@ -78,6 +78,7 @@ class LoopRun:
             beat=self._beat,
             watch=self._watch,
             before=self.describe,
+            grouped=True,
             system=options.packing.system and not is_shard,
             console=LineRedactor() if options.packing.console and not is_shard else None,
         )

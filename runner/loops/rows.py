@@ -106,6 +106,7 @@ class Rows:
         self.filled += 1
         if self.filled == self._room:
             self.commit()
+            self._recorder.write_if_full()
             self.open()
 
     def _set_leaves(self, described: Described) -> None:

@@ -24,7 +24,7 @@ from runner.recording.repair import can_be_repaired
 from runner.recording.row_reader import FOREVER
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.runs.listing import run_in
-from runner.runs.run import RECORDING_FILE, Run
+from runner.runs.run import RECORDING_FILE, RUN_FILE, Run
 from runner.runs.shards import shard_folders
 from runner.util.arrays import Ints, Records
 from runner.util.files import open_regular
@@ -230,7 +230,8 @@ class Source:
 def open_sources(run: Run, stack: ExitStack) -> tuple[list[Source], dict[str, str]]:
     """Open what each process of a run recorded; leave out those that joined and recorded nothing.
 
-    Returns also why the recordings of other processes cannot be folded at all, by name.
+    Returns also why recordings are to be kept, by name: those that cannot be folded, and those of which it is
+    not known how much they lack.
 
     Raises:
         RecordingError: a recording is damaged, and can be repaired.
@@ -260,6 +261,8 @@ def open_sources(run: Run, stack: ExitStack) -> tuple[list[Source], dict[str, st
             if any(stated.values()):
                 left_out[name] = f"found no messages, expected {sum(stated.values()):,}."
             continue
+        if name and not recording.finished and not (folder / RUN_FILE).is_file():
+            left_out[name] = "was cut off, and its run.json is missing, which states how much there was."
         is_placed = part is not None and part.facts.get("placed") is True
         sources.append(Source(name, recording, len(sources), first, is_placed, stated))
         first += recording.environments

@@ -203,6 +203,7 @@ class VectorRows:
         self._filled = row + 1
         if is_full:
             self.commit()
+            self._recorder.write_if_full()
 
     def _gather(self) -> None:
         """Put the ends of episodes in `_ended`, and the resets that followed them, with the block's."""

@@ -2,8 +2,10 @@
 
     send(records) -> encoder threads (checksum, compression) -> writer thread (digest, file)
 
-Work reaches the digest and the file in the order in which it was sent; how much is pending is bounded. On a
-single processor the sending thread does the work itself: handing it over would only cost time.
+Work reaches the digest and the file in the order in which it was sent; how much is pending is bounded. Chunks
+of a group are written at once: whatever ends the process or fills the disk, the steps in the file have their
+resets and episodes. On a single processor the sending thread does the work itself: handing it over would only
+cost time.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from numpy.typing import NDArray
 from runner.recording.blocks import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, message_record
 from runner.recording.chunks import Chunk, Packed, encode_chunk
 from runner.recording.digest import ContentHash
-from runner.recording.schema import Topic
+from runner.recording.schema import ACTIONS, RESET, RESET_STATE, STEP_MESSAGES, TOPIC_OF, Topic
 from runner.recording.writer import RecordingFile, storage_error
 from runner.util.packing import Packing
 
@@ -47,9 +49,12 @@ Send = Callable[[Topic, memoryview, NDArray[np.uint64], NDArray[np.uint64]], Non
 
 @dataclass(frozen=True)
 class _Work:
-    """Records for the digest, the encoding of a chunk for the file if there is one, and a callback."""
+    """Records for the digest, the encoding of a chunk for the file if there is one, and a callback.
 
-    topic: Topic
+    Without a topic it is the end of a group of chunks.
+    """
+
+    topic: Topic | None
     records: memoryview
     encode: Callable[[], Chunk] | None
     done: Callable[[], None]
@@ -66,6 +71,7 @@ class Pipeline:
         before: called once, before anything is written. With it, the pipeline holds up to `MAX_HELD` pieces
             of work until `release`; only then are threads started, so a recording that is closed earlier
             needs none.
+        grouped: hold chunks until `end_group`, and write them then; else each is written by itself.
     """
 
     def __init__(
@@ -75,8 +81,13 @@ class Pipeline:
         beat: Callable[[], None],
         threads: bool = True,
         before: Callable[[], None] | None = None,
+        grouped: bool = False,
     ) -> None:
         self.hash = ContentHash()
+        self._grouped = grouped
+        self._group: list[Chunk] = []
+        self._is_empty = True
+        """Whether no group was written yet."""
         self.failure: BaseException | None = None
         """The error that stopped the writing."""
         self._file = file
@@ -137,6 +148,10 @@ class Pipeline:
 
         self._enqueue(_Work(topic, memoryview(b""), encode if self._file is not None else None, lambda: None))
 
+    def end_group(self) -> None:
+        """Write what was sent since the last group: resets first, then steps, then all else."""
+        self._enqueue(_Work(None, memoryview(b""), None, lambda: None))
+
     def release(self, threads: bool = True) -> None:
         """Write what is held, and hold nothing from now on; `threads` False does so without threads.
 
@@ -183,7 +198,7 @@ class Pipeline:
     def _enqueue(self, work: _Work) -> None:
         if self._held is not None:
             self._held.append(work)
-            if len(self._held) == MAX_HELD:
+            if sum(held.topic is not None for held in self._held) == MAX_HELD:
                 self.release()
         elif self._writer is None:
             self._process(work, None)
@@ -221,15 +236,35 @@ class Pipeline:
             self._last_beat = now
 
     def _write(self, work: _Work, encoded: Future[Chunk] | None) -> None:
-        self.hash.update(work.topic, work.records)
-        if work.encode is None or self._file is None:
+        if work.topic is not None:
+            self.hash.update(work.topic, work.records)
+        if self._file is None:
             return
-        chunk = work.encode() if encoded is None else encoded.result()
+        if work.encode is not None:
+            chunk = work.encode() if encoded is None else encoded.result()
+            self._group.append(chunk)
+        if self._group and (work.topic is None or not self._grouped):
+            self._write_group(self._file)
+
+    def _write_group(self, file: RecordingFile) -> None:
+        group, self._group = self._group, []
         try:
-            self._file.add_chunk(chunk)
+            file.add_chunks(sorted(group, key=_rank))
         except OSError:
-            self._file.cut_back()
+            file.cut_back()
+            if self._is_empty:  # a part of the first group is better than nothing
+                with contextlib.suppress(OSError):
+                    for chunk in group:
+                        file.add_chunk(chunk)
+                file.cut_back()
             raise
+        self._is_empty = False
+
+
+def _rank(chunk: Chunk) -> int:
+    """Return the rank of a chunk in its group: if only a part of it is written, steps have their resets."""
+    message = TOPIC_OF[chunk.summary.channel].message
+    return 0 if message in (RESET, RESET_STATE) else 1 if message in (*STEP_MESSAGES, ACTIONS) else 2
 
 
 @dataclass

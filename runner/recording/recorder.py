@@ -89,6 +89,8 @@ class Recorder:
         console: returns a line of the process's output as it is to be recorded, without secrets; None records
             no output. Only with the clock.
         packed: the chunks of another recording, used again for the same messages.
+        grouped: write the chunks of all topics together, at each flush: the file has no steps without their
+            resets then, whatever ends the process. The caller calls `write_if_full`, and `flush`.
     """
 
     def __init__(
@@ -106,11 +108,12 @@ class Recorder:
         system: bool = False,
         console: Callable[[str], str] | None = None,
         packed: PackedChunks | None = None,
+        grouped: bool = False,
     ) -> None:
         packing = packing or Packing()
         self._file = file
         self._watch = watch
-        self._packed = packed
+        self._packed, self._grouped = packed, grouped
         self._chunk_steps = packing.chunk_steps
         self._first_records = _FIRST_RECORDS if before is not None else None
         self._reference = reference or Reference()
@@ -123,8 +126,12 @@ class Recorder:
         self.counts = {topic.name: 0 for topic in schema.ALL_TOPICS}
         """Messages committed so far, by topic."""
         self._last_flush = time.monotonic()
-        self._pipeline = Pipeline(file, packing, beat, threads, before)
+        self._pipeline = Pipeline(file, packing, beat, threads, before, grouped)
         self._batches = MessageBatches(self._pipeline.send)
+        self.when_full: Callable[[], None] = self.flush
+        """Writes everything, also what the caller holds; called when a block of steps was full."""
+        self._is_full = False
+        """Whether a block of steps was full since the last flush."""
         self._stopwatch: Stopwatch | None = None
         self._observer: Observer | None = None
         if clock and file is not None and schema.CLOCK_TOPIC in file.topics:
@@ -223,6 +230,11 @@ class Recorder:
         if time.monotonic() - self._last_flush > FLUSH_SECONDS:
             self.flush()
 
+    def write_if_full(self) -> None:
+        """Write everything if a block of steps was full; call it when their resets and episodes are taken."""
+        if self._is_full:
+            self.when_full()
+
     def message(self, topic: Topic, payload: bytes) -> bool:
         """Record one message of variable size at the current logical time, in a chunk of its own.
 
@@ -249,6 +261,7 @@ class Recorder:
         """
         self._pipeline.raise_failure()
         self._batches.extend(topic, [position * STEP_NANOSECONDS for position in positions], payloads)
+        self._is_full |= self._grouped and topic.message in schema.STEP_MESSAGES
         if topic not in schema.MACHINE_TOPICS:  # of which a resumed run does not know the number
             self.counts[topic.name] += len(payloads)
 
@@ -276,6 +289,8 @@ class Recorder:
         for lane in self._lanes.values():
             if lane.open is not None and lane.open.filled:
                 self._send_block(lane)
+        self._pipeline.end_group()
+        self._is_full = False
         self._last_flush = time.monotonic()
 
     def drain(self) -> dict[str, str]:
@@ -345,6 +360,8 @@ class Recorder:
         if has_reference:
             self._send_block(lane, write=False)
         elif block.filled == len(block.records) or (lane.span and lane.span.stop == self.counts[topic.name]):
+            if self._grouped and topic.message in schema.STEP_MESSAGES:
+                self._is_full |= len(block.records) == lane.capacity  # the first, smaller one can wait
             self._send_block(lane)
 
     def _open(self, topic: Topic) -> _Block:

@@ -139,16 +139,23 @@ class RecordingFile:
         self._append(record)
         self._attachments.append(index)
 
+    def add_chunks(self, chunks: Sequence[Chunk]) -> None:
+        """Append chunks of one topic each with their message indexes: all of them, or none if that fails."""
+        start = self._offset
+        self._append(b"".join(part for chunk in chunks for part in (chunk.record, chunk.index)))
+        for chunk in chunks:
+            index_start = start + len(chunk.record)
+            place = {
+                "chunk_start_offset": start,
+                "message_index_offsets": {chunk.summary.channel: index_start} if chunk.index else {},
+                "message_index_length": len(chunk.index),
+            }
+            self._note_chunk(replace(chunk.summary, index=replace(chunk.summary.index, **place)))
+            start = index_start + len(chunk.index)
+
     def add_chunk(self, chunk: Chunk) -> None:
         """Append a chunk of one topic and its message index."""
-        start, channel = self._offset, chunk.summary.channel
-        self._append(chunk.record + chunk.index)
-        place = {
-            "chunk_start_offset": start,
-            "message_index_offsets": {channel: start + len(chunk.record)} if chunk.index else {},
-            "message_index_length": len(chunk.index),
-        }
-        self._note_chunk(replace(chunk.summary, index=replace(chunk.summary.index, **place)))
+        self.add_chunks([chunk])
 
     def _note_chunk(self, chunk: ChunkSummary) -> None:
         self._chunks.append(chunk.index)
