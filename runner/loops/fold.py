@@ -120,7 +120,7 @@ def _fold(run: Run, report: Report) -> Run:
     facts = {key: value for key, value in run.facts.items() if key != ENDS_AS}
     ending = _ending_of_run(run, unfolded)
     folded = Run(run.folder, facts).update(status=ending, summary=summary)
-    merge_marks(run.folder, [folder for folder in shard_folders(run) if folder.name not in unfolded])
+    merge_marks(run.folder, shard_folders(run))
     _remove_folded(run, unfolded)
     return folded
 
