@@ -18,9 +18,9 @@ from runner.recording.rewriting import content_of
 from runner.recording.schema import Topic
 
 _NEW: Final = frozenset({"step", "episode", "t", "reset", "environment", "log_time", "publish_time"})
-"""The fields that a fold numbers anew."""
+"""The fields to which a fold gives new numbers."""
 _NOT_COPIED: Final = (*schema.MACHINE_TOPICS, schema.EXTRA_COLUMNS_TOPIC)
-"""What is of one process only, or written anew; so are episodes, which follow from the steps."""
+"""What is of one process only, or written again; so are episodes, which follow from the steps."""
 
 
 class Content:

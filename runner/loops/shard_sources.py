@@ -245,6 +245,8 @@ def open_sources(run: Run, stack: ExitStack) -> tuple[list[Source], dict[str, st
         stated = part.summary.messages if part is not None else {}
         try:
             recording = stack.enter_context(_open_whole(path))
+            if not sources and recording.tabular:  # the run is described as in its first recording
+                recording.mdp  # noqa: B018 - an attachment may be lost
         except RecordingError as error:
             if can_be_repaired(path):
                 raise

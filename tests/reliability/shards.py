@@ -193,7 +193,7 @@ def damage(folder: Path, runs: dict[str, Path], rng: random.Random, story: list[
     elif how == "empty":
         path.write_bytes(b"")
     elif how == "no run.json" and part != folder:
-        (part / "run.json").unlink()
+        (part / "run.json").unlink(missing_ok=True)
     elif how == "other kind" and not (folder / "shards" / "other").exists():
         other = rng.choice([kind for kind in sorted(runs) if runs[kind].name != folder.name])
         shutil.copytree(runs[other] / "shards" / "w0", folder / "shards" / "other")
@@ -202,11 +202,12 @@ def damage(folder: Path, runs: dict[str, Path], rng: random.Random, story: list[
 def steps_below(folder: Path) -> Counter[bytes]:
     """Return the values of all steps in whole chunks of all recordings in a folder: the most in one file.
 
-    A file that was repaired stands beside its original: a step in both is one step.
+    A file that was repaired lies next to its original: a step in both is one step.
     """
     parts: dict[Path, Counter[bytes]] = {}
     for path in folder.rglob("*.mcap"):
-        parts[path.parent] = parts.get(path.parent, Counter()) | steps_in(path)
+        part = path if "unfolded" in path.name else path.parent
+        parts[part] = parts.get(part, Counter()) | steps_in(path)
     return sum(parts.values(), Counter())
 
 
