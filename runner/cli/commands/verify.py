@@ -119,9 +119,7 @@ def _rows(found: Verification, run: Run | None) -> dict[str, str]:
             f"{counted(found.left_out, 'step')} left out: the random generators before them are not known"
         )
     if found.cut_off:
-        notes.append(
-            f"the last {counted(found.cut_off, 'step')} left out: their resets were lost in the kill"
-        )
+        notes.append(f"the last {counted(found.cut_off, 'step')} left out: their resets were not written")
     rows["note"] = "\n".join([*notes, *found.notes])
     if found.sound:
         rows["digest"] = found.content_digest or f"{UNKNOWN} (written when a run ends properly)"

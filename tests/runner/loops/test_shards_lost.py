@@ -81,7 +81,7 @@ def test_a_repaired_shard_is_kept_if_steps_in_it_are_not_in_the_run(run):
     assert f"w0: 512 of {STEPS:,} training steps" in folded.summary.error
     assert "unfolded/w0" in dualtaxi(run.folder.parent, "show", run.run_id).output
     assert steps_in(folded.recording) == 100 + STEPS + 512
-    assert "w0: 512 of" in verify(folded.recording).finding
+    assert "w0: 512 of" in verify(folded.recording, rerun=False).finding
     assert dualtaxi(run.folder.parent, "repair", run.run_id).exit_code == 1
 
 
@@ -96,7 +96,7 @@ def test_a_shard_that_lacks_what_it_stated_is_kept(run, left):
     folded = fold_if_over(run)
     assert folded.status == "interrupted"
     assert "w1" in folded.summary.error
-    assert not verify(folded.recording).sound
+    assert not verify(folded.recording, rerun=False).sound
     assert 100 + STEPS <= steps_in(folded.recording) < 100 + 2 * STEPS
     assert (run.folder / "unfolded" / "w1" / "run.json").exists()
     if left != "removed":
@@ -171,4 +171,4 @@ def test_repair_counts_what_a_cut_recording_lacks(tmp_path):
     assert repaired.exit_code == 1
     assert f"768 to {STEPS - 1:,}" in repaired.output
     assert run_at(rec.run.folder).status == "interrupted"
-    assert not verify(path).sound
+    assert not verify(path, rerun=False).sound
