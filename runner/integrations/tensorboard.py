@@ -25,9 +25,9 @@ import numpy as np
 
 from runner.errors import ConfigError
 from runner.integrations.hooks import hook_environments, open_runs
-from runner.integrations.media import film_of, grid_of, histogram_of, picture_of
 from runner.integrations.script import ScriptRun
 from runner.integrations.shapes import WithoutEffect, forgiving, without_effect
+from runner.loops.media import film_of, grid_of, histogram_of, picture_of
 from runner.loops.recorded import ending_of
 from runner.loops.values import as_array
 from runner.runs.run import Run

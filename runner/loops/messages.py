@@ -13,6 +13,7 @@ import numpy as np
 from runner.drawing.raster import image_bytes
 from runner.errors import ConfigError
 from runner.loops.checkpointing import content_of
+from runner.loops.media import media_of
 from runner.loops.options import ALL_INFO, Options, pillow
 from runner.loops.outcomes import Outcomes
 from runner.loops.pictures import Picture
@@ -110,11 +111,18 @@ class Messages:
         """Reset states that it does not have yet, with their positions."""
 
     def log(self, phase: str, name: str, value: object) -> None:
-        """Record a number or a text under a name, at this moment."""
+        """Record a number, a text, an array, a picture or a histogram under a name, at this moment."""
         series = self._series.get((phase, name))
         if value.__class__ is not float or series is None:
             if isinstance(value, str):
                 self._log_text(name, value)
+                return
+            if not isinstance(value, int | float) and (content := media_of(value)) is not None:
+                if isinstance(content, Picture):
+                    self.picture(name, content)
+                else:
+                    check_log_name(name, value)
+                    self.snapshot(phase, name, content)
                 return
             value = logged_number(name, value)
             if series is None:

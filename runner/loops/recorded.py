@@ -63,10 +63,14 @@ class Recorded(Generic[R]):
                     self._messages.log(self._phase, self._return_name, float(returns.mean()))
 
     def log(self, name: str | Mapping[str, object], value: object = None) -> None:
-        """Record a number or a text under a name: `rec.log("loss", loss)`, `rec.log({"loss": loss})`.
+        """Record a value under a name: `rec.log("loss", loss)`, `rec.log({"loss": loss})`.
+
+        A number, a text, an array of numbers, a figure of Matplotlib, a picture of Pillow, or an `Image`,
+        `Video` or `Histogram` of `runner.loops.media`. Several numbers are recorded as by `snapshot`.
 
         Raises:
-            ConfigError: it is neither.
+            ConfigError: it is something else.
+            MissingExtra: pictures need Pillow, which is not installed.
         """
         try:
             if isinstance(name, str):

@@ -71,8 +71,8 @@ def logged_number(name: str, value: Any) -> float:
         return lone_number(value, name) if np.size(value) == 1 and np.ndim(value) else float(value)
     except (TypeError, ValueError, OverflowError, RuntimeError, RecordingError) as error:
         raise ConfigError(
-            f"log: found {type(value).__name__} for {name!r}, expected a number that a float64 holds, or "
-            "text; an array is recorded by snapshot()."
+            f"log: found {type(value).__name__} for {name!r}, expected a number that a float64 holds, "
+            "text, an array of numbers or a picture."
         ) from error
 
 

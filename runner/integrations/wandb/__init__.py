@@ -25,11 +25,12 @@ import numpy as np
 
 from runner.errors import ConfigError, RunnerError
 from runner.integrations.hooks import hook_environments
-from runner.integrations.media import Histogram, Image, Table, Video
 from runner.integrations.script import ScriptRun
 from runner.integrations.shapes import WithoutEffect, forgiving, warn_once, without_effect
 from runner.integrations.tensorboard import as_number, forward
 from runner.integrations.wandb.settings import Config, Summary
+from runner.integrations.wandb.table import Table
+from runner.loops.media import Histogram, Image, Video
 from runner.loops.options import settings_in
 from runner.loops.recorded import ending_of
 from runner.runs.listing import list_runs

@@ -16,9 +16,11 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import NormalizeReward, RecordEpisodeStatistics
+from matplotlib.figure import Figure
 
 import runner
 from runner.errors import ConfigError, EnvironmentNotUsable, RecordingError, RunnerError
+from runner.loops.media import Histogram, Image
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
@@ -425,3 +427,22 @@ def test_returns_before_a_wrapper_changed_the_rewards_are_logged(tmp_path, mode)
         logged = [(each["name"], each["value"]) for each in recording.decoded(schema.SCALAR_TOPIC)]
     assert len(returns) > 1
     assert logged == [("return before NormalizeReward", value) for value in returns]
+
+
+def test_arrays_pictures_and_histograms_are_logged_as_such(tmp_path):
+    figure = Figure(figsize=(1, 1), dpi=50)
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path) as rec:
+        rec.reset(seed=1)
+        rec.step(0)
+        rec.log({"q": np.arange(3.0), "counts": [1, 2], "one": [0.5], "nested": {"figure": figure}})
+        rec.log("view", Image(np.zeros((4, 6, 3), np.uint8)))
+        rec.log("weights", Histogram(np.arange(128.0)))
+        with pytest.raises(ConfigError, match="an array of numbers or a picture"):
+            rec.log("thing", object())
+    with runner.open_recording(rec.run.recording) as recording:
+        arrays = {each.name: (each.step, each.values.tolist()) for each in recording.arrays()}
+        pictures = [each["frame_id"] for each in recording.decoded(recording.topic("/image"))]
+    assert (arrays["q"], arrays["counts"]) == ((1, [0, 1, 2]), (1, [1, 2]))
+    assert sum(arrays["weights/counts"][1]) == 128
+    assert pictures == ["nested/figure", "view"]
+    assert rec.run.summary["logged"] == {"one": 0.5}

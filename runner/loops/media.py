@@ -1,9 +1,8 @@
-"""Pictures, films, histograms and tables as scripts give them to a logger, as a recording holds them."""
+"""Pictures, films and histograms as scripts give them to a logger, as a recording holds them."""
 
 from __future__ import annotations
 
 import io
-import json
 import os
 from collections.abc import Callable
 from typing import Any, Final
@@ -12,16 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import ConfigError
-from runner.integrations.shapes import WithoutEffect, without_effect
 from runner.loops.options import pillow
 from runner.loops.pictures import Picture
 from runner.loops.values import numbers_of
 from runner.util.arrays import Array
 from runner.util.extras import require
-from runner.util.jsonable import as_json
 
 BINS: Final = 64
-_MAX_TABLE: Final = 1 << 20
 
 
 def picture_of(value: Any, layout: str = "HWC", fps: float = 4.0) -> Picture:
@@ -130,10 +126,26 @@ def _pixels(array: NDArray[Any], layout: str) -> NDArray[np.uint8]:
     return np.broadcast_to(array, (*array.shape[:-1], 3))
 
 
+def media_of(value: Any) -> Any:
+    """Return a `Picture`, an array, or arrays by name, as a value is recorded; None for anything else.
+
+    Raises:
+        ConfigError: it is a picture or a histogram that cannot be recorded.
+        MissingExtra: Pillow, which pictures need, is not installed.
+    """
+    if isinstance(value, Media):
+        return value.content
+    if callable(getattr(value, "savefig", None)) or callable(getattr(value, "convert", None)):
+        return picture_of(value)
+    if isinstance(value, list | tuple):
+        return value if len(value) != 1 else None
+    return value if np.ndim(value) and np.size(value) != 1 else None
+
+
 # --- as wandb names them ------------------------------------------------------------------------------
 
 
-class _Media:
+class Media:
     """What was made of a script's data; if nothing could be, the error comes when it is logged."""
 
     def __init__(self, convert: Callable[..., Any], *arguments: object) -> None:
@@ -155,7 +167,7 @@ class _Media:
         return self._content
 
 
-class Image(_Media):
+class Image(Media):
     """A picture: an array [height, width] or [height, width, channels], Pillow's, Matplotlib's, or a file."""
 
     def __init__(self, data_or_path: Any, *_: object, caption: str | None = None, **__: object) -> None:
@@ -164,7 +176,7 @@ class Image(_Media):
         self.caption = caption
 
 
-class Video(_Media):
+class Video(Media):
     """A film: an array [frames, channels, height, width], or a batch of them; or a file."""
 
     def __init__(
@@ -179,7 +191,7 @@ class Video(_Media):
         self.caption = caption
 
 
-class Histogram(_Media):
+class Histogram(Media):
     """A histogram: of numbers, or counts and edges as `numpy.histogram` returns them."""
 
     def __init__(self, sequence: Any = None, np_histogram: Any = None, num_bins: int = 64) -> None:  # noqa: ARG002
@@ -188,30 +200,3 @@ class Histogram(_Media):
         else:
             arrays = zip(("counts", "edges"), np_histogram, strict=False)
             super().__init__(lambda: {name: np.asarray(values) for name, values in arrays})
-
-
-class Table:
-    """Rows, recorded as a text."""
-
-    def __init__(
-        self, columns: Any = None, data: Any = None, rows: Any = None, dataframe: Any = None, **_: object
-    ) -> None:
-        if dataframe is not None:
-            columns, data = dataframe.columns, dataframe.to_numpy()
-        data = rows if data is None else data
-        self.columns = list(() if columns is None else columns)
-        self.data = list(() if data is None else data)
-
-    def add_data(self, *row: object) -> None:
-        """Add a row."""
-        self.data.append(list(row))
-
-    def text(self) -> str:
-        """Return columns and rows as JSON."""
-        text = json.dumps(as_json({"columns": self.columns, "data": self.data}))
-        if len(text) > _MAX_TABLE:
-            raise ConfigError(f"log: found a table of {len(text):,} bytes, expected at most {_MAX_TABLE:,}")
-        return text
-
-    def __getattr__(self, name: str) -> WithoutEffect:
-        return without_effect("wandb.Table", name)
