@@ -17,7 +17,7 @@ from runner.loops.arguments import VARIABLE, CannotBeMade, arguments_of, factory
 from runner.recording.maker import FUNCTION_NAME
 from runner.replay.makers import class_name
 from runner.replay.scripts import MAIN
-from runner.replay.trust import name_of
+from runner.replay.trust import is_left_out, name_of
 from runner.util.values import MAX_TEXT
 
 _SHOWS_ONLY: Final = (RecordVideo, HumanRendering, VectorRecordVideo, VectorHumanRendering)
@@ -102,7 +102,7 @@ def wrapper_fields(wrapper: object, assumed: list[str]) -> dict[str, object]:
     """Return the fields of a `WrapperSpec`; add the wrapper to `assumed` if its arguments are unknown."""
     name = class_name(wrapper)
     kwargs, is_certain = arguments_of(wrapper, "env")
-    if not is_certain:
+    if not is_certain and not is_left_out(name):
         assumed.append(name)
     kwargs = plain_kwargs(kwargs, f"the wrapper {name}")
     return {"name": type(wrapper).__name__, "entry_point": entry_point_of(type(wrapper)), "kwargs": kwargs}
