@@ -15,6 +15,7 @@ from runner.analysis.evaluations import (
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.clock import Clock, read_clock
+from runner.recording.composition import Composition, composition_of
 from runner.recording.maker import Shard
 from runner.recording.messages import Message
 from runner.recording.reader import Recording, open_recording
@@ -63,6 +64,8 @@ class RunDetails:
     episodes: int | None = None
     train_steps: int | None = None
     eval_steps: int | None = None
+    environment: Composition | None = None
+    """What its environment consists of; None if it has none, or its recording cannot be read."""
     bytes: int = 0
     """Size of the recording; 0 if it is missing or unreadable."""
     provenance: Mapping[str, str] = field(default_factory=dict)
@@ -99,6 +102,7 @@ class RunDetails:
             "content_digest": summary.content_digest,
             "topic_digests": dict(summary.topic_digests) if "topic_digests" in summary else None,
             **{key: getattr(self, key) for key in ("episodes", "train_steps", "eval_steps")},
+            "environment": None if self.environment is None else self.environment.as_json(),
             "seconds": summary.seconds,
             "recorded_seconds": None if self.clock is None else self.clock.duration,
             "steps_a_second": None if self.clock is None else self.clock.steps_a_second,
@@ -132,6 +136,7 @@ def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> Ru
                     run,
                     config if config == recording.config else recording.config,  # the former in better order
                     **done,
+                    environment=composition_of(recording) if recording.has_environment else None,
                     bytes=recording.size,
                     shards=recording.shards,
                     clock=read_clock(recording),

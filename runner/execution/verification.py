@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from runner.errors import Diverged
+from runner.recording.composition import Composition
 from runner.recording.reader import Recording
 from runner.replay.differences import Difference
 from runner.runs.provenance import Differences
@@ -41,6 +42,8 @@ class Verification:
     """What was done: only the file was checked, a job was retrained, or a loop's environment was rerun."""
     environment: Literal["", "recorded", "installed"] = ""
     """The environment with which it was retrained or rerun."""
+    composition: Composition | None = None
+    """What the environment consists of; None if there is none, or nothing can be read."""
     reason: str = ""
     """Why the environment cannot be rerun, as a sentence; empty if it was, or was not to be."""
     finding: str = ""

@@ -44,6 +44,7 @@ from runner.execution.verification import (
 from runner.execution.verify_loop import verify_loop
 from runner.learning.learner import Learner
 from runner.recording import schema
+from runner.recording.composition import composition_of
 from runner.recording.integrity import check_integrity, refuse_foreign, survey
 from runner.recording.reader import Recording, open_recording
 from runner.recording.records import Report as BytesReport
@@ -114,7 +115,9 @@ def check(
     is_cut = isinstance(damage, CutOff) and not _states_its_end(path)
     try:
         with open_recording(path) as recording:
+            composition = composition_of(recording) if recording.has_environment else None
             found = _check_content(recording, installed, report, trust)
+            found = replace(found, composition=composition)
             unreadable = "" if damage is None or is_cut else _first_unreadable(recording)
     except (RecordingError, ConfigError) as error:
         if is_cut and not survey(path).chunks:

@@ -19,6 +19,7 @@ from runner.execution.verification import (
 from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.consistency import Findings, check_extras, check_phase
+from runner.recording.description import has_environment
 from runner.recording.digest import ContentHash, combined_digest
 from runner.recording.loop_blocks import Inconsistent, check_without_steps
 from runner.recording.reader import Recording
@@ -41,7 +42,7 @@ def verify_loop(recording: Recording) -> Verification:
         verdict="consistent" if is_over else "interrupted",
         train_steps=recording.step_count("train"),
         eval_steps=recording.step_count("eval"),
-        not_compared="" if recording.config.get("env") == {"id": "none", "kwargs": {}} else LOOP_NOT_COMPARED,
+        not_compared=LOOP_NOT_COMPARED if has_environment(recording.config) else "",
         is_loop=True,
     )
     try:

@@ -103,11 +103,13 @@ def _kept(kind: type[Any]) -> dict[str, str]:
         if isinstance(value, ast.Name) and isinstance(target, ast.Attribute):
             is_own = ast.unparse(target.value) == own and stored[f".{target.attr}"] == 1
             kept |= {value.id: target.attr} if is_own and not stored[value.id] else {}
-    others = (method for base in kind.__mro__ for method in vars(base).values() if method is not constructor)
+    methods = (each for base in kind.__mro__ for each in vars(base).values() if inspect.isfunction(each))
+    unwrapped = (inspect.unwrap(each) for each in methods if each is not constructor)
+    others = (each for each in unwrapped if inspect.isfunction(each))
     changed = {
         instruction.argval
         for method in others
-        if inspect.isfunction(method) and not set(kept.values()).isdisjoint(method.__code__.co_names)
+        if not set(kept.values()).isdisjoint(method.__code__.co_names)
         for instruction in dis.get_instructions(method)
         if instruction.opname == "STORE_ATTR"
     }

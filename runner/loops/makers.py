@@ -25,7 +25,7 @@ from gymnasium.wrappers import OrderEnforcing
 from runner.environments.gym_types import AnyVectorEnv
 from runner.errors import ConfigError
 from runner.loops.actions import action_names
-from runner.loops.arguments import CannotBeMade, arguments_of, plain_kwargs, plain_number
+from runner.loops.arguments import CannotBeMade, arguments_of, is_plain, plain_kwargs, plain_number
 from runner.loops.vec_env import LIBRARY, VecEnvVector, mode_of
 from runner.loops.wrappers import (
     OBSERVERS,
@@ -109,6 +109,7 @@ def _with_spec(
         registered_by="" if top in ("gymnasium", MAIN) else registered_by,
         assumed=tuple(assumed),
         inner_wrappers=inner,
+        registered=_registered(spec),
     )
     return _with_versions(
         maker, [top, *(top_package(name) for name in maker.wrappers if name not in OBSERVERS)]
@@ -134,6 +135,16 @@ def _spec_fields(spec: EnvSpec) -> tuple[dict[str, object], str]:
         "kwargs": plain_kwargs(spec.kwargs, spec.id),
     }
     return fields, registered_by
+
+
+def _registered(spec: object) -> dict[str, object]:
+    """Return the arguments and the step limit that are registered for the id of a specification."""
+    known = gymnasium.registry.get(spec.id) if isinstance(spec, EnvSpec) else None
+    if known is None:
+        return {}
+    kwargs = {name: value for name, value in known.kwargs.items() if is_plain(value)}
+    plain = json.loads(json.dumps(kwargs, default=plain_number))
+    return {"kwargs": plain, "max_episode_steps": known.max_episode_steps}
 
 
 def _own_fields(base: object, assumed: list[str]) -> tuple[dict[str, object], str]:

@@ -9,7 +9,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from runner.errors import RecordingError
 from runner.util.values import MAX_TEXT, is_text, is_too_deep, is_whole
@@ -84,6 +84,8 @@ class EnvironmentMaker:
     has those of their attributes, or the default values."""
     inner_wrappers: int = 0
     """How many wrappers the registered function adds itself, which are not in `spec`."""
+    registered: Mapping[str, Any] = field(default_factory=dict)
+    """`kwargs` and `max_episode_steps` that are registered for the id; empty if it is not registered."""
     vector: VectorMaker | None = None
     packages: Mapping[str, str] = field(default_factory=dict)
     """The versions of the distributions that determine what the environment does, by name."""
@@ -118,6 +120,7 @@ def parse_maker(values: Mapping[str, object], where: str) -> EnvironmentMaker:
         wrappers=check.names("wrappers"),
         assumed=check.names("assumed"),
         inner_wrappers=check.whole("inner_wrappers"),
+        registered=check.object("registered"),
         vector=None if vector is None else _parse_vector(vector, f"{where}: the vector's {MAKER_RECORD}"),
         packages=check.versions("packages"),
         platform=check.text("platform", MAX_TEXT),
@@ -170,6 +173,15 @@ class _Check:
             value = None
         self.require(key, isinstance(value, kind) and not is_too_deep(value))
         return text
+
+    def object(self, key: str) -> Mapping[str, Any]:
+        """Return an object of bounded size; an empty one if it is missing, as in earlier recordings."""
+        value = self.values.get(key, {})
+        self.require(key, isinstance(value, Mapping) and not is_too_deep(value))
+        self.require(key, isinstance(value.get("kwargs", {}), Mapping))
+        limit = value.get("max_episode_steps")
+        self.require(key, limit is None or is_whole(limit, 1, 2**62))
+        return dict(value)
 
     def whole(self, key: str) -> int:
         """Return a number from 0; 0 if it is missing, as in earlier recordings."""

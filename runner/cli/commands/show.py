@@ -192,6 +192,7 @@ def _head(details: RunDetails) -> dict[str, str]:
         "error": summary.error or "",
         "branch": "" if origin is None else f"of run {origin.run} {origin}",
         "processes": _processes(details.shards),
+        "environment": str(details.environment or ""),
         "steps": steps,
         "time": time,
         "digest": summary.content_digest or f"{UNKNOWN} (written when a run ends properly)",

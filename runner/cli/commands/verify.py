@@ -106,6 +106,7 @@ def verify_command(
 def _rows(found: Verification, run: Run | None) -> dict[str, str]:
     """Return a verdict and all that belongs to it, as text by name."""
     rows = {"recording": str(found.path), "verdict": _verdict(found), "first": found.finding}
+    rows["environment"] = str(found.composition or "")
     if found.verdict == "interrupted" and run is not None and run.can_train_again:
         rows["next"] = f"`{command_for(run, 'resume')}` continues from there"
     if found.reason:
@@ -172,6 +173,7 @@ def _as_json(found: Verification) -> dict[str, object]:
         "path": str(found.path.absolute()),
         **values,
         **texts,
+        "environment": None if found.composition is None else found.composition.as_json(),
         "difference": difference,
         "changes": changes,
     }

@@ -30,6 +30,7 @@ from runner.export.reports.maps import MapRow, maps_of, stages_of
 from runner.export.reports.playback import MAX_VALUES, playback_of, titled
 from runner.export.reports.rendering import LegendEntry, View, embedded, render, templates
 from runner.recording import schema
+from runner.recording.composition import composition_of
 from runner.recording.metrics import METRICS, Metric
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import RecentTraining
@@ -203,7 +204,7 @@ def _facts(recording: Recording) -> dict[str, str]:
     steps, trial_steps = map(recording.step_count, ("train", "eval"))
     if recording.can_train_again:
         facts = {
-            "Environment": config["env"]["id"],
+            "Environment": composition_of(recording),
             "Algorithm": spoken(config["algorithm"]),
             "Tables": f"{spoken(config['tables'])}, reward: {config['rewards']}",
             "Training": f"{episodes:,} of {config['episodes']:,} episodes, {steps:,} steps recorded",
@@ -216,7 +217,7 @@ def _facts(recording: Recording) -> dict[str, str]:
         spaces = {name: space["type"] for name, space in recording.spaces.items()}
         parallel = f", {recording.environments} in parallel" if recording.environments > 1 else ""
         facts = {
-            "Environment": f"{config['env']['id']}{parallel}",
+            "Environment": f"{composition_of(recording)}{parallel}",
             "Recorded": f"from a loop, by {config['made_by']}",
             "Spaces": f"observation {spaces['observation']}, action {spaces['action']}",
             "Training": f"{episodes:,} episodes, {steps:,} steps",

@@ -11,6 +11,7 @@ from runner.analysis.qtable import recorded_tables
 from runner.errors import RecordingError
 from runner.export.reports.rendering import View
 from runner.recording import schema
+from runner.recording.composition import composition_of
 from runner.recording.description import has_environment
 from runner.recording.metrics import EvaluationMetric
 from runner.recording.reader import open_recording
@@ -105,6 +106,13 @@ def loop_results(run: Run) -> Summary:
             return loop_summary(recording)
     except RecordingError:
         return Summary()
+
+
+def environment_of(run: Run) -> str:
+    """Return what a run's environment consists of; empty if it has none, or cannot be read."""
+    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
+        return str(composition_of(recording)) if has_environment(recording.config) else ""
+    return ""
 
 
 def result_of(metric: EvaluationMetric, evaluation: EvaluationMetrics) -> tuple[str, str]:

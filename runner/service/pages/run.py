@@ -42,7 +42,7 @@ from runner.service.dependencies import (
     SettingsOf,
 )
 from runner.service.jobs.queue import JobQueue
-from runner.service.pages.frame import RunView, has_tables, head_of, loop_results, result_of
+from runner.service.pages.frame import RunView, environment_of, has_tables, head_of, loop_results, result_of
 from runner.service.pages.rendering import Form, message_of, page
 from runner.service.settings import Settings
 from runner.util import humanize
@@ -224,7 +224,8 @@ def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:
         "Training episodes": humanize.number(episodes, 0),
         "Training steps": humanize.number(summary.get("train_steps"), 0),
     }
-    facts = _results(run, EvaluationMetrics.of(summary.get("last_evaluation") or {})) | {
+    facts = {"Environment": environment} if (environment := environment_of(run)) else {}
+    facts |= _results(run, EvaluationMetrics.of(summary.get("last_evaluation") or {})) | {
         **(taken if has_environment(run.file.config) else {}),
         **({"Evaluation steps": humanize.number(trial_steps, 0)} if trial_steps or live else {}),
         "Time": _duration(run),
