@@ -13,6 +13,7 @@ without a traceback and exits with `exit_code`.
     ├── Diverged             a recording differs from what its job produces
     ├── RunNotFound          no run, or more than one, matches a name
     ├── StorageError         a file or folder cannot be written, or the disk is full
+    ├── OutOfResources       the system gives no more memory or open files
     └── MissingExtra         an optional package is not installed
 """
 
@@ -114,6 +115,12 @@ class RunNotFound(RunnerError):
 
 class StorageError(RunnerError):
     """A file or folder cannot be written, or the disk is full."""
+
+    exit_code = ExitCode.DIFFERENT
+
+
+class OutOfResources(RunnerError):
+    """The system gives this process no more memory, threads or open files."""
 
     exit_code = ExitCode.DIFFERENT
 

@@ -18,7 +18,7 @@ from typing import IO, Final
 import click
 
 from runner.cli.command import Group
-from runner.errors import ConfigError, ConfigProblem, ExitCode, RunnerError, StorageError
+from runner.errors import ConfigError, ConfigProblem, ExitCode, OutOfResources, RunnerError, StorageError
 from runner.util import __version__
 from runner.util.humanize import printable
 
@@ -78,6 +78,8 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
 """Section -> command -> its module in `runner.cli.commands`, and its short help."""
 
 _DISK_FULL: Final = tuple(getattr(errno, name) for name in ("ENOSPC", "EDQUOT") if hasattr(errno, name))
+_NO_THREAD: Final = "can't start new thread"
+"""Python's message where the system gives no thread, which has no class of its own."""
 
 _WRONG_PATH: Final = (
     errno.ENOENT,
@@ -145,6 +147,26 @@ def exit_code_of(error: RunnerError) -> int:
     return error.exit_code
 
 
+def _of_the_system(error: Exception) -> RunnerError | None:
+    """Return the error of our own for one of the system: a full disk, too little memory, too many files."""
+    number, limit = error.errno if isinstance(error, OSError) else None, ""
+    if number in _DISK_FULL and isinstance(error, OSError):
+        return StorageError(f"{error.filename or 'stdout'}: {error.strerror}.")
+    if number in (errno.EMFILE, errno.ENFILE):
+        limit = "more open files (`ulimit -n`)"
+    elif number in (errno.ENOMEM, errno.EAGAIN) or isinstance(error, MemoryError) or _NO_THREAD in str(error):
+        limit = "more memory (`ulimit -v`) and processes (`ulimit -u`)"
+    elif isinstance(error, OSError) and number is None and "load shared object" in str(error):
+        limit = "more memory (`ulimit -v`), or install the package again"
+    if not limit:
+        return None
+    reason = (str(error) or type(error).__name__).partition(". ")[0]
+    found = OutOfResources(f"the system refused: {reason}. Allow {limit}.")
+    for note in getattr(error, "__notes__", []):
+        found.add_note(note)
+    return found
+
+
 def error_as_json(message: str, exit_code: int, problems: Sequence[ConfigProblem] = (), **more: str) -> str:
     """Return an error as a line of JSON, in the form of the service's API, with further keys."""
     located = [problem._asdict() for problem in problems]
@@ -194,11 +216,10 @@ class LazyGroup(Group):
             raise click.exceptions.Exit(ExitCode.OK) from None
         except RunnerError as error:
             raise Failure(error, as_json) from error
-        except OSError as error:
-            if error.errno not in _DISK_FULL:
+        except (OSError, MemoryError, RuntimeError) as error:
+            if (understood := _of_the_system(error)) is None:
                 raise
-            full = StorageError(f"{error.filename or 'stdout'}: {error.strerror}.")
-            raise Failure(full, as_json) from error
+            raise Failure(understood, as_json) from error
         except click.exceptions.NoArgsIsHelpError:
             raise
         except click.ClickException as error:

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import errno
 import json
+import subprocess
+import sys
 
+import gymnasium
 import pytest
 
+import runner
 from runner.cli import exit_code_of
 from runner.errors import StorageError
 
@@ -87,3 +91,25 @@ def test_parent_folders_of_output_are_created(recorded, tmp_path):
     assert path.is_file()
     (tmp_path / "file").touch()
     assert recorded("plot", "tiny", "-o", tmp_path / "file" / "plot.svg").exit_code == 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of the system")
+@pytest.mark.parametrize(
+    ("limit", "value", "expected"), [("RLIMIT_AS", 300 << 20, "memory"), ("RLIMIT_NOFILE", 8, "open files")]
+)
+def test_a_limit_of_the_system_is_an_error_without_a_traceback(tmp_path, limit, value, expected):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="cart") as rec:
+        rec.reset(seed=0)
+        rec.step(0)
+    code = (
+        "import resource, sys; from runner.cli import main; sys.argv[0] = 'dualtaxi';"
+        f"resource.setrlimit(resource.{limit}, ({value}, {value})); main()"
+    )
+    words = ["verify", rec.run.run_id, "--recordings", str(tmp_path)]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert "Traceback" not in done.stderr
+    assert expected in done.stderr.splitlines()[-1]
+    assert done.stderr.splitlines()[-1].startswith("Error: ")
+    assert done.returncode == 1
