@@ -218,3 +218,12 @@ def test_the_steps_of_a_run_are_in_the_range_of_the_estimate(command):
     (run,) = list_runs(command.recordings)
     steps = run.summary["train_steps"] + run.summary["eval_steps"]
     assert float(low) * 1000 <= steps <= float(high) * 1000
+
+
+def test_a_branch_of_training_names_the_recorded_action(command, tiny):
+    command("run", tiny)
+    action = json.loads(command("play", "tiny", "--episode", 1, "--json").stdout.splitlines()[2])["action"]
+    for number, is_recorded in ((action, True), ((action + 1) % 36, False)):
+        done = command("branch", "tiny", "--at", "1:2", "--action", number, "--name", f"branch{number}")
+        assert done.exit_code == 0, done.output
+        assert (f"{number} is the recorded action at 1:2" in done.stderr) == is_recorded
