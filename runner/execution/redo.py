@@ -52,13 +52,13 @@ def rerun_loop(
     A difference counts if it comes out again in other processes, with other hash seeds and a later clock.
 
     Args:
-        checked: the result of checking the file, which is returned if it is not sound, not of a loop, or of
-            one that was interrupted before its first step.
+        checked: the result of checking the file, which is returned if it is not sound, or of a loop that was
+            interrupted before its first step.
         sample: how many episodes to rerun, at even distances; None for all that happened.
         tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
     """
     is_empty = checked.verdict == "interrupted" and not checked.train_steps + checked.eval_steps
-    if is_empty or not (checked.is_loop and checked.sound):
+    if is_empty or not checked.sound:
         return checked
     with open_recording(checked.path) as recording:
         if reason := why_not_redone(recording, trust):

@@ -238,7 +238,7 @@ def _require_actions(run: Run, trust: bool) -> None:
     with open_recording(run.recording) as recording:
         if not recording.has_actions:
             raise RunnerError(
-                f"run {run.run_id} was recorded without its actions, so its steps cannot be done again."
+                f"run {run.run_id} was recorded without its actions, so its environment cannot be rerun."
             )
         if recording.result.content_digest is None:
             raise RunnerError(

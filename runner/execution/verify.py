@@ -29,7 +29,6 @@ from runner.errors import (
     RunnerError,
 )
 from runner.execution.initial_tables import recorded_tables
-from runner.execution.redo import rerun_loop
 from runner.execution.session import Report, Session, recorder_for
 from runner.execution.verification import (
     CIRCUMSTANCES,
@@ -79,7 +78,11 @@ def verify(
         RecordingError: there is no such file, or it is not a dualtaxi recording.
     """
     found = check(path, damage_of(path), bool(rerun), report, trust)
-    return found if rerun is False else rerun_loop(found, sample, tolerance, trust)
+    if rerun is False or not found.is_loop:
+        return found
+    from runner.execution.redo import rerun_loop  # slow to import
+
+    return rerun_loop(found, sample, tolerance, trust)
 
 
 def damage_of(path: Path, report: BytesReport = lambda *_: None) -> RecordingError | None:
@@ -137,9 +140,10 @@ def check(
 
 
 def _states_its_end(path: Path) -> bool:
-    """Return whether the run of a recording is stated to have finished: then its file is whole."""
+    """Return whether the run of a recording was closed, as `run.json` states: then its file was whole."""
     with contextlib.suppress(RunnerError):
-        return run_at(path).file.status == "finished"
+        run = run_at(path).file
+        return run.status != "running" and run.summary.content_digest is not None
     return False
 
 

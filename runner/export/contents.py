@@ -51,7 +51,7 @@ def shortcomings(recording: Recording) -> list[str]:
 def require_steps(recording: Recording, purpose: str, may_redo: bool = False) -> None:
     """Refuse a recording without steps for a purpose, such as `play`.
 
-    With `may_redo` recorded actions are enough, as their steps are done again.
+    With `may_redo` recorded actions are enough, as their environment is rerun.
 
     Raises:
         RecordingError: it has none.
@@ -63,7 +63,9 @@ def require_steps(recording: Recording, purpose: str, may_redo: bool = False) ->
 def why_no_steps(recording: Recording) -> str:
     """Return why a recording has no steps, and the command that records them, if there is one."""
     if recording.leaves_out_steps and not (recording.can_train_again or recording.has_actions):
-        return "they were left out (steps: none), and without its actions a loop's steps cannot be done again"
+        return (
+            "they were left out (steps: none), and without its actions a loop's environment cannot be rerun"
+        )
     if recording.leaves_out_steps:
         return (
             f"they were left out (steps: {recording.config['recording']['steps']}); "

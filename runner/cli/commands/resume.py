@@ -101,7 +101,7 @@ def rerecord_command(
     had_steps = (is_loop or run.status == "finished") and holds_steps(run)
     if is_loop:
         steps = (run.summary.train_steps or 0) + (run.summary.eval_steps or 0)
-        with count_line("steps done again", steps) as count:
+        with count_line("steps rerun", steps) as count:
             run = rerecord(run, trust=trust, count=count)
     else:
         with job_progress("", run.episodes_to_do or 0) as (report, interrupt):

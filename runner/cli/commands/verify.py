@@ -72,7 +72,6 @@ def verify_command(
       dualtaxi verify k3v9m2xq --sample 20 --tolerance 1e-6
       dualtaxi verify backup/recording.mcap --json
     """
-    from runner.execution.redo import rerun_loop
     from runner.execution.verification import Verification
     from runner.execution.verify import check, damage_of
 
@@ -92,7 +91,9 @@ def verify_command(
             damage = damage_of(path, reading)
         with job_progress("verifying", episodes) as (report, _):
             found = check(path, damage, bool(rerun), report, trust)
-    if rerun is not False:
+    if found.is_loop and rerun is not False:
+        from runner.execution.redo import rerun_loop  # slow to import
+
         with count_line("steps rerun", 0 if sample else found.train_steps + found.eval_steps) as count:
             found = rerun_loop(found, sample, tolerance, trust, count)
     if as_json:

@@ -200,7 +200,7 @@ def test_without_actions_nothing_comes_again(tmp_path):
     assert (redone.verdict, redone.reason) == ("consistent", "No steps were recorded.")
     shown = CliRunner().invoke(cli, ["play", run.run_id, "--recordings", str(tmp_path)])
     assert shown.exit_code
-    assert "without its actions a loop's steps cannot be done again" in " ".join(shown.output.split())
+    assert "without its actions a loop's environment cannot be rerun" in " ".join(shown.output.split())
     assert "rerecord" not in shown.output
 
 
