@@ -136,7 +136,8 @@ def check(
         return replace(found, verdict="interrupted", content_digest="", notes=(*found.notes, note))
     if found.sound:
         return replace(found, verdict="damaged", finding=f"{damage}{unreadable}", content_digest="")
-    return replace(found, verdict="damaged", notes=(*found.notes, str(damage)))
+    verdict = found.verdict if is_cut else "damaged"
+    return replace(found, verdict=verdict, notes=(*found.notes, str(damage)))
 
 
 def _states_its_end(path: Path) -> bool:

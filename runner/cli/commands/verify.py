@@ -13,7 +13,7 @@ from runner.cli.options import json_option, recordings_option, run_argument, tru
 from runner.cli.output import draw, facts, print_json
 from runner.cli.parameter_types import COUNT
 from runner.cli.progress import bytes_line, count_line
-from runner.cli.runs import command_for, find, find_recording, folded, job_progress, require_over
+from runner.cli.runs import command_for, find_recording, folded, job_progress, require_over
 from runner.errors import Diverged, ExitCode, RunnerError
 from runner.runs.locking import locked
 from runner.runs.run import Run
@@ -72,25 +72,17 @@ def verify_command(
       dualtaxi verify k3v9m2xq --sample 20 --tolerance 1e-6
       dualtaxi verify backup/recording.mcap --json
     """
-    from runner.execution.verification import Verification
     from runner.execution.verify import check, damage_of
 
-    try:
-        path, run = find_recording(run_name, recordings)
-    except RunnerError:
-        run = find(run_name, recordings)
-        if run.status != "interrupted":
-            raise
-        found = Verification(run.recording, "interrupted")  # it ended before it had a recording
-    else:
-        require_over(run)
-        if run is not None and (shards := shards_in_words(run)):
-            raise RunnerError(f"run {run.run_id} is not complete: {shards} of it could not be added.")
-        episodes = (run.episodes_to_do or 0) if run else 0
-        with bytes_line("reading") as reading:
-            damage = damage_of(path, reading)
-        with job_progress("verifying", episodes) as (report, _):
-            found = check(path, damage, bool(rerun), report, trust)
+    path, run = find_recording(run_name, recordings)
+    require_over(run)
+    if run is not None and (shards := shards_in_words(run)):
+        raise RunnerError(f"run {run.run_id} is not complete: {shards} of it could not be added.")
+    episodes = (run.episodes_to_do or 0) if run else 0
+    with bytes_line("reading") as reading:
+        damage = damage_of(path, reading)
+    with job_progress("verifying", episodes) as (report, _):
+        found = check(path, damage, bool(rerun), report, trust)
     if found.is_loop and rerun is not False:
         from runner.execution.redo import rerun_loop  # slow to import
 
