@@ -2,6 +2,7 @@
 
     recordings/k3v9m2xq/run.json         id, name, configuration, owner, status, summary
     recordings/k3v9m2xq/labels.json      another name, tags, a note
+    recordings/k3v9m2xq/trust.json       the mark of a run that this user recorded, see `runner.runs.marks`
     recordings/k3v9m2xq/recording.mcap   everything else
 
 `run.json` is written before anything heavy is imported, and only ever replaced as a whole. Its status was

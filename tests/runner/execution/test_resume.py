@@ -58,7 +58,8 @@ def assert_same(done: Run, whole: Run) -> None:
     found = verify.verify(done.recording)
     assert found.sound, found.finding
     assert found.content_digest == whole.summary["content_digest"]
-    assert {path.name for path in done.folder.iterdir()} <= {"run.json", "recording.mcap", "owner.lock"}
+    files = {path.name for path in done.folder.iterdir()}
+    assert files <= {"run.json", "recording.mcap", "owner.lock", "trust.json"}
 
 
 @pytest.mark.parametrize("share", [0, 1e-4, 0.05, 0.2, 0.4, 0.6, 0.75, 0.9, 0.97, 0.99, 0.9999])
