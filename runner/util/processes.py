@@ -159,8 +159,8 @@ class ChildProcess:
             context = multiprocessing.get_context("spawn")
         context = context or process_context()
         self._pipe, theirs = context.Pipe()
-        is_own_only = os.environ.get(OWN_ONLY, "")
-        self._process = context.Process(target=_serve, args=(theirs, memory_bytes, is_own_only), daemon=True)
+        variables = _own_variables()
+        self._process = context.Process(target=_serve, args=(theirs, memory_bytes, variables), daemon=True)
         try:
             with starting_processes(with_main=False, hash_seed=hash_seed):
                 self._process.start()
@@ -262,9 +262,15 @@ class ChildProcess:
         self._pipe.close()
 
 
-def _serve(pipe: Any, memory_bytes: int, is_own_only: str) -> None:
+def _own_variables() -> dict[str, str]:
+    return {name: value for name, value in os.environ.items() if name.startswith("DUALTAXI_")}
+
+
+def _serve(pipe: Any, memory_bytes: int, variables: Mapping[str, str]) -> None:
     """Call functions that come through a pipe, and send what they return, until it is closed."""
-    os.environ[OWN_ONLY] = is_own_only
+    for name in _own_variables():  # as they were when the fork server began
+        del os.environ[name]
+    os.environ.update(variables)
     global _pipe_to_parent  # noqa: PLW0603 - one pipe for the whole process
     _pipe_to_parent = pipe
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent to act on

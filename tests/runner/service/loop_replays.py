@@ -14,6 +14,7 @@ from starlette.testclient import TestClient
 
 import runner
 from runner.recording.reader import open_recording
+from runner.runs.marks import MARK_FILE
 from runner.runs.resolve import find_run
 from runner.service.app import create_app
 from runner.service.settings import Settings
@@ -48,6 +49,7 @@ def record_loops(folder: Path) -> None:
     play(gymnasium.make("CartPole-v1"), folder, "pole")
     play(gymnasium.make("CartPole-v1", render_mode="rgb_array"), folder, "framed", frames_every=3)
     play(Rooms(with_text=True), folder, "rooms")
+    (find_run("rooms", folder).folder / MARK_FILE).unlink()  # as of one that was pushed
     with runner.record_vector(
         SyncVectorEnv([lambda: gymnasium.make("CartPole-v1")] * 3), folder, name="poles"
     ) as rec:

@@ -104,7 +104,7 @@ def test_extras_are_shown_before_the_step_that_they_were_recorded_with(tmp_path)
 
 
 def test_without_a_picture_the_page_gives_the_reason_and_the_values(loops_client):
-    """An environment of the user's own is not imported."""
+    """An environment of somebody else's own is not imported."""
     known = set(sys.modules)
     text = page(loops_client, "/runs/rooms/replay/train/0?t=2")
     assert "There is no picture." in text
