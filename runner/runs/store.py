@@ -137,9 +137,9 @@ class Store:
 
     def only_of(self, runs: Iterable[str]) -> dict[str, int]:
         """Return the contents that only these runs refer to, with their bytes."""
-        leaving = set(runs)
-        staying = {digest for run in self.runs() if run not in leaving for digest in self.of_run(run)}
-        own = {digest for run in leaving for digest in self.of_run(run)}
+        leaving, known = set(runs), set(self.runs())
+        staying = {digest for run in known - leaving for digest in self.of_run(run)}
+        own = {digest for run in known & leaving for digest in self.of_run(run)}
         return {digest: self._size(digest) for digest in sorted(own - staying)}
 
     def drop(self, run: str) -> int:

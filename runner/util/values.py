@@ -16,6 +16,7 @@ JsonView = Mapping[str, Any]
 """The same, only to be read."""
 MAX_TEXT: Final = 200
 """The most characters of a short text."""
+_PLAIN: Final = frozenset((str, int, float, bool, type(None)))
 MAX_JSON_DEPTH: Final = 100
 """How deep the values of a JSON file may be nested."""
 NAME_PATTERN: Final = r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}$"
@@ -104,7 +105,8 @@ def is_too_deep(value: object, depth: int = 0) -> bool:
                 inner += item.values()
             elif isinstance(item, list):
                 inner += item
-        level, depth = [item for item in inner if isinstance(item, Mapping | list)], depth + 1
+        parts = (item for item in inner if item.__class__ not in _PLAIN)
+        level, depth = [item for item in parts if isinstance(item, Mapping | list)], depth + 1
     return False
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
 from itertools import islice
@@ -148,7 +148,7 @@ def row_of(run: Run, size: int | None) -> dict[str, object]:
         "host": text(run.file.provenance.get("host") or run.file.owner.get("host")),
         "git": text(run.file.provenance.get("git")),
         "archive": text(run.archive.target or None),
-        "settings": json.dumps(dict(_flat(config))),
+        "settings": json.dumps(_flat(config)),
     }
 
 
@@ -186,17 +186,24 @@ def number(value: object) -> float | None:
         return None
 
 
-def _flat(value: object, path: str = "", depth: int = 0) -> Iterator[tuple[str, object]]:
-    """Yield the plain values in a configuration by dotted path; items of lists by their position."""
-    if isinstance(value, Mapping | list):
-        parts = enumerate(value) if isinstance(value, list) else value.items()
-        for (key, part), _ in zip(parts, range(_TEXT), strict=False):
-            if depth < _DEPTH:
-                yield from _flat(part, f"{path}.{key}" if path else str(key), depth + 1)
-    elif isinstance(value, str):
-        yield path, text(value)
-    elif value is None or isinstance(value, bool) or number(value) is not None:
-        yield path, value
+def _flat(config: Mapping[str, object]) -> dict[str, object]:
+    """Return the plain values in a configuration by dotted path; items of lists by their position."""
+    flat: dict[str, object] = {}
+
+    def put(parts: Iterable[tuple[object, object]], path: str, depth: int) -> None:
+        for key, value in islice(parts, _TEXT):
+            here, kind = f"{path}{key}", value.__class__
+            if kind is dict or kind is list:
+                if depth < _DEPTH:
+                    inside: Any = value
+                    put(enumerate(inside) if kind is list else inside.items(), f"{here}.", depth + 1)
+            elif kind is str:
+                flat[here] = text(value)
+            elif value is None or kind is bool or number(value) is not None:
+                flat[here] = value
+
+    put(config.items(), "", 1)
+    return flat
 
 
 class Candidate(NamedTuple):
