@@ -6,11 +6,17 @@ import contextlib
 import fnmatch
 import secrets
 import shutil
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Final
 
 from runner.errors import RunnerError, StorageError
 from runner.util.files import replacing, storage_errors
+
+_MARK: Final = "dualtaxi-export-"
+"""What the names of temporary files begin with, after the dot."""
+_IDLE_SECONDS: Final = 3600
 
 
 def write_new(path: Path, force: bool, write: Callable[[Path], object]) -> None:
@@ -25,8 +31,17 @@ def write_new(path: Path, force: bool, write: Callable[[Path], object]) -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
         except FileExistsError as error:
             raise StorageError(f"{path}: {path.parent} is a file, expected a folder.") from error
-        with replacing(path) as temporary:
+        _remove_left_over(path.parent)
+        with replacing(path, _MARK) as temporary:
             write(temporary)
+
+
+def _remove_left_over(folder: Path) -> None:
+    """Remove the temporary files of killed exports: those that nothing was written to for an hour."""
+    for file in folder.glob(f".{_MARK}*"):
+        with contextlib.suppress(OSError):
+            if not file.is_dir() and time.time() - file.lstat().st_mtime > _IDLE_SECONDS:
+                file.unlink()
 
 
 def require_new(path: Path, force: bool) -> None:

@@ -125,15 +125,18 @@ def write_all(descriptor: int, data: bytes) -> None:
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, mark: str = "") -> Iterator[Path]:
     """Yield a free, hidden path in the same folder; the file written there then replaces the one at `path`.
 
     A reader sees the old file or the new one. If the block fails, the old one stays.
 
+    Args:
+        mark: what the hidden name begins with.
+
     Raises:
         OSError: the file cannot be replaced.
     """
-    fresh = path.with_name(f".{secrets.token_hex(4)}.{path.name}")
+    fresh = path.with_name(f".{mark}{secrets.token_hex(4)}.{path.name}")
     try:
         yield fresh
         fresh.replace(path)
