@@ -19,8 +19,6 @@ from runner.recording.run_file import EvaluationMetrics, Summary
 from runner.util import humanize
 from runner.util.values import finite
 
-"""Training episodes that the summary of a loop averages, the last ones."""
-
 
 @dataclass(frozen=True)
 class TrainingRecord:

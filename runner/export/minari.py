@@ -182,8 +182,8 @@ def _environment_spec(
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            made = {"id": env_id, "kwargs": kwargs, "rewards": recording.config.get("rewards")}
-            require_may_train(recording.path, {"env": made, "rewards": made["rewards"]})
+            made = {"env": {"id": env_id, "kwargs": kwargs}, "rewards": recording.config.get("rewards")}
+            require_may_train(recording.path, made)
             env = gymnasium.make(env_id, **kwargs)
             env.close()
     except Exception as error:  # an environment may raise anything

@@ -205,8 +205,9 @@ def require_listed(env_id: str, kwargs: Mapping[str, object]) -> None:
     if module:
         with contextlib.suppress(ImportError):  # the environment's own error says more
             importlib.import_module(module)
-    if (registered := gymnasium.registry.get(name)) is not None:
-        require_registered_arguments(name, registered, kwargs)
+    for registered in list(gymnasium.registry.values()):
+        if name in (registered.id, registered.id.rpartition("-v")[0]):  # without a version: its newest one
+            require_registered_arguments(name, registered, kwargs)
 
 
 def require_registered_arguments(

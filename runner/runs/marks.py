@@ -18,13 +18,13 @@ import secrets
 import sys
 import sysconfig
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
 from runner.recording.maker import EnvironmentMaker
-from runner.util.files import open_regular, read_object
+from runner.util.files import open_regular, read_object, write_object
 from runner.util.values import JsonView
 
 MARK_FILE: Final = "trust.json"
@@ -78,27 +78,14 @@ def mark(folder: Path, environment: EnvironmentMaker | JsonView | None) -> None:
     if digest in before.environments:
         return
     folders, script = _own_places(text)
-    digests = {"script_digest": _digest_of(script)} if script else {"script_digest": before.script_digest}
-    added = Mark(
-        (*before.environments, digest),
-        tuple(dict.fromkeys([*before.folders, *folders])),
-        script or before.script,
-        **digests,
-    )
-    _write(folder, added, key)
+    _write(folder, [Mark((digest,), tuple(folders), script, _digest_of(script)), before], key)
 
 
 def merge_marks(folder: Path, others: list[Path]) -> None:
     """Add to a run's mark what the marks in other folders state; those that do not hold state nothing."""
     marks = [mark_of(place) for place in (folder, *others)]
-    if (key := _key(False)) is None or not any(one.environments for one in marks):
-        return
-    environments, folders = (
-        tuple(dict.fromkeys(text for one in marks for text in getattr(one, name)))
-        for name in ("environments", "folders")
-    )
-    script = next((one for one in marks if one.script), Mark())
-    _write(folder, Mark(environments, folders, script.script, script.script_digest), key)
+    if any(one.environments for one in marks) and (key := _key(False)) is not None:
+        _write(folder, marks, key)
 
 
 def mark_of(folder: Path) -> Mark:
@@ -179,7 +166,7 @@ def _stdlib() -> tuple[str, ...]:
 
 
 def _digest_of(script: str) -> str:
-    with contextlib.suppress(OSError), open_regular(script) as stream:
+    with contextlib.suppress(OSError), open_regular(script) as stream:  # "" is no file
         return hashlib.sha256(stream.read()).hexdigest()
     return ""
 
@@ -189,11 +176,17 @@ def _seal(values: Mapping[str, object], key: bytes) -> str:
     return hashlib.blake2b(text.encode(), key=key, digest_size=32, person=b"dualtaxi.mark").hexdigest()
 
 
-def _write(folder: Path, marked: Mark, key: bytes) -> None:
-    values = asdict(marked) | {"environments": list(marked.environments), "folders": list(marked.folders)}
+def _write(folder: Path, marks: list[Mark], key: bytes) -> None:
+    """Replace a run's mark by one that states what these state; the first script among them counts."""
+    script = next((one for one in marks if one.script), Mark())
+    values: dict[str, object] = {
+        "environments": list(dict.fromkeys(digest for one in marks for digest in one.environments)),
+        "folders": list(dict.fromkeys(path for one in marks for path in one.folders)),
+        "script": script.script,
+        "script_digest": script.script_digest,
+    }
     with contextlib.suppress(OSError, ValueError):  # a path may be no text
-        text = json.dumps(values | {"seal": _seal(values, key)})
-        (folder / MARK_FILE).write_text(text, encoding="utf-8")
+        write_object(folder / MARK_FILE, values | {"seal": _seal(values, key)})
 
 
 def _key(is_needed: bool) -> bytes | None:

@@ -69,8 +69,8 @@ def importing_from(folders: Sequence[str], is_for_good: bool = False) -> Iterato
     try:
         yield
     finally:
-        for folder in () if is_for_good else added:
-            sys.path.remove(folder)
+        if not is_for_good:
+            sys.path[:] = [folder for folder in sys.path if folder not in added]
 
 
 @contextlib.contextmanager

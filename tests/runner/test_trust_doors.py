@@ -29,6 +29,7 @@ from runner.recording.reader import open_recording
 from runner.recording.rewriting import rewrite
 from runner.replay.environment import redo
 from runner.replay.makers import make_environment, make_vector
+from runner.replay.trust import require_listed
 from runner.runs.marks import MARK_FILE
 from runner.runs.run import Run
 from runner.service.app import create_app
@@ -400,6 +401,12 @@ def test_no_route_makes_what_a_stranger_chose(service, trap):
                 assert untouched(trap), address
                 texts.append(answer.text if "text" in answer.headers.get("content-type", "") else "")
     assert "--trust" not in "".join(texts)
+
+
+def test_an_id_without_a_version_is_judged_as_the_environment_that_it_stands_for():
+    require_listed("CartPole", {"sutton_barto_reward": True})
+    with pytest.raises(CannotRedo, match="keyword argument of CartPole"):
+        require_listed("CartPole", {"config": "trap.Env"})
 
 
 def test_of_a_strangers_loop_the_service_makes_not_even_a_known_environment(service):

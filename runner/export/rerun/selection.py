@@ -210,8 +210,8 @@ def _focus(recording: Recording, request: Request) -> tuple[int, int] | None:
             ("train", train.steps_of(_training_episodes(recording, explicit, train.lengths))),
             ("eval", evals.steps_of(np.concatenate(trials))),
         )
-        for span in spans
-        for step in (span.start, span.stop - 1)
+        if spans
+        for step in (spans[0].start, spans[-1].stop - 1)
     ]
     return (min(times), max(times)) if times else None
 

@@ -16,7 +16,7 @@ import pytest
 import runner
 from runner.execution.verify import verify
 from runner.recording.reader import open_recording
-from runner.runs.marks import KEY_FILE, MARK_FILE, Mark, _make_key, mark_of, merge_marks
+from runner.runs.marks import KEY_FILE, MARK_FILE, Mark, _make_key, mark, mark_of, merge_marks
 from runner.runs.run import Run
 
 SCRIPT = """\
@@ -157,6 +157,14 @@ def test_every_environment_of_a_run_is_marked(tmp_path):
             each.reset(seed=1)
             each.step(0)
     assert len(mark_of(env.run.folder).environments) == 2
+
+
+def test_a_mark_that_is_extended_is_replaced_at_once(own, recorded):
+    before = (own / MARK_FILE).read_bytes()
+    os.link(own / MARK_FILE, own / "earlier")
+    mark(own, {"id": "Taxi-v4"})
+    assert (own / "earlier").read_bytes() == before
+    assert set(mark_of(own).environments) > set(mark_of(recorded).environments)
 
 
 def test_a_folded_run_has_the_marks_of_its_shards_and_branches_that_of_their_parent(recorded, tmp_path):
