@@ -92,8 +92,7 @@ def resume(
     with locked(run) as current:
         if is_finished(current):
             return _with_finished_status(current)
-        require_may_train(current.recording, current.file.config, trust)
-        return _resume(current, accept_changes, report, stop)
+        return _resume(current, accept_changes, report, stop, trust)
 
 
 def require_same_makers(run: Run) -> None:
@@ -110,9 +109,10 @@ def _with_finished_status(run: Run) -> Run:
         return run.update(status="finished", summary=facts["summary"] | {"bytes": recording.size})
 
 
-def _resume(run: Run, accept_changes: bool, report: Report, stop: Stop) -> Run:
+def _resume(run: Run, accept_changes: bool, report: Report, stop: Stop, trust: bool) -> Run:
     started = time.monotonic()
     job, described = _job(run)
+    require_may_train(run.recording, job.config.to_mapping(), trust)
     if not described:
         job, run = resolve_job(job, run)
     path, contents = _place(run, described)

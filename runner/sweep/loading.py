@@ -166,7 +166,7 @@ def _with_checked_parameters(sweep: Sweep, document: Document, require: Require 
         for number, sample in enumerate(_samples(parameter)):
             try:
                 experiment = _valid_experiment(sweep, path, sample, document)
-                if number == 0 or path.startswith("env."):
+                if number == 0 or path.split(".")[0] == "env":
                     _check_environment(experiment, path, document, require)
             except ConfigError as error:
                 errors.append(error)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -23,6 +24,7 @@ import runner
 from runner.cli import cli
 from runner.config.job import identity_of
 from runner.errors import CannotRedo
+from runner.execution.resume import resume
 from runner.execution.verify import verify
 from runner.recording.maker import EnvironmentMaker, VectorMaker
 from runner.recording.reader import open_recording
@@ -309,6 +311,18 @@ def test_with_trust_the_traps_are_imported(strangers, trap):
     assert (trap / "IMPORTED").exists()
 
 
+def test_an_interrupted_job_is_resumed_only_as_its_recording_allows(strangers, lake, trap, tmp_path):
+    own = Path(shutil.copytree(strangers / "job", tmp_path / "job"))
+    size = (own / "recording.mcap").stat().st_size
+    os.truncate(own / "recording.mcap", size // 2)
+    facts = json.loads((own / "run.json").read_text())
+    facts |= {"config": lake.facts["config"], "status": "interrupted"}
+    (own / "run.json").write_text(json.dumps(facts))
+    with pytest.raises(CannotRedo, match="--trust"):
+        resume(Run(own, facts), accept_changes=True)
+    assert untouched(trap)
+
+
 def test_a_known_environment_of_a_stranger_is_made(strangers):
     assert verify(strangers / "known" / "recording.mcap").verdict == "reproduced"
 
@@ -417,8 +431,10 @@ def test_of_a_strangers_loop_the_service_makes_not_even_a_known_environment(serv
 @pytest.mark.parametrize("env", [{"id": "trap:CartPole-v1"}, {"id": "Taxi-v4", "kwargs": {"x": "trap"}}])
 def test_no_job_of_a_client_makes_what_is_not_listed(env, service, trap):
     config = {"name": "mine", "env": env, "episodes": 3}
-    sweep = {"base": config, "parameters": {"discount": [0.9, 0.8]}, "seeds": [0]}
-    for text in (config, sweep):
+    sweep = {"base": config, "parameters": {"discount": [0.9, 0.8]}, "seeds": [0], "strategy": "grid"}
+    listed = sweep | {"base": config | {"env": {"id": "Taxi-v4"}}}
+    second = listed | {"parameters": {"env": [{"id": "Taxi-v4"}, env]}}
+    for text in (config, sweep, second):
         answer = service.post("/api/v1/jobs/check", content=json.dumps(text))
         assert answer.status_code == 422, answer.text
         assert "--trust" not in answer.text
