@@ -180,7 +180,7 @@ def rebuild(recordings: tuple[Path, ...] = folders_option, as_json: bool = json_
 
     Examples:
       dualtaxi index rebuild
-      dualtaxi index rebuild --recordings /data/runs --recordings recordings
+      dualtaxi index rebuild --recordings others --recordings recordings
     """
     from runner.runs.catalogue.database import index_path
     from runner.runs.catalogue.index import look

@@ -6,6 +6,7 @@ import pkgutil
 import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import click
 import pytest
@@ -60,7 +61,9 @@ def _examples():
 
 
 @pytest.mark.parametrize("words", list(_examples()))
-def test_examples_can_be_typed(words):
+def test_examples_can_be_typed(words, own_folder):
+    for folder in ("others", "recordings"):
+        Path(folder).mkdir()
     command = cli
     while isinstance(command, click.Group):
         name, *words = words
