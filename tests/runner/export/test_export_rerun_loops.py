@@ -253,7 +253,10 @@ def test_pictures_end_where_the_environment_differs(tmp_path):
 
 
 def test_a_loop_whose_environment_cannot_be_made_again_is_exported_without_pictures(tmp_path):
-    with runner.record(Rooms(), tmp_path) as rec:
+    class Hidden(Rooms):
+        """Has no name by which it could be imported."""
+
+    with runner.record(Hidden(), tmp_path) as rec:
         list(play(rec, 30))
     with open_recording(rec.run.recording) as recording:
         exported = Exported(recording, tmp_path / "run.rrd", frames=True)
