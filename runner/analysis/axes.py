@@ -53,7 +53,7 @@ class Axis:
         """Return the length of a part of the axis in words."""
         if self.whole:
             return f"{value:,.0f} {self.title if value != 1 else self.title.removesuffix('s')}"
-        return f"{value:,.6g} {self.unit} of {self.title}".replace("  ", " ")
+        return f"{value:,.6g} {self.unit} of {self.title}" if self.unit else f"{value:,.6g} of {self.title}"
 
     def counts(self, name: str) -> bool:
         """Return whether values logged under a name are positions on the axis."""

@@ -6,7 +6,7 @@ recorded by `snapshot`, of each name the latest.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NotRequired, TypedDict
 
 import numpy as np
@@ -141,20 +141,32 @@ def _describe_snapshots(
         description["state"], description["state_in_words"] = number, str(states[number])
         description["visits"] = None if taken is None else sum(taken)
         description["values"] = [
-            {
-                "agent": table,
-                "action": action,
-                "action_in_words": name,
-                "value": float(q[number, action]),
-                "greedy": bool(q[number].argmax() == action),
-                "visits": None if taken is None else taken[action],
-                "changed_step": None,
-                "changed_episode": None,
-            }
+            value
             for table, q in tables.items()
-            for action, name in enumerate(names)
+            for value in _action_values(table, names, q[number], int(q[number].argmax()), taken)
         ]
     return description, one_array(list(tables.values()))
+
+
+def _action_values(
+    agent: str,
+    names: Iterable[object],
+    values: NDArray[np.float64],
+    greedy: int,
+    visits: Sequence[int] | None,
+) -> Iterator[ActionValue]:
+    """Yield the values of a learner's actions in a state, whose changes are not known."""
+    for action, name in enumerate(names):
+        yield {
+            "agent": agent,
+            "action": action,
+            "action_in_words": str(name),
+            "value": float(values[action]),
+            "greedy": action == greedy,
+            "visits": None if visits is None else int(visits[action]),
+            "changed_step": None,
+            "changed_episode": None,
+        }
 
 
 def _actions_taken(recording: Recording, state: int, stop: int) -> list[int] | None:
@@ -204,18 +216,12 @@ def _add_state(description: TablesDescription, recording: Recording, replay: Tab
     for i, (agent, named) in enumerate(zip(replay.agents, replay.named_tables, strict=True)):
         q = named["q"]
         names = joint if q.shape[1] == mdp.joint_actions else own[i] if own else range(q.shape[1])
-        for action, name in enumerate(names):
-            changed = int(history.changed_step[i, action])
-            value: ActionValue = {
-                "agent": agent,
-                "action": action,
-                "action_in_words": str(name),
-                "value": float(q[state, action]),
-                "greedy": bool(replay.greedy[i, state] == action),
-                "visits": int(history.visits[i, action]),
-                "changed_step": None if changed < 0 else changed,
-                "changed_episode": None if changed < 0 else int(history.changed_episode[i, action]),
-            }
+        greedy = int(replay.greedy[i, state])
+        for value in _action_values(agent, names, q[state], greedy, history.visits[i]):
+            action = value["action"]
+            if (changed := int(history.changed_step[i, action])) >= 0:
+                value["changed_step"] = changed
+                value["changed_episode"] = int(history.changed_episode[i, action])
             if "policy" in named:
                 value["policy"] = float(named["policy"][state, action])
             values.append(value)

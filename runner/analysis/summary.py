@@ -136,7 +136,7 @@ def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> Ru
                     run,
                     config if config == recording.config else recording.config,  # the former in better order
                     **done,
-                    environment=composition_of(recording) if recording.has_environment else None,
+                    environment=composition_of(recording),
                     bytes=recording.size,
                     shards=recording.shards,
                     clock=read_clock(recording),

@@ -107,7 +107,7 @@ def branch(
     report: Callable[[int], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Branch | TrainingBranch:
-    """Change one step of a recorded run, and record what follows as a run of its own, with the same luck.
+    """Change one step of a recorded run, and record what follows as a run of its own, with the same draws.
 
     The training of a job is changed at `at`, and goes on to its end: see
     `runner.execution.branching.branch_training`. For a loop, one episode is played on, in its environment

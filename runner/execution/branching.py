@@ -1,4 +1,4 @@
-"""Branch the training of a job: another action at a step, or other settings from it on, with the same luck.
+"""Branch the training of a job: another action at a step, or other settings from it on, with the same draws.
 
     branch = branch_training(run, at="120:5", action={"taxi_1": "north"}, overrides=["epsilon=0.1"])
 

@@ -71,7 +71,7 @@ def rerecord(
 ) -> Run:
     """Record the steps of a run that left them out.
 
-    A job is trained again; a loop's environment takes the recorded actions again. The new recording replaces
+    A job is retrained; a loop's environment takes the recorded actions again. The new recording replaces
     the old one when it is complete and has the same content digest. A run that has its steps is returned as
     it is.
 
@@ -229,7 +229,7 @@ def _rerecord_job(run: Run, fresh: Path, report: Report, stop: Stop) -> None:
 
 
 def _require_actions(run: Run, trust: bool) -> None:
-    """Refuse a loop whose steps cannot be done again, or whose result cannot be compared.
+    """Refuse a loop whose environment cannot be rerun, or whose result cannot be compared.
 
     Raises:
         CannotRedo: the environment cannot be had.

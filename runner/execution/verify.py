@@ -118,9 +118,8 @@ def check(
     is_cut = isinstance(damage, CutOff) and not _states_its_end(path)
     try:
         with open_recording(path) as recording:
-            composition = composition_of(recording) if recording.has_environment else None
             found = _check_content(recording, installed, report, trust)
-            found = replace(found, composition=composition)
+            found = replace(found, composition=composition_of(recording))
             unreadable = "" if damage is None or is_cut else _first_unreadable(recording)
     except (RecordingError, ConfigError) as error:
         if is_cut and not survey(path).chunks:

@@ -19,7 +19,6 @@ from runner.execution.verification import (
 from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.consistency import Findings, check_extras, check_phase
-from runner.recording.description import has_environment
 from runner.recording.digest import ContentHash, combined_digest
 from runner.recording.loop_blocks import Inconsistent, check_without_steps
 from runner.recording.reader import Recording
@@ -42,7 +41,7 @@ def verify_loop(recording: Recording) -> Verification:
         verdict="consistent" if is_over else "interrupted",
         train_steps=recording.step_count("train"),
         eval_steps=recording.step_count("eval"),
-        not_compared=LOOP_NOT_COMPARED if has_environment(recording.config) else "",
+        not_compared=LOOP_NOT_COMPARED if recording.has_environment else "",
         is_loop=True,
     )
     try:

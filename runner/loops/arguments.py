@@ -181,6 +181,7 @@ def factory_of(made: Any) -> tuple[str, dict[str, object], bool]:
             break
     else:
         raise CannotBeMade(f"the wrapper {class_name(made)} does not record its arguments")
+    path = f"{function.__module__}:{name}"
     _, *parameters = inspect.signature(function).parameters.values()
     methods = vars(local).values() if isinstance(local, type) else [local]
     cells = {
@@ -190,8 +191,7 @@ def factory_of(made: Any) -> tuple[str, dict[str, object], bool]:
     }
     kwargs = {each.name: cells[each.name].cell_contents for each in parameters if each.name in cells}
     if any(each.default is each.empty for each in parameters if each.name not in cells):
-        raise CannotBeMade(f"{function.__module__}:{name} does not record its arguments")
+        raise CannotBeMade(f"{path} does not record its arguments")
     changed = {each.argval for each in dis.get_instructions(function) if each.opname == "STORE_DEREF"}
     is_certain = len(kwargs) == len(parameters) and changed.isdisjoint(kwargs)
-    path = f"{function.__module__}:{name}"
     return path, plain_kwargs(kwargs, path), is_certain

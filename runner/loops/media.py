@@ -191,6 +191,12 @@ class Video(Media):
         self.caption = caption
 
 
+def _histogram_as_given(counts_and_edges: Any) -> dict[str, Array]:
+    if len(counts_and_edges) != 2:
+        raise ConfigError(f"histogram: found {len(counts_and_edges)} arrays, expected counts and edges")
+    return dict(zip(("counts", "edges"), map(np.asarray, counts_and_edges), strict=True))
+
+
 class Histogram(Media):
     """A histogram: of numbers, or counts and edges as `numpy.histogram` returns them."""
 
@@ -198,5 +204,4 @@ class Histogram(Media):
         if np_histogram is None:
             super().__init__(histogram_of, sequence)
         else:
-            arrays = zip(("counts", "edges"), np_histogram, strict=False)
-            super().__init__(lambda: {name: np.asarray(values) for name, values in arrays})
+            super().__init__(_histogram_as_given, np_histogram)

@@ -22,12 +22,11 @@ from runner.util.values import MAX_TEXT
 
 _SHOWS_ONLY: Final = (RecordVideo, HumanRendering, VectorRecordVideo, VectorHumanRendering)
 """Wrappers that only show or store pictures: left out when the environment is made again."""
-_SB3_ATARI: Final = "stable_baselines3.common.atari_wrappers"
 OBSERVERS: Final = frozenset(
     {
         "sb3_contrib.common.wrappers.action_masker:ActionMasker",
         "stable_baselines3.common.monitor:Monitor",
-        f"{_SB3_ATARI}:AtariWrapper",  # puts the other ones together
+        "stable_baselines3.common.atari_wrappers:AtariWrapper",  # puts the other ones together
     }
 )
 """Wrappers of Stable-Baselines3 that themselves change no observation, reward or end: left out, too."""
@@ -131,13 +130,11 @@ def entry_point_of(value: object) -> str:
     Raises:
         CannotBeMade: it cannot be imported by such a name.
     """
-    text = value if isinstance(value, str) else ""
-    if not text and callable(value):
-        module, name = getattr(value, "__module__", None), getattr(value, "__qualname__", "?")
-        if getattr(sys.modules.get(str(module)), name, None) is value:
-            text = f"{module}:{name}"
-    if not FUNCTION_NAME.fullmatch(text) or "." in text.partition(":")[2]:
-        raise CannotBeMade(f"{name_of(value)} cannot be imported by name"[:MAX_TEXT])
-    if text.startswith(f"{MAIN}:") and not getattr(sys.modules[MAIN], "__file__", None):
+    text = name_of(value)
+    module, _, name = text.partition(":")
+    is_there = isinstance(value, str) or getattr(sys.modules.get(module), name, None) is value
+    if not is_there or not FUNCTION_NAME.fullmatch(text) or "." in name:
+        raise CannotBeMade(f"{text} cannot be imported by name"[:MAX_TEXT])
+    if module == MAIN and not getattr(sys.modules[MAIN], "__file__", None):
         raise CannotBeMade(f"{text} is defined in no file")
     return text

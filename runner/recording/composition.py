@@ -53,13 +53,15 @@ class Composition:
         return vars(self) | {"arguments": dict(self.arguments), "wrappers": wrappers}
 
 
-def composition_of(recording: RunDescription, phase: str = "train") -> Composition:
-    """Return what the environment of a phase consists of, as far as the recording states it.
+def composition_of(recording: RunDescription) -> Composition | None:
+    """Return what the environment consists of, as far as the recording states it; None if it has none.
 
     Raises:
         RecordingError: the recording is damaged.
     """
-    stated, maker = recording.environment, recording.maker_of(phase)
+    if not recording.has_environment:
+        return None
+    stated, maker = recording.environment, recording.maker_of("train")
     name, limit = str(stated["env_id"]).rpartition(":")[2], stated["step_limit"] or None
     if maker is None:
         return Composition(name, stated["kwargs"], limit)
@@ -74,11 +76,12 @@ def composition_of(recording: RunDescription, phase: str = "train") -> Compositi
         for key, value in (given.items() if isinstance(given, Mapping) else ())
         if key != "render_mode" and (key not in usual or usual[key] != value)
     }
-    own = spec.get("additional_wrappers", spec.get("wrappers", [])) if spec else None
-    wrappers = own if isinstance(own, list) else [{"entry_point": each} for each in reversed(maker.wrappers)]
-    if maker.vector is not None:
-        wrappers = wrappers + json.loads(maker.vector.wrapper_specs or "[]")
-    named = (_wrapper(each) for each in wrappers if isinstance(each, Mapping))
+    wrappers = [{"entry_point": name} for name in reversed(maker.wrappers)]
+    if spec:
+        own = spec.get("additional_wrappers", spec.get("wrappers"))
+        wrappers = own if isinstance(own, list) else []
+    wrappers += json.loads(maker.vector.wrapper_specs or "[]") if maker.vector is not None else []
+    named = (_wrapper(fields) for fields in wrappers if isinstance(fields, Mapping))
     return Composition(
         name,
         changed,

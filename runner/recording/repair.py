@@ -206,7 +206,7 @@ class _Salvage:
         if missing := REQUIRED_RECORDS - described:
             raise RecordingError(
                 f"{self._path}: its metadata {', '.join(sorted(missing))} is damaged or was never written: "
-                "its messages cannot be interpreted. `dualtaxi resume` does the run again."
+                "its messages cannot be interpreted. `dualtaxi resume` retrains the run."
             )
 
     def _take_metadata(self, file: RecordingFile, name: str, entries: dict[str, str]) -> None:

@@ -1,4 +1,4 @@
-"""Steps that were done again, compared with the recorded ones: what differs first, and in which episode."""
+"""Steps that were rerun, compared with the recorded ones: what differs first, and in which episode."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Comparison:
         self._digests = {phase: EpisodeDigests() for phase in schema.PHASES}
 
     def of(self, part: Part) -> RedoneSteps:
-        """Return steps that were done again, up to the first difference."""
+        """Return steps that were rerun, up to the first difference."""
         phase, environment, rows, resets, results = part
         recorded = _recorded_values(rows, results)
         done, resets_done = results.done, results.resets_done

@@ -1,4 +1,4 @@
-"""Recorded steps compared with what an environment returned when they were done again."""
+"""Recorded steps compared with what an environment returned when they were rerun."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One replay of a loop's recording: its environments, its pieces done again one after the other, compared."""
+"""One replay of a loop's recording: its environments, its pieces rerun one after the other, compared."""
 
 from __future__ import annotations
 

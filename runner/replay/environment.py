@@ -1,4 +1,4 @@
-"""A loop's episodes, done again: its environment is made again and takes the recorded resets and actions.
+"""A loop's episodes, rerun: its environment is made again and takes the recorded resets and actions.
 
     for steps in redo_in_child(path, "train", episodes=[5], render=True):
         for row in range(len(steps)):
@@ -7,7 +7,7 @@
             ...                           # the environment is not the recorded one; nothing follows
 
 `redo` runs the environment, which is foreign code, in this process; `redo_in_child` in a child process with
-limits on memory and time. `runner.replay.makers` says whether a recording can be done again, and
+limits on memory and time. `runner.replay.makers` says whether a recording can be rerun, and
 `runner.export.pictures` what its pictures are made from.
 """
 
@@ -48,11 +48,11 @@ def redo(
     make: Callable[[], object] | None = None,
     draw_from: int = 0,
 ) -> Iterator[RedoneSteps]:
-    """Do recorded episodes again; yield their steps in blocks of about 0.2 s, compared with the recording.
+    """Rerun recorded episodes; yield their steps in blocks of about 0.2 s, compared with the recording.
 
     An episode alone is begun at its reset, if that has a seed or the state of the random generators was
     recorded there, else at the nearest such reset before it. Where its first steps differ then, as in
-    environments that keep more than that from episode to episode, it is done again with all episodes since an
+    environments that keep more than that from episode to episode, it is rerun with all episodes since an
     earlier seed, and at last since the beginning of the recording.
 
     Args:
@@ -101,10 +101,10 @@ def redo_in_child(
     trust: bool = False,
     draw_from: int = 0,
 ) -> Iterator[RedoneSteps]:
-    """Do recorded episodes again in a child process, which ends with the iterator; see `redo`.
+    """Rerun recorded episodes in a child process, which ends with the iterator; see `redo`.
 
-    The child works ahead of the caller by a block at most. A process that is such a child does it itself, as
-    it may have none.
+    The child works ahead of the caller by a block at most. A process that is such a child reruns them
+    itself, as it may have none.
 
     Raises:
         CannotRedo: see `redo`; or the environment hangs, crashes, or needs more memory.
@@ -161,7 +161,7 @@ def _silence() -> None:
 
 
 def _redo_path(path: Path, phase: str | None, episodes: Sequence[int] | None, **arguments: Any) -> None:
-    """Pass the redone steps of a recording to the process that called this one."""
+    """Pass the rerun steps of a recording to the process that called this one."""
     with open_recording(path) as recording:
         for steps in redo(recording, phase, episodes, report=report_progress, **arguments):
             report_progress(steps)

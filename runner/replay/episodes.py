@@ -1,4 +1,4 @@
-"""One recorded episode, done again alone: begun as late as its environment allows."""
+"""One recorded episode, rerun alone: begun as late as its environment allows."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class _Astray(Exception):
 
 @dataclass(frozen=True)
 class _Target:
-    """An episode that is done again alone."""
+    """An episode that is rerun alone."""
 
     phase: str
     number: int

@@ -1,7 +1,7 @@
 """The classes and functions of the script that recorded a run, without what else it does.
 
 Imported are the script's modules; executed are its definitions that are needed, and the assignments that
-these need. Loops, calls and the rest of the script are left out, so that nothing is trained again.
+these need. Loops, calls and the rest of the script are left out, so that nothing is retrained.
 """
 
 from __future__ import annotations

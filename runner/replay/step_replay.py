@@ -198,7 +198,7 @@ class StepReplay:
     def _lost(self, found: int) -> RecordingError:
         return RecordingError(
             f"{self._where}: training steps {self.step} to {found - 1} were lost, so the Q-tables after them "
-            "are unknown until the next snapshot; `dualtaxi resume` trains the run again."
+            "are unknown until the next snapshot; `dualtaxi resume` retrains the run."
         )
 
 

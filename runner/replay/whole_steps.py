@@ -1,9 +1,7 @@
-"""Whole steps of an episode of which only the actions were recorded: done again, and proved by digests."""
+"""Whole steps of an episode of which only the actions were recorded: rerun, and proved by digests."""
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 
@@ -32,25 +30,16 @@ def whole_steps(recording: Recording, phase: str, episode: int) -> NDArray[np.vo
     span, topic = recording.episode_span(phase, episode), recording.topic(f"/{phase}/step")
     if len(span) * recording.dtypes[topic].itemsize > MAX_EPISODE_BYTES:
         raise RecordingError(
-            f"{recording.path}: {phase} episode {episode} has {len(span):,} steps, too many to do again for "
+            f"{recording.path}: {phase} episode {episode} has {len(span):,} steps, too many to rerun for "
             f"an array; `dualtaxi rerecord {recording.run_id}` records them."
         )
     return _whole_steps(recording.path, recording.size, phase, episode)
 
 
-def _done_again(path: Path, phase: str, episode: int) -> Iterator[RedoneSteps]:
-    """Yield the steps of an episode, done again in a process with limits: this one, if it has them."""
-    from runner.replay.environment import redo, redo_in_child  # loads Gymnasium
-
-    if not multiprocessing.current_process().daemon:
-        yield from redo_in_child(path, phase, [episode])
-        return
-    with open_recording(path) as recording:
-        yield from redo(recording, phase, [episode])
-
-
 @lru_cache(4)
 def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> NDArray[np.void]:
+    from runner.replay.environment import redo_in_child  # loads Gymnasium
+
     with open_recording(path) as recording:
         span, own = recording.episode_span(phase, episode), []
         for block in recording.actions(phase):
@@ -60,7 +49,7 @@ def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> NDArray[np
             raise RecordingError(f"{path}: steps of {PHASE_NAMES[phase]} episode {episode:,} were lost.")
         records = blank_steps(recording, phase, np.concatenate(own))
         is_state, start = recording.kind == "step", least_number(recording.spaces["observation"])
-    for steps in _done_again(path, phase, episode):
+    for steps in redo_in_child(path, phase, [episode]):
         fill_in(records, (steps.step - span.start) // span.step, steps)
         for first in steps.starts if is_state else ():
             records["state"][0] = int(np.asarray(first.got).reshape(())) - start

@@ -103,10 +103,8 @@ def mark_of(folder: Path) -> Mark:
 def own_mark(recording: Path, environment: EnvironmentMaker | JsonView) -> Mark | None:
     """Return the mark next to a recording if it covers an environment; None if it does not."""
     found = mark_of(recording.parent)
-    if not found.environments:
-        return None
-    is_covered = hashlib.sha256(_canonical(environment).encode()).hexdigest() in found.environments
-    return found if is_covered else None
+    digest = hashlib.sha256(_canonical(environment).encode()).hexdigest()
+    return found if digest in found.environments else None
 
 
 @contextlib.contextmanager

@@ -76,9 +76,9 @@ def branch_command(
     recordings: Path | None = recordings_option,
     as_json: bool = json_option,
 ) -> None:
-    """Change one step of RUN, and record what follows as a run of its own, with the same luck.
+    """Change one step of RUN, and record what follows as a run of its own, with the same draws.
 
-    A run that was trained here is trained again, the same up to the step. There the agents take other
+    A run that was trained here is retrained, the same up to the step. There the agents take other
     actions, or settings change (--set: step size, discount, epsilon, exploration, quirks and the parameters
     of the algorithm); every random draw that this does not affect stays the same. The branch can be verified,
     resumed, compared and branched like any run.

@@ -1,4 +1,4 @@
-"""`dualtaxi resume`, `rerecord` and `evaluate`: train or play a recorded run again."""
+"""`dualtaxi resume`, `rerecord` and `evaluate`: retrain, rerun or play a recorded run."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def resume_command(
 ) -> None:
     """Resume RUN, which was interrupted or failed, as if it had never stopped.
 
-    The run is trained again without recording, which is quick, and compared byte for byte with its recording;
+    The run is retrained without recording, which is quick, and compared byte for byte with its recording;
     what is missing is then recorded. The content digest is that of an uninterrupted run. A recording that
     lost something in its middle is written again and replaced at the end. Nothing is done for a finished run.
 
@@ -84,7 +84,7 @@ def rerecord_command(
 ) -> None:
     """Record the steps of RUN, which was recorded without them.
 
-    A job (recording.steps: none) is trained again. The environment of a loop (steps="actions") takes the
+    A job (recording.steps: none) is retrained. The environment of a loop (steps="actions") takes the
     recorded actions again, in a process with limits. The full recording replaces the old one once it is
     complete and has the same content digest, which proves that these are its steps. Nothing is done for a
     run that has its steps.

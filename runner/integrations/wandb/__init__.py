@@ -94,7 +94,7 @@ class Tracked:
     @property
     def dir(self) -> str:
         """A folder for files of the script; they do not become part of the recording."""
-        folder = Path("wandb") / f"run-{self.id}" / "files"
+        folder = Path("wandb") / f"run-{self.script.run_id}" / "files"
         folder.mkdir(parents=True, exist_ok=True)
         return str(folder.absolute())
 

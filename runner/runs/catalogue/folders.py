@@ -68,9 +68,8 @@ class Folders:
         """Read what changed and write it to the index, a transaction for each batch."""
         for difference in found:
             root, here = difference.root, Row.root == difference.root
-            for entries in chunked(
-                sorted(difference.changed), _BATCH
-            ):  # as the table has them: it grows at its end
+            # In the order of the table, which then grows at its end.
+            for entries in chunked(sorted(difference.changed), _BATCH):
                 rows = [self._row(root, entry) for entry in entries]
                 with self._database.atomic("IMMEDIATE"):
                     write_rows(self._database, rows)

@@ -111,7 +111,7 @@ def loop_results(run: Run) -> Summary:
 def environment_of(run: Run) -> str:
     """Return what a run's environment consists of; empty if it has none, or cannot be read."""
     with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
-        return str(composition_of(recording)) if has_environment(recording.config) else ""
+        return str(composition_of(recording) or "")
     return ""
 
 

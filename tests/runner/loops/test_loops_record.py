@@ -439,6 +439,8 @@ def test_arrays_pictures_and_histograms_are_logged_as_such(tmp_path):
         rec.log("weights", Histogram(np.arange(128.0)))
         with pytest.raises(ConfigError, match="an array of numbers or a picture"):
             rec.log("thing", object())
+        with pytest.raises(ConfigError, match="found 1 arrays, expected counts and edges"):
+            rec.log("thing", Histogram(np_histogram=([1],)))
     with runner.open_recording(rec.run.recording) as recording:
         arrays = {each.name: (each.step, each.values.tolist()) for each in recording.arrays()}
         pictures = [each["frame_id"] for each in recording.decoded(recording.topic("/image"))]

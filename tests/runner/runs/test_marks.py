@@ -1,4 +1,4 @@
-"""Runs that this user recorded are done again with all that they name; copies of them elsewhere are not."""
+"""Runs that this user recorded are rerun with all that they name; copies of them elsewhere are not."""
 
 from __future__ import annotations
 
