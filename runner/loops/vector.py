@@ -52,7 +52,8 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
         VectorWrapper.__init__(self, env)
         self._mode, self._resets_within = mode, mode == AutoresetMode.SAME_STEP
         self._watch = watch
-        layers = [*layers_of(env), *layers_of(getattr(env.unwrapped, "envs", [None])[0])]
+        first = next(iter(getattr(env.unwrapped, "envs", ())), None)  # none where they are in other processes
+        layers = [*layers_of(env), *layers_of(first)]
         self._return_name = return_name(list(map(class_name, layers)))
         self._has_messages = bool(loop.options.info or loop.options.frames_every or self._return_name)
         self._record_into(loop)

@@ -48,6 +48,7 @@ class Listed(VectorEnv[Any, Any, Any]):
 
     def __init__(self) -> None:
         self.num_envs, self.t = 2, 0
+        self.envs: list[object] = []  # they are in other processes
         self.metadata = {}
         self.observation_space = spaces.Box(0, 99, (1,), np.float32)
         self.action_space = spaces.Discrete(2)
