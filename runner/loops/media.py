@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from runner.errors import ConfigError
 from runner.loops.options import pillow
 from runner.loops.pictures import Picture
-from runner.loops.values import numbers_of
+from runner.loops.values import as_array, numbers_of
 from runner.util.arrays import Array
 from runner.util.extras import require
 
@@ -139,7 +139,8 @@ def media_of(value: Any) -> Any:
         return picture_of(value)
     if isinstance(value, list | tuple):
         return value if len(value) != 1 else None
-    return value if np.ndim(value) and np.size(value) != 1 else None
+    array = as_array(value)
+    return value if array.ndim and array.size != 1 else None
 
 
 # --- as wandb names them ------------------------------------------------------------------------------

@@ -255,14 +255,14 @@ def test_tensors_and_dictionaries_of_them_are_recorded(tmp_path):
         rec.reset(seed=0)
         rec.step(0)
         rec.snapshot("net", {"w": Tensor([1, 2]), "inner": {"b": Tensor([0.5], "torch.bfloat16")}})
-        rec.log({"loss": Tensor(2.0), "eval": {"return": 3}})
+        rec.log({"loss": Tensor(2.0), "lone": Tensor([3.0]), "eval": {"return": 3}})
         with pytest.raises(ConfigError, match="found list of object for 'opt/groups'"):
             rec.snapshot("opt", {"w": [1.0], "groups": [{"lr": 1}]})
     with open_recording(rec.run.recording) as recording:
         arrays = {array.name: array.values.tolist() for array in recording.arrays()}
         logged = {one["name"]: one["value"] for one in recording.decoded(recording.topic("/scalar"))}
     assert arrays == {"net/w": [1, 2], "net/inner/b": [0.5]}
-    assert logged == {"loss": 2, "eval/return": 3}
+    assert logged == {"loss": 2, "lone": 3, "eval/return": 3}
 
 
 def test_short_recordings_start_no_threads(tmp_path):
