@@ -34,7 +34,7 @@ OUTSIDE: Final = (
     "The environment gives other results each time for the same seed and actions: it depends on more than "
     "its seed, such as the global random generators, the clock, the order of a set, or threads."
 )
-_HASH_SEEDS: Final = (1, 2)
+_HASH_SEEDS: Final = (1, 2, 3, 4)
 """A difference is looked for again with each: two texts in a set may have the same order with one."""
 _AHEAD_SECONDS: Final = 3_244_643
 """37 days and some hours, minutes and seconds: an odd number of each."""
