@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from runner.errors import RecordingError, RunnerError, nearest
 from runner.recording.clock import read_clock
 from runner.recording.reader import Recording
-from runner.recording.schema import SCALAR_TOPIC, STEP_NANOSECONDS, TRAIN_EPISODE
+from runner.recording.schema import STEP_NANOSECONDS, TRAIN_EPISODE
 
 Values = NDArray[np.float64]
 Place = TypeVar("Place", int, float)
@@ -189,11 +189,16 @@ def _logged(recording: Recording, axis: Axis) -> tuple[Values, Values]:
     steps: list[int] = []
     values: list[float] = []
     name, every, count = "", 1, 0
-    for scalar in recording.decoded(SCALAR_TOPIC):
-        is_count = scalar["phase"] == "train" and axis.counts(scalar["name"])
-        if not is_count or scalar["name"] != (name := name or scalar["name"]):
+    logged = (
+        (series[number][0], step, value)
+        for series, rows in recording.scalars()
+        for counting in ([phase == "train" and axis.counts(own) for own, phase in series],)
+        if any(counting)
+        for number, _, step, _, value in rows[np.array(counting)[rows["series"]]].tolist()
+    )
+    for own, step, value in logged:
+        if own != (name := name or own):
             continue
-        step, value = scalar["step"], scalar["value"]
         is_later = step >= (steps[-1] if steps else 0) and value >= (values[-1] if values else 0)
         if not (is_later and math.isfinite(value)):
             raise RecordingError(

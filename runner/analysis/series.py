@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -328,14 +327,14 @@ def _edges(recording: Recording, places: Positions) -> tuple[NDArray[np.float64]
         last = float(places.at(done["episodes"], done["train_steps"]))
         first = 0.0
     else:
-        steps: set[int] = set()
+        steps = np.empty(0, np.int64)
         last_step = 0
-        for scalar in recording.decoded(schema.SCALAR_TOPIC):
-            last_step = max(last_step, int(scalar["step"]))
+        for _, rows in recording.scalars():
+            last_step = max(last_step, int(rows["step"].max()))
             if len(steps) <= _MAX_EXACT:
-                steps.add(int(scalar["step"]))
+                steps = np.union1d(steps, rows["step"])
         if len(steps) <= _MAX_EXACT:
-            ends = np.unique(places.at(0, sorted(steps)))
+            ends = np.unique(places.at(0, steps))
             return np.concatenate([ends[:1] - 1, ends]) if len(ends) else np.arange(2.0), ""
         last = float(places.at(0, last_step))
         first = -1.0 if places.axis.whole else 0.0  # so that a stretch is steps 0 to 99, not 1 to 100
@@ -423,31 +422,38 @@ def _mean_scalars(
 
     Also whether any is the mean of several values.
     """
-    ends = edges[1:].tolist()
-    bins = len(ends)
-    after = (0, 0)  # training steps, and the episodes that ended in them
+    ends = edges[1:]
     wanted = set(names)
     sums: dict[str, NDArray[np.float64]] = {}
     counts: dict[str, NDArray[np.float64]] = {}
-    for scalar in recording.decoded(schema.SCALAR_TOPIC):
-        name = scalar["name"] if scalar["phase"] == "train" else f"{scalar['name']} ({scalar['phase']})"
-        if name not in sums:
+    for series, rows in recording.scalars():
+        steps, episodes = rows["step"].copy(), rows["episode"].copy()
+        evaluated = np.array([phase != "train" for _, phase in series])[rows["series"]]
+        if evaluated.any():
+            own = rows[evaluated]
+            steps[evaluated] = (own["log_time"] // schema.STEP_NANOSECONDS).astype(np.int64) - own["step"]
+            moments, at = np.unique(steps[evaluated], return_inverse=True)
+            ended = [recording.first_from(schema.TRAIN_EPISODE, "last_step", k) for k in moments.tolist()]
+            episodes[evaluated] = np.array(ended)[at]
+        reached = places.at(episodes + 1, steps)
+        stretches = np.searchsorted(ends, np.trunc(reached) if places.axis.whole else reached)
+        stretches = stretches.clip(max=len(ends) - 1)
+        usable = is_usable(rows["value"])
+        for k, (logged, phase) in enumerate(series):
+            name = logged if phase == "train" else f"{logged} ({phase})"
             names[name] = None
-            if name not in wanted and len(sums) >= room:
-                not_finite[FURTHER_NAMES] += bool(room)
-                continue
-            sums[name], counts[name] = np.zeros(bins), np.zeros(bins)
-        if not abs(scalar["value"]) <= LARGEST:
-            not_finite[f"{LOGGED}{name}"] += 1
-            continue
-        step, episodes = training_step(scalar), scalar["episode"]
-        if scalar["phase"] != "train":
-            if step != after[0]:
-                after = (step, recording.first_from(schema.TRAIN_EPISODE, "last_step", step))
-            episodes = after[1]
-        k = min(bisect_left(ends, places.one(episodes + 1, step)), bins - 1)
-        sums[name][k] += scalar["value"]
-        counts[name][k] += 1
+            of_series = rows["series"] == k
+            if name not in sums:
+                if name not in wanted and len(sums) >= room:
+                    if room:
+                        not_finite[FURTHER_NAMES] += int(of_series.sum())
+                    continue
+                sums[name], counts[name] = np.zeros(len(ends)), np.zeros(len(ends))
+            if left_out := int((of_series & ~usable).sum()):
+                not_finite[f"{LOGGED}{name}"] += left_out
+            of_series &= usable
+            np.add.at(sums[name], stretches[of_series], rows["value"][of_series])  # in their order
+            counts[name] += np.bincount(stretches[of_series], minlength=len(ends))
     with np.errstate(invalid="ignore"):
         means = {name: sums[name] / counts[name] for name in sums}
     return means, any((own > 1).any() for own in counts.values())

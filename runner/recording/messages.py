@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
@@ -126,6 +126,84 @@ _SCALAR_NUMBER: Final = struct.Struct("<cq")
 def _scalar_struct(before_value: int, before_step: int, after: str) -> struct.Struct:
     """Return the layout of a `dualtaxi.Scalar`: bytes before its value and step, and format after these."""
     return struct.Struct(f"<{before_value}sd{before_step}sq{after}")
+
+
+class Scalars(NamedTuple):
+    """Logged values, in the order in which they were logged."""
+
+    series: list[tuple[str, str]]
+    """Name and phase of each series, in the order of their first values."""
+    rows: NDArray[np.void]
+    """A `SCALAR_ROW` for each value."""
+
+
+SCALAR_ROW: Final = np.dtype(
+    [("series", "<i8"), ("log_time", "<u8"), ("step", "<i8"), ("episode", "<i8"), ("value", "<f8")]
+)
+"""A logged value: the number of its series in `Scalars.series`, and the fields of its message."""
+_MAX_LAYOUTS: Final = 64
+"""The most layouts among payloads of one size; beyond these it is quicker to decode them one by one."""
+
+
+def decode_scalars(messages: Sequence[tuple[int, bytes]]) -> Scalars:
+    """Return `dualtaxi.Scalar` messages, given as log times and payloads.
+
+    Payloads that differ in nothing but the bytes of their numbers are decoded together.
+
+    Raises:
+        RecordingError: a payload is not such a message.
+    """
+    numbers: dict[tuple[str, str], int] = {}
+    rows = np.empty(len(messages), SCALAR_ROW)
+    rows["log_time"] = [time for time, _ in messages]
+    sizes = np.array([len(payload) for _, payload in messages])
+    for size in np.unique(sizes).tolist():
+        left = np.flatnonzero(sizes == size)
+        joined = b"".join([messages[k][1] for k in left.tolist()])
+        payloads = np.frombuffer(joined, np.uint8).reshape(len(left), size)
+        for _ in range(_MAX_LAYOUTS):
+            if not len(left):
+                break
+            fields = decode(schema.SCALAR, payloads[0].tobytes())
+            places = _number_places(fields, payloads[0].tobytes())
+            is_constant = np.ones(size, bool)
+            for at in places.values():
+                is_constant[at : at + 8] = False
+            alike = (payloads[:, is_constant] == payloads[0, is_constant]).all(axis=1)
+            same = rows[left[alike]]
+            same["series"] = numbers.setdefault((fields["name"], fields["phase"]), len(numbers))
+            for name in ("step", "episode", "value"):
+                same[name] = fields[name]
+            for name, at in places.items():
+                same[name] = payloads[alike, at : at + 8].view(SCALAR_ROW[name])[:, 0]
+            rows[left[alike]] = same
+            left, payloads = left[~alike], payloads[~alike]
+        for k in left.tolist():
+            time, payload = messages[k]
+            fields = decode(schema.SCALAR, payload)
+            number = numbers.setdefault((fields["name"], fields["phase"]), len(numbers))
+            rows[k] = number, time, fields["step"], fields["episode"], fields["value"]
+    _, first = np.unique(rows["series"], return_index=True)
+    order = np.argsort(first)
+    rows["series"] = np.argsort(order)[rows["series"]]
+    series = list(numbers)
+    return Scalars([series[k] for k in order.tolist()], rows)
+
+
+def _number_places(fields: Message, payload: bytes) -> dict[str, int]:
+    """Return where the numbers of a `dualtaxi.Scalar` begin; nothing if it was not written by `encode`."""
+    places: dict[str, int] = {}
+    if encode(schema.SCALAR, fields) == payload:
+        at = 0
+        for field in schema.SCALAR.fields:
+            value = fields[field.name]
+            if isinstance(value, str):
+                size = len(value.encode())
+                at += 1 + len(varint(size)) + size if size else 0
+            elif payload[at : at + 1] == bytes([field.number << 3 | 1]):  # zeros are left out
+                places[field.name] = at + 1
+                at += 9
+    return places
 
 
 def decode(message: MessageType, payload: bytes) -> Message:

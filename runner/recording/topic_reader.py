@@ -6,8 +6,9 @@ import os
 import stat
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property, partial
+from itertools import islice
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import Final, Self, TypeVar
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -17,13 +18,14 @@ from runner.errors import RecordingError
 from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.description import RunDescription
 from runner.recording.index import ChunkEntry, read_index
-from runner.recording.messages import Message, decode
+from runner.recording.messages import Message, Scalars, decode, decode_scalars
 from runner.recording.metadata import check_file, dtypes_of
 from runner.recording.record_store import RecordStore
-from runner.recording.schema import Topic
+from runner.recording.schema import SCALAR_TOPIC, Topic
 from runner.recording.topic_chunks import ChunkSpan, TopicChunks, chunks_by_topic
 
 M = TypeVar("M")
+_MAX_SCALARS: Final = 8_192
 
 
 class TopicReader(RunDescription):
@@ -182,6 +184,21 @@ class TopicReader(RunDescription):
         parse = partial(decode, topic.message)
         for time, fields in self._parsed(topic, parse, max_bytes=max_bytes, times=times):
             yield {"log_time": time} | fields
+
+    def scalars(self) -> Iterator[Scalars]:
+        """Yield the values that a loop logged, thousands at a time, as columns.
+
+        Raises:
+            RecordingError: a message cannot be read.
+        """
+        messages = self._parsed(SCALAR_TOPIC, bytes)
+        while batch := list(islice(messages, _MAX_SCALARS)):
+            try:
+                yield decode_scalars(batch)
+            except RecordingError:
+                for _ in self.decoded(SCALAR_TOPIC):  # names the message
+                    pass
+                raise
 
     def _parsed(
         self,

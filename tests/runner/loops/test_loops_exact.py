@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import warnings
 from typing import Any
 
@@ -239,3 +240,28 @@ def test_a_scalar_is_encoded_as_protobuf_does():
             for episode in (0, 7):
                 fields = {"name": "loss/π", "value": value, "phase": "eval", "step": step, "episode": episode}
                 assert quick(value, step, episode) == encode(schema.SCALAR, fields)
+
+
+def test_many_scalars_are_decoded_as_one_by_one():
+    from runner.recording.messages import decode, decode_scalars, encode
+
+    numbers = [0.0, -0.0, math.nan, math.inf, 1e-300, -5.0]
+    messages = [
+        {"name": name, "value": value, "phase": phase, "step": step, "episode": episode}
+        for step in (0, 1, -1, 2**40)
+        for episode in (0, 7)
+        for name in ("", "loss/π", "b" * 200, *(f"w{k:02}" for k in range(20)))
+        for phase in ("eval", "train", "")
+        for value in numbers
+    ]
+    payloads = [encode(schema.SCALAR, message) for message in messages]
+    payloads += [payloads[-1][-9:] + payloads[-1][:-9], b"", b"\x32\x01x" + payloads[0]]  # of other writers
+    times = [2**64 - 1 - k for k in range(len(payloads))]
+    series, rows = decode_scalars(list(zip(times, payloads, strict=True)))
+    expected = [decode(schema.SCALAR, payload) for payload in payloads]
+    assert series == list(dict.fromkeys((one["name"], one["phase"]) for one in expected))
+    assert [series[k] for k in rows["series"].tolist()] == [(one["name"], one["phase"]) for one in expected]
+    for name in ("step", "episode"):
+        assert rows[name].tolist() == [one[name] for one in expected]
+    assert rows["value"].tobytes() == np.array([one["value"] for one in expected]).tobytes()
+    assert rows["log_time"].tolist() == times
