@@ -32,7 +32,12 @@ _SETTINGS: Final = (
     *("core.fsmonitor=false", f"core.hooksPath={os.devnull}", "core.sshCommand=false", "core.pager=cat"),
     *("core.quotePath=false", "core.safecrlf=false", "credential.helper=", "protocol.allow=never"),
     *("diff.external=", "diff.noprefix=false", "diff.mnemonicPrefix=false", "diff.relative=false"),
-    *("safe.bareRepository=explicit", "submodule.recurse=false", "status.relativePaths=false"),
+    *(
+        "diff.submodule=short",
+        "safe.bareRepository=explicit",
+        "submodule.recurse=false",
+        "status.relativePaths=false",
+    ),
 )
 _VARIABLES: Final = {
     "GIT_OPTIONAL_LOCKS": "0",
@@ -108,7 +113,9 @@ def read_repository(
         _read_remote_and_filters(git, repository)
         on_commit(repository)
         status = ("--porcelain=v1", "-z", "--untracked-files=all", "--no-renames", _IGNORE_SUBMODULES)
-        for entry in filter(None, git.run("status", *status, limit=_MAX_STATUS_BYTES).split("\0")):
+        # The names as they are, to be excluded by them below.
+        text = git.run("status", *status, limit=_MAX_STATUS_BYTES, errors="surrogateescape")
+        for entry in filter(None, text.split("\0")):
             (repository.untracked if entry[:2] == "??" else repository.changed).append(entry[3:])
         if paths := used(root):
             text = git.run("ls-files", "-z", "--", *(f":(literal){path}" for path in paths))
@@ -173,8 +180,15 @@ class _Git:
         others = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
         self._variables = others | _VARIABLES
 
-    def run(self, command: str, *arguments: str, limit: int = 1 << 20, may_fail: bool = False) -> str:
-        """Return the output of a command.
+    def run(
+        self,
+        command: str,
+        *arguments: str,
+        limit: int = 1 << 20,
+        may_fail: bool = False,
+        errors: str = "replace",
+    ) -> str:
+        """Return the output of a command; `errors` says what becomes of bytes that are not UTF-8.
 
         Raises:
             NotRecorded: it takes too long, writes too much, or fails and may not.
@@ -187,13 +201,13 @@ class _Git:
             is_late.set()
             _kill(process)
 
-        with tempfile.TemporaryFile() as errors:
+        with tempfile.TemporaryFile() as log:
             try:
                 process = subprocess.Popen(
                     line,
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.PIPE,
-                    stderr=errors,
+                    stderr=log,
                     env=self._variables,
                     start_new_session=True,
                 )
@@ -208,15 +222,15 @@ class _Git:
                 if len(output) > limit:
                     _kill(process)
             timer.cancel()
-            errors.seek(0)
-            self.message = errors.read(_MAX_MESSAGE_BYTES).decode(errors="replace")
+            log.seek(0)
+            self.message = log.read(_MAX_MESSAGE_BYTES).decode(errors="replace")
         if is_late.is_set():
             raise NotRecorded(f"git {command} was stopped: reading the repository took {self._seconds:g} s")
         if len(output) > limit:
             raise NotRecorded(f"git {command} was stopped: it wrote more than {size(limit)}")
         if process.returncode and not may_fail:
             raise NotRecorded(_reason(self.message))
-        return output.decode(errors="replace")
+        return output.decode(errors=errors)
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:

@@ -163,6 +163,16 @@ def test_a_file_with_the_name_of_a_secret_is_named_and_not_stored(project, name)
     assert "before" not in read(project)[1].patch
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are text there")
+def test_a_secret_whose_name_is_no_text_is_not_in_the_patch(project):
+    path = project / os.fsdecode(b"\xff.env")
+    for text in ("before\n", "DB=p@ss word!\n"):
+        git(project, "commit", "-qm", "Change it", "--allow-empty")
+        path.write_text(text)
+        git(project, "add", "-A")
+    assert read(project)[1].patch == ""
+
+
 @pytest.mark.parametrize("name", ["environment.py", "secretary.py", "id_mapping.py", "monkey.py"])
 def test_a_source_with_a_harmless_name_is_recorded(project, name):
     (project / name).write_text("x = 1\n")
@@ -173,6 +183,7 @@ def test_a_source_with_a_harmless_name_is_recorded(project, name):
 def test_submodules_are_recorded_by_their_commits(project, tmp_path):
     git(project, "-c", "protocol.file.allow=always", "submodule", "add", "-q", str(project), "part")
     git(project, "commit", "-qm", "Add a part")
+    git(project, "config", "diff.submodule", "log")
     before = git(project / "part", "rev-parse", "HEAD")
     git(project / "part", "commit", "-q", "--allow-empty", "-m", "Go on")
     after = git(project / "part", "rev-parse", "HEAD")
