@@ -21,7 +21,7 @@ from runner.replay.recorded import Piece, RecordedReset, pieces
 from runner.replay.redone import Frame, RedoneSteps
 from runner.replay.stepping import EnvironmentStepper, GameStepper, Stepper
 from runner.replay.stepping_vector import VectorStepper
-from runner.replay.trust import trusting
+from runner.replay.trust import require_plain, trusting
 
 BLOCK_SECONDS: Final = 0.2
 """Blocks of steps take about this long, so that progress and a hanging environment can be seen."""
@@ -129,6 +129,8 @@ class Replay:
                 end = first_drawn
             here = [(row - begin, reset) for row, reset in resets if row < end or end == stop]
             resets, block = resets[len(here) :], rows[begin * width : end * width]
+            for _, reset in () if stepper.is_trusted else here:
+                require_plain("option of a reset,", reset.options or {}, {})
             started = time.monotonic()
             results = stepper.run(block, here)
             self._adapt(time.monotonic() - started, results.frames if stepper.draws else None)
@@ -168,7 +170,7 @@ class Replay:
         """
         key, maker = self._key(phase, environment), self._recording.maker_of(phase, environment)
         if key not in self._steppers:
-            env = self._environment(maker, environment)
+            env, is_trusted = self._environment(maker, environment)
             try:
                 if environment == ALL and maker is not None and maker.vector is not None:
                     autoreset = maker.vector.autoreset
@@ -179,6 +181,7 @@ class Replay:
                     stepper = EnvironmentStepper(env, self._recording)
                     vector = None if maker is None else maker.vector
                     stepper.ends_once = vector is not None and vector.is_vec_env
+                stepper.is_trusted = is_trusted
                 stepper.check_spaces()
             except (CannotRedo, MemoryError):
                 raise
@@ -188,14 +191,15 @@ class Replay:
             self._steppers[key] = stepper
         return self._steppers[key]
 
-    def _environment(self, maker: EnvironmentMaker | None, environment: int) -> object:
+    def _environment(self, maker: EnvironmentMaker | None, environment: int) -> tuple[object, bool]:
+        """Return an environment, and whether it may get all that is recorded."""
         if self._make is not None:
-            return self._make()
+            return self._make(), True
         if maker is None:
             raise CannotRedo(why_not_made(maker, self._trust))
         with trusting(self._recording.path, maker, self._trust) as trust:
             make = make_vector if environment == ALL else make_environment
-            return make(maker, trust, self.render)
+            return make(maker, trust, self.render), trust
 
 
 def _are_separate(recording: Recording) -> bool:

@@ -97,6 +97,8 @@ class Stepper(ABC):
         self.env = env
         self.draws = False
         """Whether to draw a picture after each step and reset."""
+        self.is_trusted = False
+        """Whether `reset` may get options that name something."""
         self._recording = recording
         self.observation_space, self.action_space = self._spaces()
         self._learners = len(recording.agents)

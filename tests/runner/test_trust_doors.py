@@ -18,6 +18,7 @@ import click
 import gymnasium
 import pytest
 from click.testing import CliRunner
+from gymnasium.envs.classic_control import CartPoleEnv
 from starlette.testclient import TestClient
 
 import runner
@@ -309,6 +310,34 @@ def test_with_trust_the_traps_are_imported(strangers, trap):
     assert untouched(trap)
     assert verify(recording, trust=True).verdict == "reproduced"
     assert (trap / "IMPORTED").exists()
+
+
+def test_options_of_a_reset_are_numbers_unless_the_run_is_trusted(tmp_path, monkeypatch):
+    """An environment may look up what options name: `highway_env` imports classes of vehicles."""
+    got = []
+    original = CartPoleEnv.reset
+
+    def reset(env, *, seed=None, options=None):
+        got.append(options)
+        return original(env, seed=seed, options=options)
+
+    monkeypatch.setattr(CartPoleEnv, "reset", reset)
+    for options in ({"low": -0.01, "high": 0.01}, {"config": {"other_vehicles_type": "trap.Env"}}):
+        with runner.record(gymnasium.make("CartPole-v1"), tmp_path) as env:
+            env.reset(seed=1, options=options)
+            env.step(0)
+        got.clear()
+        with open_recording(env.run.recording) as recording:
+            assert all(s.difference is None for s in redo(recording))
+            assert got == [options]
+            (env.run.folder / MARK_FILE).unlink()
+            got.clear()
+            if "config" in options:
+                with pytest.raises(CannotRedo, match=r"option of a reset, config=.*--trust"):
+                    list(redo(recording))
+            else:
+                assert all(s.difference is None for s in redo(recording))
+            assert got == [options] * ("low" in options)
 
 
 def test_an_interrupted_job_is_resumed_only_as_its_recording_allows(strangers, lake, trap, tmp_path):
