@@ -249,6 +249,8 @@ class SummaryWriter:
         if self._is_own:
             self.script.close()
 
+    finish = close  # TorchRL's loggers end by it what has it
+
     def __enter__(self) -> Self:
         return self
 
