@@ -153,6 +153,14 @@ class RowReader(TopicReader):
                 return min(int(block["step"][np.argmax(over)]) // n * n + n, total // n * n)
         return total // n * n
 
+    @property
+    def last_step_time(self) -> int:
+        """The `log_time` of the last step in a recording that was cut: later resets lost their steps."""
+        if "content_digest" in self.result or any(map(self.has_actions_alone, schema.PHASES)):
+            return FOREVER
+        chunks = [self._chunks(self.topic(f"/{phase}/step")) for phase in schema.PHASES]
+        return max((own.entry(len(own) - 1).end_time for own in chunks if len(own)), default=0)
+
 
 def _records_of(messages: Sequence[Message], dtype: np.dtype[np.void]) -> NDArray[np.void]:
     records = np.zeros(len(messages), dtype)

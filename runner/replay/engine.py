@@ -65,6 +65,8 @@ class Replay:
         self._recording, self._trust, self._make = recording, trust, make
         self._comparison = Comparison(recording, tolerance)
         self._report, self.render = report, render
+        self._last_step_time = recording.last_step_time
+        """When the steps end that were recorded: later resets came after steps that were lost."""
         self._steppers: dict[_Key, Stepper] = {}
         self._known: set[_Key] = set()
         """The environments whose random generators are in the recorded state."""
@@ -104,6 +106,7 @@ class Replay:
         """
         phase, width = piece.phase, self._recording.environments if environment == ALL else 1
         rows, resets = own_steps(piece, environment, self._recording.environments)
+        resets = [(row, reset) for row, reset in resets if reset.time <= self._last_step_time]
         begin = 0
         if not self.is_known(phase, environment):
             first = next((k for k, (_, reset) in enumerate(resets) if reset.is_known), None)

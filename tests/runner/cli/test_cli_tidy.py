@@ -387,6 +387,7 @@ def documented():
 def test_the_documented_examples_run(command, make, monkeypatch, tmp_path):
     make(40, "interrupted")
     monkeypatch.chdir(tmp_path)
+    Path("loops").mkdir()
     assert len(documented()) > 10
     for words in documented():
         result = command(*words)

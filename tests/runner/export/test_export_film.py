@@ -267,14 +267,16 @@ def test_a_grid_ends_after_twice_the_median_length(tmp_path, words, frames):
 
 
 def test_a_film_names_the_extra_where_the_environment_needs_pygame(tmp_path):
-    (tmp_path / "pygame.py").write_text("raise ModuleNotFoundError('hidden', name='pygame')")
+    hidden = tmp_path / "hidden"
+    hidden.mkdir()
+    (hidden / "pygame.py").write_text("raise ModuleNotFoundError('hidden', name='pygame')")
     with runner.record(gymnasium.make("CartPole-v1"), tmp_path / "runs") as rec:
         rec.reset(seed=0)
         rec.step(0)
     words = [sys.executable, "-m", "runner", "export", "film", str(rec.run.recording), "-o", "film.gif"]
     done = subprocess.run(
         words,
-        env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{Path.cwd()}"},
+        env=os.environ | {"PYTHONPATH": f"{hidden}{os.pathsep}{Path.cwd()}"},
         cwd=tmp_path,
         capture_output=True,
         text=True,

@@ -329,8 +329,12 @@ def test_what_cannot_be_branched_leaves_no_run(runs, tmp_path):
     ):
         with pytest.raises(ConfigError, match=message):
             runner.branch(run, recordings=tmp_path, **options)
-    own = recorded(tmp_path / "own", Rooms())
-    with pytest.raises(CannotRedo, match="not made by gymnasium"):
+
+    class Hidden(Rooms):
+        """Has no name by which it could be imported."""
+
+    own = recorded(tmp_path / "own", Hidden())
+    with pytest.raises(CannotRedo, match="cannot be imported"):
         runner.branch(own, at="0:1", recordings=tmp_path)
     assert [each.name for each in tmp_path.iterdir()] == ["own"]
 

@@ -142,6 +142,11 @@ def test_diff_names_the_frame_that_differs(tmp_path):
     assert (divergence["field"], divergence["a"], divergence["b"]) == ("next_observation.picture[3, 4]", 7, 8)
 
 
+def made_pole() -> Any:
+    """Return the environment of `record_pole` without the scale of its rewards."""
+    return gymnasium.make("CartPole-v1")
+
+
 def record_pole(folder: Path, name: str, steps: str = "all", change: int = -1, scale: float = 1.0) -> str:
     """Record three CartPole episodes whose rewards are scaled from step 20 on; return the run's id.
 
@@ -155,7 +160,7 @@ def record_pole(folder: Path, name: str, steps: str = "all", change: int = -1, s
     env = gymnasium.make("CartPole-v1")
     taken = 0
     env = gymnasium.wrappers.TransformReward(env, lambda reward: reward * (scale if taken > 20 else 1.0))
-    with runner.record(env, folder, name=name, steps=steps, code=False) as rec:
+    with runner.record(env, folder, name=name, steps=steps, code=False, make=made_pole) as rec:
         rec.reset(seed=0)
         episodes = 0
         while episodes < 3:

@@ -16,7 +16,7 @@ from runner.errors import CannotRedo, ConfigError, RunnerError
 from runner.execution.verify import verify
 from runner.loops.policies import play_checkpoint, values_along
 from runner.runs.resolve import find_run
-from tests.runner.loops.making import dualtaxi, make, play
+from tests.runner.loops.making import Rooms, dualtaxi, make, play
 
 pytest.importorskip("safetensors")
 
@@ -156,9 +156,14 @@ def test_a_policy_that_does_not_work_is_named(folder, policy, kind, message):
 
 
 def test_what_cannot_be_evaluated_says_why(folder):
-    rooms, pole = find_run("rooms", folder), find_run("pole", folder)
-    with pytest.raises(CannotRedo, match=r"not made by gymnasium\.make"):
-        play_checkpoint(rooms, rooms.checkpoints()[0], "agent_of_test:policy", folder, 1)
+    class Hidden(Rooms):
+        """Has no name by which it could be imported."""
+
+    with runner.record(Hidden(), folder / "hidden") as rec:
+        rec.checkpoint("policy", {"w": BALANCING})
+    hidden, pole = rec.run, find_run("pole", folder)
+    with pytest.raises(CannotRedo, match="cannot be imported"):
+        play_checkpoint(hidden, hidden.checkpoints()[0], "agent_of_test:policy", folder, 1)
     before = len(runner.list_runs(folder))
     with pytest.raises(RunnerError, match="ZeroDivisionError"):
         play_checkpoint(pole, pole.checkpoints()[0], "agent_of_test:failing", folder, 1)

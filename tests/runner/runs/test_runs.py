@@ -37,7 +37,7 @@ def test_a_run_is_on_disk_with_its_configuration(folder):
     assert from_mapping(found.facts["config"]) == CONFIG
     assert found.created.tzinfo is not None
     assert found.summary == {}
-    assert [path.name for path in run.folder.iterdir()] == [RUN_FILE]
+    assert {path.name for path in run.folder.iterdir()} == {RUN_FILE, "trust.json"}
 
 
 def test_a_run_may_have_another_name(folder):
@@ -68,7 +68,7 @@ def test_an_update_is_whole_and_leaves_the_rest(folder):
     changed = run.update(status="finished", summary={"bytes": 3})
     assert (changed.status, changed.summary) == ("finished", {"bytes": 3})
     assert list_runs(folder) == [changed]
-    assert [path.name for path in run.folder.iterdir()] == [RUN_FILE]
+    assert {path.name for path in run.folder.iterdir()} == {RUN_FILE, "trust.json"}
 
 
 @pytest.mark.parametrize(
