@@ -10,6 +10,7 @@ waits for it; any other may end the process meanwhile by `kill`. The function ma
 from __future__ import annotations
 
 import contextlib
+import errno
 import multiprocessing
 import os
 import signal
@@ -164,6 +165,9 @@ class ChildProcess:
         try:
             with starting_processes(with_main=False, hash_seed=hash_seed):
                 self._process.start()
+        except EOFError as error:  # the fork server could not open what it needs
+            self._pipe.close()
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE)) from error
         except BaseException:
             self._pipe.close()
             raise

@@ -125,7 +125,7 @@ def _parts(details: RunDetails, branches: Mapping[str, Origin]) -> list[Renderab
         table = evaluation_table(details.evaluations, details.success_events, console())
         parts += [title("Evaluations"), table]
     if details.loop is not None:
-        parts += [title("Last results"), facts(_loop_results(details.loop))]
+        parts += [title("Last results"), facts(_loop_results(details.loop, has_environment(details.config)))]
     if details.extras:
         parts += [title("Values recorded with steps"), facts(_extras(details.extras))]
     if details.checkpoints:
@@ -173,11 +173,14 @@ def _draw_random_policy(run: Run) -> None:
 
 
 def _head(details: RunDetails) -> dict[str, str]:
+    from runner.recording.description import has_environment
 
     run, summary, origin = details.run, details.run.summary, origin_in(details.config)
     took = "" if summary.seconds is None else f", took {duration(summary.seconds)}"
     steps = ""
-    if not (details.train_steps is None or details.episodes is None or details.eval_steps is None):
+    if has_environment(details.config) and not (
+        details.train_steps is None or details.episodes is None or details.eval_steps is None
+    ):
         steps = f"{details.train_steps:,} of training in {counted(details.episodes, 'episode')}, "
         steps += f"{details.eval_steps:,} of evaluation"
     clock, time = details.clock, ""
@@ -210,10 +213,10 @@ def _processes(shards: Sequence[Shard]) -> str:
     return "; ".join(", ".join(part) for part in (names + more, ends) if part)
 
 
-def _loop_results(loop: Summary) -> dict[str, str]:
+def _loop_results(loop: Summary, with_environment: bool) -> dict[str, str]:
     """Return the means of a loop's last training episodes and the values it logged last."""
-    results, recent = {"training": "no episode ended"}, loop.recent_training
-    if recent and recent.episodes:
+    results = {"training": "no episode ended"} if with_environment else {}
+    if (recent := loop.recent_training) and recent.episodes:
         episodes = f"last {recent.episodes:,} episodes" if recent.episodes > 1 else "one episode"
         means = f"mean return {number(recent.mean_return)}, mean length {number(recent.mean_length)}"
         results["training"] = f"{means} ({episodes})"

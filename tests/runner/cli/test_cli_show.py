@@ -6,6 +6,7 @@ import shutil
 
 import pytest
 
+from runner.integrations.tensorboard import SummaryWriter
 from runner.runs.run import RUN_FILE, create_run
 
 
@@ -151,3 +152,12 @@ def test_a_damaged_recording_is_reported_without_a_traceback(command, tmp_path):
     assert result.exit_code == 2
     assert "noise.mcap" in result.stderr
     assert "Traceback" not in result.output
+
+
+def test_a_run_of_values_alone_is_shown_without_steps_and_episodes(command_in, tmp_path):
+    with SummaryWriter(recordings=tmp_path, monitor_gym=False) as writer:
+        writer.add_scalar("loss", 0.5, 3)
+    shown = command_in(tmp_path)("show", writer.run.run_id).stdout
+    assert "logged loss  0.5" in shown
+    assert "of training" not in shown
+    assert "episode" not in shown

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+import multiprocessing
 import os
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -66,3 +69,12 @@ def test_a_script_need_not_guard_its_statements(tmp_path):
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120, check=False)
     assert (done.stdout, done.stderr) == ("3\n", "")
+
+
+def test_a_process_that_cannot_be_started_is_an_error_of_the_system():
+    def start():
+        raise EOFError
+
+    context = SimpleNamespace(Pipe=multiprocessing.Pipe, Process=lambda **_: SimpleNamespace(start=start))
+    with pytest.raises(OSError, match=os.strerror(errno.EMFILE)):
+        ChildProcess(MEMORY, context)
