@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help run serve test test-integrations lint bench soak fuzz damage clean
+.PHONY: help run serve test test-integrations lint bench soak fuzz damage inventory clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-17s %s\n", $$1, $$2}'
@@ -45,6 +45,9 @@ fuzz: $(VENV)/.installed-dev  ## feed the reader a million mutated recordings (L
 
 damage: $(VENV)/.installed-dev  ## change 10,000 single bytes, each to be found by verify
 	$(BIN)/python -m tests.reliability.damage
+
+inventory: $(VENV)/.installed-dev  ## compare pages, commands, routes and names with what is written down
+	$(BIN)/python -m tests.inventory
 
 clean:  ## remove the environment and caches; recordings stay
 	rm -rf $(VENV) $(VENV)-integrations build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
