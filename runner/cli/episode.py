@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,19 +23,8 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from runner.export.episodes import EpisodePlace
-    from runner.export.pictures import Pictures
     from runner.recording.reader import Recording
     from runner.recording.spaces import Value
-
-
-@dataclass(frozen=True)
-class Frame:
-    """What a terminal shows of a step."""
-
-    above: Text
-    below: Text
-    picture: bytes = b""
-    """A PNG between the texts; empty if there is none."""
 
 
 class Episode:
@@ -60,35 +48,20 @@ class Episode:
                 "truncated": bool(row["truncated"]),
             }
 
-    def frames(self) -> Iterator[Frame]:
-        """Yield a frame of the first state, and one after each step, in text alone."""
-        draw = _state_drawer(self._recording)
-        for moment in moments_of(self._recording, self._phase, self._number):
-            yield Frame(self._above(moment.t) + draw(moment.observation), _below(moment))
-
-    def illustrated(self, pictures: Pictures) -> Iterator[Frame]:
-        """Yield a frame for each picture of the episode."""
-        from runner.drawing.raster import image_bytes
-
-        for picture in pictures:
-            below = _below(picture)
-            below.append("" if picture.t else "\n\n")  # as high as those of steps
-            if picture.note:
-                below.append(f"\n{picture.note}")
-            yield Frame(self._above(picture.t), below, image_bytes(picture.pixels, "png"))
-
-    def _above(self, t: int) -> Text:
+    def frames(self) -> Iterator[Text]:
+        """Yield a frame of the first state, and one after each step."""
         from rich.text import Text
 
-        return Text.assemble((self._title, "bold"), f"\nstep {t:,} of {self._length:,}\n\n")
+        draw = _state_drawer(self._recording)
+        for moment in moments_of(self._recording, self._phase, self._number):
+            step = f"\nstep {moment.t:,} of {self._length:,}\n\n"
+            yield Text.assemble((self._title, "bold"), step, draw(moment.observation), _in_words(moment))
 
 
-def _below(moment: Moment) -> Text:
-    from rich.text import Text
-
+def _in_words(moment: Moment) -> str:
     if not moment.action:
-        return Text("the start")
-    return Text(
+        return "the start"
+    return (
         f"{moment.action}\nreward {_joined(moment.rewards)}, so far {_joined(moment.returns)}\n"
         + ", ".join(filter(None, [moment.events, moment.ended]))
     )

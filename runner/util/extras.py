@@ -22,7 +22,6 @@ _PACKAGES: Final = {
     "rerun_notebook": "rerun-notebook",
     "resvg_py": "resvg-py",
     "sklearn": "scikit-learn",
-    "textual_image": "textual-image",
 }
 """Module -> its package, where the names differ."""
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import itertools
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import click
 
@@ -21,22 +20,12 @@ from runner.cli.options import (
     json_option,
     recordings_option,
     run_argument,
-    trust_option,
 )
 from runner.cli.output import console, echo, print_json, say
-from runner.cli.progress import stage_line
 from runner.cli.runs import find_recorded
-from runner.errors import MissingExtra
-from runner.util.extras import require
 
 if TYPE_CHECKING:
-    from rich.console import Console, ConsoleOptions, RenderResult
-    from rich.live import Live
-
-    from runner.cli.episode import Frame
-    from runner.export.episodes import EpisodePlace
-    from runner.export.pictures import Pictures
-    from runner.recording.reader import Recording
+    from rich.text import Text
 
 ReadKey = Callable[[float | None], str]
 """Waits for a key, at most a number of seconds; returns its meaning, empty if none was pressed."""
@@ -52,8 +41,6 @@ _MEANINGS: Final = {
     **dict.fromkeys((b"n", b"\x1b[C", b"\xe0M"), "forward"),
 }
 """The bytes that terminals send (of arrows escape sequences, on Windows after 0xE0), and their meaning."""
-_MAX_COLUMNS: Final = 100
-"""The largest width of a picture."""
 _POLL_SECONDS: Final = 0.02
 
 
@@ -69,8 +56,6 @@ def play_command(
         metavar="STEPS",
         help="Steps per second.",
     ),
-    no_pictures: bool = option("--no-pictures", is_flag=True, help="Show text alone."),
-    trust: bool = trust_option,
     recordings: Path | None = recordings_option,
     as_json: bool = json_option,
 ) -> None:
@@ -83,9 +68,7 @@ def play_command(
     step stays until a key is pressed. Where stdout is no
     terminal, the frames come one after another, without waiting. --json prints one line for each step.
 
-    In a terminal it shows pictures, as `dualtaxi export film` does: by the terminal's graphics (kitty,
-    sixel), else by coloured half blocks. Scenes are drawn in text where there are no graphics. NO_COLOR and
-    --no-pictures turn pictures off.
+    `dualtaxi export film` writes the pictures of an episode.
 
     Examples:
       dualtaxi play @latest
@@ -95,6 +78,7 @@ def play_command(
     """
     choice.require_one()
     from runner.cli.episode import Episode
+    from runner.export.values import Values
     from runner.recording.reader import open_recording
 
     run, terminal = find_recorded(run_name, recordings), console()
@@ -105,96 +89,26 @@ def play_command(
             for step in played.steps():
                 print_json(step, indent=None)
             return
+        if not recording.tabular and Values(recording.spaces["observation"], "observation").image:
+            say(f"Observations that are pictures are not shown: `dualtaxi export film {run_name}` does.")
         if not terminal.is_terminal or terminal.is_dumb_terminal:
             for frame in played.frames():
-                text = (frame.above + frame.below).plain
-                echo("\n".join(line.rstrip() for line in text.splitlines()) + "\n")
+                echo("\n".join(line.rstrip() for line in frame.plain.splitlines()) + "\n")
             return
-        image = None if no_pictures else _image_type(recording.tabular)
-        frames = played.frames()
-        if image is not None and (shown := _pictures(recording, place, trust, stack)) is not None:
-            frames = played.illustrated(shown)
 
         from rich.live import Live
-
-        live = stack.enter_context(Live(console=terminal, auto_refresh=False, vertical_overflow="crop"))
-        read_key = stack.enter_context(_key_reader())
-        _play(frames, 1 / speed, read_key, _Screen(live, image).show)
-
-
-def _image_type(is_tabular: bool) -> Any:
-    """Return what draws pictures in this terminal, a renderable of `textual_image`; None for nothing.
-
-    To find out, the terminal is queried once; its reply comes on stdin.
-    """
-    if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or not sys.stdin.isatty():
-        return None
-    try:
-        drawn = require("textual_image.renderable", "PIL", extra="film", purpose="play with pictures")
-    except MissingExtra as error:
-        if not is_tabular:  # a scene is drawn in text
-            say(str(error))
-        return None
-    has_graphics = drawn.Image in (drawn.SixelImage, drawn.TGPImage)
-    return drawn.Image if has_graphics or not is_tabular else None
-
-
-def _pictures(
-    recording: Recording, place: EpisodePlace, trust: bool, stack: contextlib.ExitStack
-) -> Pictures | None:
-    """Return the pictures of an episode, closed with the stack; None if there are only values."""
-    from runner.export.pictures import Source, pictures
-
-    with stage_line("drawing the first picture"):
-        shown = pictures(recording, place.phase, place.number, trust)
-    stack.callback(shown.close)
-    if shown.source is Source.VALUES:
-        say(f"There are no pictures: {shown.reason}")
-        return None
-    return shown
-
-
-class _Screen:
-    """Shows frames in a live display."""
-
-    def __init__(self, live: Live, image: Any) -> None:
-        self._live, self._image = live, image
-        self._shown: Any = None
-
-    def show(self, frame: Frame, keys: str) -> None:
-        """Show a frame, and a line about the keys below it if that is not empty."""
-        from rich.console import Group
         from rich.text import Text
 
-        below = Text.assemble(frame.below, (f"\n{keys}" if keys else "", "dim"))
-        if not frame.picture:
-            self._live.update(frame.above + below, refresh=True)
-            return
-        before, self._shown = self._shown, self._image(io.BytesIO(frame.picture), "auto", "auto")
-        lines = len(frame.above.plain.splitlines()) + len(below.plain.splitlines()) + 2
-        height = max(self._live.console.height - lines, 4)
-        picture = _Bounded(self._shown, _MAX_COLUMNS, height)
-        above = frame.above.copy()
-        above.rstrip()
-        self._live.update(Group(above, picture, below), refresh=True)
-        if before is not None:
-            before.cleanup()  # a terminal with graphics keeps every picture until it is removed
+        live = stack.enter_context(Live(console=terminal, auto_refresh=False, vertical_overflow="crop"))
 
+        def show(frame: Text, keys: str) -> None:
+            live.update(Text.assemble(frame, (f"\n{keys}" if keys else "", "dim")), refresh=True)
 
-class _Bounded:
-    """A renderable of at most some columns and lines."""
-
-    def __init__(self, inner: Any, columns: int, lines: int) -> None:
-        self._inner, self._columns, self._lines = inner, columns, lines
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Render it within these bounds."""
-        width = min(options.max_width, self._columns)
-        yield from console.render(self._inner, options.update(width=width, height=self._lines))
+        _play(played.frames(), 1 / speed, stack.enter_context(_key_reader()), show)
 
 
 def _play(
-    frames: Iterator[Frame], seconds: float, read_key: ReadKey | None, show: Callable[[Frame, str], None]
+    frames: Iterator[Text], seconds: float, read_key: ReadKey | None, show: Callable[[Text, str], None]
 ) -> None:
     """Show frames at even intervals; keys pause, step back and forward, restart and quit.
 
