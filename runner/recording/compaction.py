@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
-from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from runner.recording import schema
@@ -21,9 +20,9 @@ from runner.recording.chunks import encode_chunk
 from runner.recording.messages import decode, encode
 from runner.recording.pipeline import MessageBatches
 from runner.recording.recorder import BLOCK_BYTES
-from runner.recording.records import ReadChunk, attachment_of, metadata_of, read_chunk
+from runner.recording.records import ReadChunk
 from runner.recording.rewriting import whole_records
-from runner.recording.schema import TOPIC_OF, Topic
+from runner.recording.schema import Topic
 from runner.recording.writer import RecordingFile
 from runner.util.files import replacing
 from runner.util.packing import Packing
@@ -56,7 +55,7 @@ class _Compaction:
 
     def take(self, chunk: ReadChunk) -> None:
         """Take a chunk of the old recording."""
-        topic = TOPIC_OF[chunk.summary.channel]
+        topic = chunk.topic
         if topic not in self._kept and len(chunk.records) > _SMALL:
             self._batches.flush_topic(topic)
             self._write(topic, chunk.records, chunk.times, chunk.offsets)
@@ -116,13 +115,11 @@ def compacted(
         fresh = RecordingFile(path, file.topics)
         try:
             writing = _Compaction(fresh, packing, steps, environments)
-            for opcode, offset, body in whole_records(file.path):
-                if opcode == Opcode.METADATA:
-                    fresh.add_metadata(*metadata_of(body))
-                elif opcode == Opcode.ATTACHMENT:
-                    fresh.add_attachment(*attachment_of(body, offset))
-                elif opcode == Opcode.CHUNK:
-                    writing.take(read_chunk(body, offset))
+            for record in whole_records(file.path):
+                if isinstance(record, ReadChunk):
+                    writing.take(record)
+                else:
+                    fresh.copy(record)
             writing.finish()
         except BaseException:
             fresh.close()

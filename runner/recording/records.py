@@ -57,9 +57,26 @@ Report = Callable[[int, int], None]
 """Called with the bytes that were read, and the size of the file."""
 
 
+class MetadataRecord(NamedTuple):
+    """A metadata record."""
+
+    name: str
+    entries: dict[str, str]
+
+
+class AttachmentRecord(NamedTuple):
+    """An undamaged attachment."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+
 class ReadChunk(NamedTuple):
     """An undamaged chunk and its messages."""
 
+    body: bytes
+    """The body of the record, as it is in the file."""
     summary: ChunkSummary
     records: bytes
     """The message records."""
@@ -69,10 +86,24 @@ class ReadChunk(NamedTuple):
     """Where each message begins in `records`."""
 
     @property
+    def offset(self) -> int:
+        """Where the record is in the file."""
+        return int(self.summary.index.chunk_start_offset)
+
+    @property
+    def topic(self) -> schema.Topic:
+        """The topic of its messages."""
+        return schema.TOPIC_OF[self.summary.channel]
+
+    @property
     def messages(self) -> list[bytes]:
         """The message records one by one."""
         edges = pairwise([*self.offsets.tolist(), len(self.records)])
         return [self.records[start:stop] for start, stop in edges]
+
+
+Record = MetadataRecord | AttachmentRecord | ReadChunk
+"""A record that a copy of a recording takes over; all others are written anew."""
 
 
 @dataclass
@@ -162,7 +193,7 @@ def read_chunk(body: bytes, offset: int) -> ReadChunk:
         message_start_time=head.start_time,
         uncompressed_size=head.uncompressed_size,
     )
-    return ReadChunk(ChunkSummary(index, channel, len(times)), records, times, offsets)
+    return ReadChunk(body, ChunkSummary(index, channel, len(times)), records, times, offsets)
 
 
 def _checked_messages(records: bytes, where: str) -> tuple[int, NDArray[np.uint64], NDArray[np.uint64]]:
@@ -205,22 +236,35 @@ def _checked_messages(records: bytes, where: str) -> tuple[int, NDArray[np.uint6
     return channel, block["log_time"], offsets
 
 
-def copied_chunk(chunk: ReadChunk, body: bytes, indexed: bool) -> Chunk:
+def read_record(opcode: int, offset: int, body: bytes) -> Record | None:
+    """Return the record with this body; None if it is of another kind.
+
+    Raises:
+        RecordingError: it is damaged, or no recorder writes it.
+    """
+    if opcode == Opcode.CHUNK:
+        return read_chunk(body, offset)
+    if opcode == Opcode.ATTACHMENT:
+        return attachment_of(body, offset)
+    return metadata_of(body) if opcode == Opcode.METADATA else None
+
+
+def copied_chunk(chunk: ReadChunk, indexed: bool) -> Chunk:
     """Return a chunk to be written as it was read, with its times and its message index made again.
 
     Args:
         indexed: whether the recording has message indexes.
     """
     summary, start, end = chunk.summary, int(chunk.times[0]), int(chunk.times[-1])
-    body = _CHUNK_TIMES.pack(start, end) + body[_CHUNK_TIMES.size :]  # no checksum covers them
-    indexed = has_message_index(schema.TOPIC_OF[summary.channel], indexed)
+    body = _CHUNK_TIMES.pack(start, end) + chunk.body[_CHUNK_TIMES.size :]  # no checksum covers them
+    indexed = has_message_index(chunk.topic, indexed)
     index = message_index(summary.channel, chunk.times, chunk.offsets) if indexed else b""
     entry = replace(summary.index, message_start_time=start, message_end_time=end)
     return Chunk(RECORD_HEAD.pack(Opcode.CHUNK, len(body)) + body, index, replace(summary, index=entry))
 
 
-def attachment_of(body: bytes, offset: int) -> tuple[str, str, bytes]:
-    """Return the name, media type and data of an attachment record.
+def attachment_of(body: bytes, offset: int) -> AttachmentRecord:
+    """Return the attachment in a record.
 
     Raises:
         RecordingError: its checksum does not match, or it has times, which no recorder writes.
@@ -232,11 +276,11 @@ def attachment_of(body: bytes, offset: int) -> tuple[str, str, bytes]:
     data = body[stream.count : -4]
     if len(data) != size or times != (0, 0) or crc32(body[:-4]) != int.from_bytes(body[-4:], "little"):
         raise RecordingError(f"attachment at {offset}: its content does not match its checksum")
-    return name, media_type, data
+    return AttachmentRecord(name, media_type, data)
 
 
-def metadata_of(body: bytes) -> tuple[str, dict[str, str]]:
-    """Return the name and entries of a metadata record.
+def metadata_of(body: bytes) -> MetadataRecord:
+    """Return the metadata in a record.
 
     Raises:
         RecordingError: it is larger than `MAX_METADATA_BYTES`.
@@ -244,7 +288,7 @@ def metadata_of(body: bytes) -> tuple[str, dict[str, str]]:
     if len(body) > MAX_METADATA_BYTES:
         raise RecordingError(f"metadata of {len(body):,} bytes, expected {MAX_METADATA_BYTES:,} at most")
     record = Metadata.read(ReadDataStream(BytesIO(body)))
-    return record.name, dict(record.metadata)
+    return MetadataRecord(record.name, dict(record.metadata))
 
 
 def asks_for_indexes(config: dict[str, str]) -> bool:

@@ -32,13 +32,11 @@ from runner.recording.reader import open_recording
 from runner.recording.records import (
     IN_DATA,
     UNREADABLE,
+    MetadataRecord,
     ReadChunk,
+    Record,
     Report,
-    asks_for_indexes,
-    attachment_of,
-    copied_chunk,
-    metadata_of,
-    read_chunk,
+    read_record,
 )
 from runner.recording.schema import Topic
 from runner.recording.writer import RecordingFile
@@ -114,10 +112,10 @@ def can_be_repaired(path: Path) -> bool:
     """Return whether a damaged recording holds messages that a repair can keep."""
     described, has_messages = set(), False
     with contextlib.suppress(RecordingError, OSError), open_regular(path) as stream:
-        for opcode, _, body in DamagedFile(stream, path).good_records():
-            has_messages |= opcode == Opcode.CHUNK
-            if opcode == Opcode.METADATA:
-                described.add(metadata_of(body)[0])
+        for record in DamagedFile(stream, path).good_records():
+            has_messages |= isinstance(record, ReadChunk)
+            if isinstance(record, MetadataRecord):
+                described.add(record.name)
             if has_messages and described >= REQUIRED_RECORDS:
                 return True
     return False
@@ -135,13 +133,11 @@ def _salvage(path: Path, fresh: Path, report: Report, stated: Mapping[str, int])
 
 
 def _kind(file: DamagedFile, path: Path) -> str:
-    for opcode, _, body in file.good_records():
-        if opcode == Opcode.METADATA:
-            name, entries = metadata_of(body)
-            if name == "run":
-                check_run(entries, str(path))
-                return kind_of(entries)
-        if opcode == Opcode.CHUNK:
+    for record in file.good_records():
+        if isinstance(record, MetadataRecord) and record.name == "run":
+            check_run(record.entries, str(path))
+            return kind_of(record.entries)
+        if isinstance(record, ReadChunk):
             break
     return "job"
 
@@ -174,7 +170,6 @@ class _Salvage:
         self._topics = topics
         self._damaged = damaged
         self._done = Repair(path)
-        self._indexed = True
         self._dtypes: dict[Topic, np.dtype[np.void]] = {}
         self._next = dict.fromkeys(topics, 0)
         """The number of the next message expected of each topic."""
@@ -188,16 +183,15 @@ class _Salvage:
         """Write the new file."""
         described = set()
         with RecordingFile(fresh, self._topics) as file:
-            for opcode, offset, body in self._damaged.good_records(report):
-                if opcode == Opcode.METADATA:
-                    name, entries = metadata_of(body)
-                    described.add(name)
-                    self._take_metadata(file, name, entries)
-                elif opcode == Opcode.ATTACHMENT:
-                    file.add_attachment(*attachment_of(body, offset))
-                elif opcode == Opcode.CHUNK:
+            for record in self._damaged.good_records(report):
+                if isinstance(record, MetadataRecord):
+                    described.add(record.name)
+                    self._take_metadata(file, record)
+                elif isinstance(record, ReadChunk):
                     self._check_described(described)
-                    self._take_chunk(file, offset, body)
+                    self._take_chunk(file, record)
+                else:
+                    file.copy(record)
             self._check_described(described)
             self._finish(file)
         return self._done
@@ -209,31 +203,30 @@ class _Salvage:
                 "its messages cannot be interpreted. `dualtaxi resume` retrains the run."
             )
 
-    def _take_metadata(self, file: RecordingFile, name: str, entries: dict[str, str]) -> None:
+    def _take_metadata(self, file: RecordingFile, record: MetadataRecord) -> None:
+        name, entries = record
         if name == "result":
             with contextlib.suppress(RecordingError):  # one that makes no sense is worth as much as none
                 self._counts, self._result = _recorded_counts(entries), entries
             return
         if name == "repair":
             return
-        if name == "config":
-            self._indexed = asks_for_indexes(entries)
         if name == "run":
             check_run(entries, str(self._path))
             self._dtypes = dtypes_of(entries, str(self._path))
-        file.add_metadata(name, entries)
+        file.copy(record)
 
-    def _take_chunk(self, file: RecordingFile, offset: int, body: bytes) -> None:
-        """Copy a good chunk and make its index again; note a hole before it."""
-        chunk, where = read_chunk(body, offset), f"{self._path}: chunk at {offset}"
-        topic, count = schema.TOPIC_OF[chunk.summary.channel], chunk.summary.messages
+    def _take_chunk(self, file: RecordingFile, chunk: ReadChunk) -> None:
+        """Copy a good chunk; note a hole before it."""
+        where = f"{self._path}: chunk at {chunk.offset}"
+        topic, count = chunk.topic, chunk.summary.messages
         if topic not in self._topics:
             raise RecordingError(f"{where}: found messages of another kind of run.")
         first = expected = self._next[topic]
         if topic is schema.EXTRA_COLUMNS_TOPIC:
             self._take_extra_columns(chunk)
         if topic.message is schema.EXTRA and len(chunk.records) // count not in self._extra_widths:
-            self._damaged.lost_bytes += len(body)  # their names are lost
+            self._damaged.lost_bytes += len(chunk.body)  # their names are lost
             return
         if topic in self._dtypes:
             if len(chunk.records) % self._dtypes[topic].itemsize:
@@ -247,7 +240,7 @@ class _Salvage:
         if first > expected:
             self._done.lost.setdefault(topic.name, []).append([expected, first])
         self._next[topic] = first + count
-        file.add_chunk(copied_chunk(chunk, body, self._indexed))
+        file.copy(chunk)
         self._done.kept[topic.name] = self._done.kept.get(topic.name, 0) + count
 
     def _take_extra_columns(self, chunk: ReadChunk) -> None:
@@ -340,17 +333,18 @@ class DamagedFile:
         if (magic := self._read(0, len(MCAP0_MAGIC))) != MCAP0_MAGIC:
             raise RecordingError(f"{path}: found {magic!r} at its start, expected an MCAP file.")
 
-    def good_records(self, report: Report = lambda *_: None) -> Iterator[tuple[int, int, bytes]]:
-        """Yield (opcode, offset, body) of the readable records, skipping all others."""
+    def good_records(self, report: Report = lambda *_: None) -> Iterator[Record]:
+        """Yield the readable metadata, attachments and chunks, skipping all that is damaged."""
         offset = len(MCAP0_MAGIC)
         while offset + RECORD_HEAD.size <= self.size:
             report(offset, self.size)
             opcode, length = RECORD_HEAD.unpack(self._read(offset, RECORD_HEAD.size))
             if (opcode, length) == (Opcode.DATA_END, 4):
                 return
-            body = self._good_body(opcode, length, offset)
-            if body is not None:
-                yield opcode, offset, body
+            is_good, record = self._good_record(opcode, length, offset)
+            if is_good:
+                if record is not None:
+                    yield record
                 offset += RECORD_HEAD.size + length
                 continue
             next_chunk = self._next_chunk(offset + 1)
@@ -360,21 +354,15 @@ class DamagedFile:
             offset = next_chunk
         self.lost_bytes += max(self.size - offset, 0)
 
-    def _good_body(self, opcode: int, length: int, offset: int) -> bytes | None:
-        """Return the body of the record at an offset; None if it is damaged."""
+    def _good_record(self, opcode: int, length: int, offset: int) -> tuple[bool, Record | None]:
+        """Return whether the record at an offset is undamaged, and what a copy takes of it."""
         start = offset + RECORD_HEAD.size
         if opcode not in IN_DATA or length > min(self.size - start, MAX_CHUNK_BYTES):
-            return None
+            return False, None
         try:
             if opcode == Opcode.CHUNK:
                 chunk_head(self._read(start, min(length, _LIKE_BYTES)), length, "")
-            body = self._read(start, length)
-            if opcode == Opcode.CHUNK:
-                read_chunk(body, offset)
-            elif opcode == Opcode.ATTACHMENT:
-                attachment_of(body, offset)
-            elif opcode == Opcode.METADATA:
-                metadata_of(body)
+            return True, read_record(opcode, offset, self._read(start, length))
         except (RecordingError, *UNREADABLE):
             self._allowance -= length
             if self._allowance < 0:
@@ -382,8 +370,7 @@ class DamagedFile:
                     f"{self._path}: too much of it only looks like chunks, last at {offset}: "
                     "it was made to exhaust its readers."
                 ) from None
-            return None
-        return body
+            return False, None
 
     def _next_chunk(self, offset: int) -> int:
         """Return the offset of the next good chunk, or the end of the file."""
@@ -392,7 +379,7 @@ class DamagedFile:
             for like in _LIKE_A_CHUNK.finditer(piece, 0, len(piece)):
                 at = offset + like.start()
                 _, length = RECORD_HEAD.unpack_from(piece, like.start())
-                if like.start() < _PIECE and self._good_body(Opcode.CHUNK, length, at) is not None:
+                if like.start() < _PIECE and self._good_record(Opcode.CHUNK, length, at)[0]:
                     return at
             offset += _PIECE
         return self.size

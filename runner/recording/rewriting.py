@@ -6,24 +6,20 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 
-from mcap.opcode import Opcode
-
 from runner.errors import RecordingError
 from runner.recording.digest import ContentHash, combined_digest
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
 from runner.recording.records import (
     UNREADABLE,
+    MetadataRecord,
     ReadChunk,
-    asks_for_indexes,
-    attachment_of,
-    copied_chunk,
-    metadata_of,
-    read_chunk,
+    Record,
+    read_record,
     walk,
 )
 from runner.recording.run_file import Summary
-from runner.recording.schema import ALL_TOPICS, STEP_MESSAGES, TOPIC_OF, Topic
+from runner.recording.schema import ALL_TOPICS, STEP_MESSAGES, Topic
 from runner.recording.writer import RecordingFile
 from runner.util.files import open_regular
 
@@ -52,29 +48,19 @@ def rewrite(
     Raises:
         OSError: the new file exists or cannot be written.
     """
-    indexed, result = True, None
+    result = None
     with open_recording(path) as recording:
         topics = recording.topics
     with RecordingFile(fresh, topics) as file:
-        for opcode, offset, body in whole_records(path):
-            if opcode == Opcode.METADATA:
-                name, entries = metadata_of(body)
-                if name == "config":
-                    indexed = asks_for_indexes(entries)
-                changed = change(name, entries)
-                if name == "result":
+        for record in whole_records(path):
+            if isinstance(record, MetadataRecord):
+                changed = change(*record)
+                if record.name == "result":
                     result = changed
                 elif changed is not None:
-                    file.add_metadata(name, changed)
-            elif opcode == Opcode.ATTACHMENT:
-                attachment = attachment_of(body, offset)
-                if attachment[0] not in left_out:
-                    file.add_attachment(*attachment)
-            elif opcode == Opcode.CHUNK:
-                chunk = read_chunk(body, offset)
-                topic = TOPIC_OF[chunk.summary.channel]
-                if topic.name not in left_out:
-                    file.add_chunk(copied_chunk(chunk, body, indexed))
+                    file.copy(record._replace(entries=changed))
+            elif (record.topic if isinstance(record, ReadChunk) else record).name not in left_out:
+                file.copy(record)
         add(file)
         for name, added in (more or {}).items():
             file.add_metadata(name, added)
@@ -90,8 +76,8 @@ def content_of(path: Path) -> str:
         RecordingError: it is damaged, or states another digest than its messages have.
     """
     seen = ContentHash()
-    for topic, chunk in _chunks(path):
-        seen.update(topic, chunk.records)
+    for chunk in _chunks(path):
+        seen.update(chunk.topic, chunk.records)
     with open_recording(path) as recording:
         result = recording.result
     if result.content_digest is not None and not _is_stated(result, seen.topics()):
@@ -111,14 +97,14 @@ def continues(path: Path, earlier: Path) -> bool:
             return False
     counts: Counter[Topic] = Counter()
     expected, seen = ContentHash(), ContentHash()
-    for topic, chunk in _chunks(earlier):
-        expected.update(topic, chunk.records)
-        counts[topic] += len(chunk.offsets)
-    for topic, chunk in _chunks(path):
-        shared = min(counts[topic], len(chunk.offsets))
-        counts[topic] -= shared
+    for chunk in _chunks(earlier):
+        expected.update(chunk.topic, chunk.records)
+        counts[chunk.topic] += len(chunk.offsets)
+    for chunk in _chunks(path):
+        shared = min(counts[chunk.topic], len(chunk.offsets))
+        counts[chunk.topic] -= shared
         end = len(chunk.records) if shared == len(chunk.offsets) else int(chunk.offsets[shared])
-        seen.update(topic, memoryview(chunk.records)[:end])
+        seen.update(chunk.topic, memoryview(chunk.records)[:end])
     return seen.topics() == expected.topics()
 
 
@@ -130,15 +116,12 @@ def _is_stated(result: Summary, seen: dict[str, str]) -> bool:
     return dict(result.topic_digests) == seen and combined_digest(seen) == result.content_digest
 
 
-def _chunks(path: Path) -> Iterator[tuple[Topic, ReadChunk]]:
-    for opcode, offset, body in whole_records(path):
-        if opcode == Opcode.CHUNK:
-            chunk = read_chunk(body, offset)
-            yield TOPIC_OF[chunk.summary.channel], chunk
+def _chunks(path: Path) -> Iterator[ReadChunk]:
+    return (record for record in whole_records(path) if isinstance(record, ReadChunk))
 
 
-def whole_records(path: Path) -> Iterator[tuple[int, int, bytes]]:
-    """Yield (opcode, offset, body) of the data section's records, up to where the file may be cut off.
+def whole_records(path: Path) -> Iterator[Record]:
+    """Yield the metadata, attachments and chunks of a recording, up to where the file may be cut off.
 
     Raises:
         RecordingError: it is damaged.
@@ -150,7 +133,7 @@ def whole_records(path: Path) -> Iterator[tuple[int, int, bytes]]:
     try:
         with open_regular(path) as stream:
             for opcode, offset, body in walk(stream, path.stat().st_size):
-                if opcode != Opcode.DATA_END:
-                    yield opcode, offset, body
+                if (record := read_record(opcode, offset, body)) is not None:
+                    yield record
     except UNREADABLE as error:
         raise RecordingError(f"{path}: a record of it cannot be read; `dualtaxi repair` mends it.") from error

@@ -36,7 +36,14 @@ from runner.recording.blocks import RECORD_HEAD
 from runner.recording.chunks import Chunk, ChunkSummary
 from runner.recording.index import FOOTER_BODY_BYTES, FOOTER_HEAD, checksum
 from runner.recording.messages import file_descriptor_set
-from runner.recording.records import Contents
+from runner.recording.records import (
+    AttachmentRecord,
+    Contents,
+    MetadataRecord,
+    Record,
+    asks_for_indexes,
+    copied_chunk,
+)
 from runner.recording.schema import ALL_TOPICS, KINDS, MESSAGES, PROFILE, Topic
 from runner.util import __version__
 
@@ -77,6 +84,7 @@ class RecordingFile:
         self._counts = {topic.channel: 0 for topic in ALL_TOPICS}
         self._start_time: int | None = None
         self._end_time = 0
+        self._indexed = True
         self.topics = tuple(topics)
         """The topics it has channels for."""
 
@@ -138,6 +146,17 @@ class RecordingFile:
         )
         self._append(record)
         self._attachments.append(index)
+
+    def copy(self, record: Record) -> None:
+        """Append a record of another recording; a chunk gets its times and its message index anew."""
+        if isinstance(record, MetadataRecord):
+            if record.name == "config":
+                self._indexed = asks_for_indexes(record.entries)
+            self.add_metadata(*record)
+        elif isinstance(record, AttachmentRecord):
+            self.add_attachment(*record)
+        else:
+            self.add_chunk(copied_chunk(record, self._indexed))
 
     def add_chunks(self, chunks: Sequence[Chunk]) -> None:
         """Append chunks of one topic each with their message indexes: all of them, or none if that fails."""

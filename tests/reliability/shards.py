@@ -30,7 +30,6 @@ import gymnasium
 import numpy as np
 from click.testing import CliRunner
 from gymnasium.vector import SyncVectorEnv
-from mcap.opcode import Opcode
 
 import runner
 from runner.cli import cli
@@ -42,7 +41,7 @@ from runner.recording.blocks import HEADER_BYTES
 from runner.recording.liveness import owner
 from runner.recording.messages import decode
 from runner.recording.metadata import check_run, dtypes_of
-from runner.recording.records import ReadChunk, metadata_of, read_chunk
+from runner.recording.records import MetadataRecord, ReadChunk
 from runner.recording.repair import DamagedFile
 from runner.runs.listing import run_at
 from runner.runs.shards import shards_of
@@ -219,24 +218,21 @@ def steps_in(path: Path) -> Counter[bytes]:
         return steps
     try:
         with open_regular(path) as stream:
-            for opcode, offset, body in DamagedFile(stream, path).good_records():
-                if opcode == Opcode.METADATA:
-                    name, entries = metadata_of(body)
-                    if name == "run":
-                        check_run(entries, str(path))
-                        dtypes = dtypes_of(entries, str(path))
-                elif opcode == Opcode.CHUNK:
-                    chunk = read_chunk(body, offset)
-                    topic = schema.TOPIC_OF[chunk.summary.channel]
-                    if topic.message in schema.STEP_MESSAGES:
-                        steps.update(values_of(chunk, topic, dtypes))
+            for record in DamagedFile(stream, path).good_records():
+                if isinstance(record, ReadChunk):
+                    if record.topic.message in schema.STEP_MESSAGES:
+                        steps.update(values_of(record, dtypes))
+                elif isinstance(record, MetadataRecord) and record.name == "run":
+                    check_run(record.entries, str(path))
+                    dtypes = dtypes_of(record.entries, str(path))
     except RunnerError:
         pass
     return steps
 
 
-def values_of(chunk: ReadChunk, topic: schema.Topic, dtypes: dict[schema.Topic, Any]) -> list[bytes]:
+def values_of(chunk: ReadChunk, dtypes: dict[schema.Topic, Any]) -> list[bytes]:
     """Return what the steps of a chunk hold that no fold may change; none of a reset in place of a step."""
+    topic = chunk.topic
     if topic in dtypes:
         rows = np.frombuffer(chunk.records, dtypes[topic])
         rows = rows[rows["t"] != schema.RESET_ONLY]

@@ -15,10 +15,9 @@ from runner.execution.verify import verify
 from runner.recording import schema
 from runner.recording.blocks import RECORD_HEAD
 from runner.recording.chunks import CHUNK_HEAD, encode_chunk
-from runner.recording.records import attachment_of, metadata_of, read_chunk, walk
+from runner.recording.records import ReadChunk, walk
 from runner.recording.repair import repair
 from runner.recording.rewriting import whole_records
-from runner.recording.schema import TOPIC_OF
 from runner.recording.writer import RecordingFile
 from runner.util.packing import Packing
 from tests.runner.recording.making import SAMPLED, TAXIS, make_run, middle_of, training
@@ -40,22 +39,19 @@ def repacked(run, folder, compression="zstd", level=19, damaged=None, altered=No
     copy.recording.unlink()
     places = [place for place, _, _ in packed_steps(run)]
     with RecordingFile(copy.recording) as file:
-        for opcode, offset, body in whole_records(run.recording):
-            if opcode == Opcode.METADATA:
-                file.add_metadata(*metadata_of(body))
-            elif opcode == Opcode.ATTACHMENT:
-                file.add_attachment(*attachment_of(body, offset))
-            elif opcode == Opcode.CHUNK:
-                chunk = read_chunk(body, offset)
-                records = bytearray(chunk.records)
-                records[-1] ^= offset in (places[k] for k in (altered, forged) if k is not None)
-                topic, packing = TOPIC_OF[chunk.summary.channel], Packing(compression, level)
-                fresh = encode_chunk(topic, bytes(records), chunk.times, chunk.offsets, packing)
-                if forged is not None and offset == places[forged]:
-                    own = bytearray(fresh.record)
-                    CHUNK_HEAD.pack_into(own, RECORD_HEAD.size, *CHUNK_HEAD.unpack_from(body))
-                    fresh = replace(fresh, record=bytes(own))
-                file.add_chunk(fresh)
+        for record in whole_records(run.recording):
+            if not isinstance(record, ReadChunk):
+                file.copy(record)
+                continue
+            records = bytearray(record.records)
+            records[-1] ^= record.offset in (places[k] for k in (altered, forged) if k is not None)
+            packing = Packing(compression, level)
+            fresh = encode_chunk(record.topic, bytes(records), record.times, record.offsets, packing)
+            if forged is not None and record.offset == places[forged]:
+                own = bytearray(fresh.record)
+                CHUNK_HEAD.pack_into(own, RECORD_HEAD.size, *CHUNK_HEAD.unpack_from(record.body))
+                fresh = replace(fresh, record=bytes(own))
+            file.add_chunk(fresh)
         file.finish()
     if damaged is not None:
         data = bytearray(copy.recording.read_bytes())

@@ -8,7 +8,6 @@ import pytest
 
 from runner.execution import verify as verifying
 from runner.execution.verify import verify
-from runner.recording import schema
 from runner.recording.chunks import encode_chunk
 from runner.recording.integrity import survey
 from runner.recording.reader import open_recording
@@ -61,9 +60,8 @@ def described_as(source, target, change):
             file.add_attachment(name, media_type, data)
         for entry in survey(source).chunks:
             body = source.read_bytes()[entry.index.chunk_start_offset + 9 :][: entry.index.chunk_length - 9]
-            _, records, times, offsets = read_chunk(body, entry.index.chunk_start_offset)
-            topic = schema.TOPIC_OF[entry.channel]
-            file.add_chunk(encode_chunk(topic, records, times, offsets, Packing()))
+            chunk = read_chunk(body, entry.index.chunk_start_offset)
+            file.add_chunk(encode_chunk(chunk.topic, chunk.records, chunk.times, chunk.offsets, Packing()))
         file.finish("result", recording.metadata("result"))
     return target
 

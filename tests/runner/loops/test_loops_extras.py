@@ -12,7 +12,6 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from rerun.chunk import RrdReader
 
@@ -28,9 +27,9 @@ from runner.recording.chunks import encode_chunk, message_index
 from runner.recording.integrity import survey
 from runner.recording.messages import encode
 from runner.recording.reader import open_recording
-from runner.recording.records import attachment_of, copied_chunk, metadata_of, read_chunk, walk
+from runner.recording.records import ReadChunk, copied_chunk
+from runner.recording.rewriting import whole_records
 from runner.recording.writer import RecordingFile
-from runner.util.files import open_regular
 from runner.util.packing import Packing
 from tests.runner.loops.making import Leaving, dualtaxi, make, play
 
@@ -304,17 +303,13 @@ def test_recordings_with_message_indexes_of_extras_are_read_as_those_without(tmp
     """Versions before wrote them."""
     run, _ = record_pole(tmp_path, 9000)
     earlier = Path(tmp_path, "earlier.mcap")
-    with open_regular(run.recording) as stream, RecordingFile(earlier, schema.KINDS["transition"]) as file:
-        for opcode, offset, body in walk(stream, run.recording.stat().st_size):
-            if opcode == Opcode.METADATA and (metadata := metadata_of(body))[0] != "result":
-                file.add_metadata(*metadata)
-            elif opcode == Opcode.ATTACHMENT:
-                file.add_attachment(*attachment_of(body, offset))
-            elif opcode == Opcode.CHUNK:
-                chunk = read_chunk(body, offset)
-                index = message_index(chunk.summary.channel, chunk.times, chunk.offsets)
-                new = replace(copied_chunk(chunk, body, indexed=True), index=index)
-                file.add_chunk(new)
+    with RecordingFile(earlier, schema.KINDS["transition"]) as file:
+        for record in whole_records(run.recording):
+            if isinstance(record, ReadChunk):
+                index = message_index(record.summary.channel, record.times, record.offsets)
+                file.add_chunk(replace(copied_chunk(record, indexed=True), index=index))
+            elif record[0] != "result":
+                file.copy(record)
         with runner.open_recording(run.recording) as recording:
             file.finish("result", recording.metadata("result"))
     assert earlier.stat().st_size > run.recording.stat().st_size + 9000 * 16
@@ -349,17 +344,12 @@ def test_forged_names_are_refused(tmp_path):
 def forge(source: Path, path: Path, payload: bytes) -> None:
     """Copy a recording with another message in place of the names of its extras."""
     contents = survey(source, keep_result=True)
-    with source.open("rb") as stream, RecordingFile(path, contents.topics) as file:
-        for opcode, offset, body in walk(stream, contents.size):
-            if opcode == 12:
-                file.add_metadata(*metadata_of(body))
-            elif opcode == 6:
-                chunk = read_chunk(body, offset)
-                topic = schema.TOPIC_OF[chunk.summary.channel]
-                new = copied_chunk(chunk, body, indexed=True)
-                if topic is schema.EXTRA_COLUMNS_TOPIC:
-                    time = int(chunk.times[0])
-                    record = message_record(topic, time, payload)
-                    new = encode_chunk(topic, record, chunk.times[:1], chunk.offsets[:1], Packing())
-                file.add_chunk(new)
+    with RecordingFile(path, contents.topics) as file:
+        for record in whole_records(source):
+            if isinstance(record, ReadChunk) and record.topic is schema.EXTRA_COLUMNS_TOPIC:
+                message = message_record(record.topic, int(record.times[0]), payload)
+                times, offsets = record.times[:1], record.offsets[:1]
+                file.add_chunk(encode_chunk(record.topic, message, times, offsets, Packing()))
+            else:
+                file.copy(record)
         file.finish()
