@@ -103,7 +103,7 @@ class ReadChunk(NamedTuple):
 
 
 Record = MetadataRecord | AttachmentRecord | ReadChunk
-"""A record that a copy of a recording takes over; all others are written anew."""
+"""A record that a copy of a recording takes over; the other kinds follow from these."""
 
 
 @dataclass

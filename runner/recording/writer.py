@@ -148,7 +148,7 @@ class RecordingFile:
         self._attachments.append(index)
 
     def copy(self, record: Record) -> None:
-        """Append a record of another recording; a chunk gets its times and its message index anew."""
+        """Append a record of another recording; the times and the message index of a chunk are made again."""
         if isinstance(record, MetadataRecord):
             if record.name == "config":
                 self._indexed = asks_for_indexes(record.entries)
