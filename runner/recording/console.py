@@ -44,12 +44,15 @@ _AGAIN_SECONDS: Final = 10.0
 """and a line that changed after it was recorded, when it is this long ago."""
 _MAX_MESSAGE: Final = 1 << 16
 
-_CONTROL: Final = re.compile(
-    r"\x1b\[([0-9;?]*)[ -/]*([@-~])"  # a sequence with its numbers and its letter
+_PIECE: Final = re.compile(
+    rf"(?P<text>[^\x00-\x08\x0a-\x1f\x7f-\x9f]{{1,{_MAX_COLUMNS}}})"
+    r"|\x1b\[(?P<count>\d{0,5})(?P<act>[ABGK])"
+    r"|\x1b\[[0-9;?]*[ -/]*[@-~]"  # colours and all else
     r"|\x1b\][^\x07\x1b]*(?:\x07|\x1b\\)?"  # a title or a link
     r"|\x1b[ -/]*[0-~]?"
     r"|[\x00-\x1f\x7f-\x9f]"
 )
+"""Text without control characters other than tabs, a sequence of the terminal, or a control character."""
 _NOTE: Final = f"Console output beyond {MAX_CONSOLE_BYTES >> 20} MB is not recorded."
 
 
@@ -154,58 +157,39 @@ class _Row:
 
 
 class Screen:
-    """The lines of one stream, as a terminal would show them: it knows the cursor, not the width."""
+    """The lines of one stream: text after a carriage return or a move of the cursor replaces its line."""
 
     def __init__(self) -> None:
         self._rows: dict[int, _Row] = {}
-        self._row = self._column = self._last = 0
+        self._row = self._last = 0
+        self._replaces = False
+        """Whether the next text replaces what its line has."""
 
     def write(self, now: float, text: str) -> None:
         """Show text that was written at some time."""
-        at = 0
-        for control in _CONTROL.finditer(text):
-            if control.start() > at:
-                self._put(now, text[at : control.start()])
-            at = control.end()
-            self._obey(now, control)
-        if at < len(text):
-            self._put(now, text[at:])
-
-    def _put(self, now: float, text: str) -> None:
-        while text:
+        for piece in _PIECE.finditer(text):
+            act, count = piece["act"] or piece[0], int(piece["count"] or 1)
             row = self._rows.setdefault(self._row, _Row(now))
-            part, text = text[: _MAX_COLUMNS - self._column], text[_MAX_COLUMNS - self._column :]
-            end = self._column + len(part)
-            row.text = row.text[: self._column].ljust(self._column) + part + row.text[end:]
-            row.is_new, self._column = True, end
-            if text:
-                self._move_to(now, self._row + 1)
+            if piece["text"]:
+                line = ("" if self._replaces else row.text) + piece["text"]
+                row.text, row.is_new, self._replaces = line[:_MAX_COLUMNS], True, False
+                if len(line) > _MAX_COLUMNS:
+                    self._move_to(self._row + 1)
+                    self._rows[self._row] = _Row(now, line[_MAX_COLUMNS:])
+                    self._replaces = False
+            elif act == "\n":
+                self._move_to(self._row + 1)
+            elif act == "A":
+                self._move_to(max(self._row - count, self._last - _WINDOW + 1, 0))
+            elif act == "B":
+                self._move_to(min(self._row + count, self._last))
+            elif act in ("\r", "G"):
+                self._replaces = True
+            elif act == "\b" or (act == "K" and (self._replaces or count == 2)):
+                row.text, row.is_new = row.text[:-1] if act == "\b" else "", True
 
-    def _obey(self, now: float, control: re.Match[str]) -> None:
-        """Move the cursor, or erase; colours and all else have no effect."""
-        numbers, letter = control[1] or "", control[2]
-        count = int(numbers) if numbers.isdecimal() and len(numbers) < 6 else 1
-        if control[0] == "\n":
-            self._move_to(now, self._row + 1)
-        elif control[0] == "\r" or (letter == "G" and count == 1):
-            self._column = 0
-        elif control[0] == "\b":
-            self._column = max(0, self._column - 1)
-        elif control[0] == "\t":
-            self._put(now, " " * (8 - self._column % 8))
-        elif letter == "A":
-            self._row = max(self._row - count, self._last - _WINDOW + 1, 0)
-        elif letter == "B":
-            self._row = min(self._row + count, self._last)
-        elif letter == "K" and (row := self._rows.get(self._row)) is not None:
-            row.text = row.text[: self._column] if numbers in ("", "0") else ""
-            row.is_new = True
-
-    def _move_to(self, now: float, row: int) -> None:
-        """Move the cursor to the beginning of a row."""
-        self._rows.setdefault(self._row, _Row(now))
-        self._row, self._column = row, 0
-        self._last = max(self._last, row)
+    def _move_to(self, row: int) -> None:
+        self._row, self._last, self._replaces = row, max(self._last, row), True
 
     def take(self, now: float, is_last: bool = False) -> Iterator[tuple[float, int, str]]:
         """Yield (when it was begun, number, text) of the lines that are to be recorded now."""
@@ -220,7 +204,7 @@ class Screen:
                 and (row.text or row.recorded is not None or number < self._last)
             ):
                 row.is_new, row.recorded = False, now
-                yield row.begun, number, row.text.rstrip()
+                yield row.begun, number, row.text.expandtabs().rstrip()
             if number <= self._last - _WINDOW and not row.is_new:
                 del self._rows[number]
 

@@ -57,17 +57,21 @@ def screen_of(*writes: str) -> list[str]:
         (["a", " ", "b", "\n"], ["a b"]),
         (["no end"], ["no end"]),
         (["\r 10 %", "\r 50 %", "\r100 %", "\n"], ["100 %"]),
-        (["loading\rdone\n"], ["doneing"]),
+        (["loading\rdone\n"], ["done"]),
         (["loading\r\x1b[Kdone\n"], ["done"]),
         (["\x1b[31mred\x1b[0m \x1b]0;title\x07text\n"], ["red text"]),
         (["one\ntwo\n\x1b[2Aeins\n\n"], ["eins", "two"]),
         (["a\tb\x00\x07\n"], ["a       b"]),
-        (["abc\b\bX\n"], ["aXc"]),
+        (["abc\b\bX\n"], ["aX"]),
+        (["one\r\n", "two\r\n"], ["one", "two"]),
+        (["half\r", "\x1b[K"], []),
+        (["\router 1", "\n", "\rinner 1", "\x1b[A", "\router 2", "\n\rinner 2\x1b[A", "\n\n"], ["outer 2", "inner 2"]),
+        (["one\ntwo\n\x1b[2A\x1b[2Bthree\n"], ["one", "two", "three"]),
         (["x" * 5000 + "\n"], ["x" * 4096, "x" * 904]),
         (["Zürich 日本\n"], ["Zürich 日本"]),
     ],
 )
-def test_lines_are_what_a_terminal_would_show(writes, lines):
+def test_text_after_a_return_or_a_move_of_the_cursor_replaces_its_line(writes, lines):
     assert screen_of(*writes) == lines
 
 
