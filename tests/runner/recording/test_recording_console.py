@@ -65,7 +65,10 @@ def screen_of(*writes: str) -> list[str]:
         (["abc\b\bX\n"], ["aX"]),
         (["one\r\n", "two\r\n"], ["one", "two"]),
         (["half\r", "\x1b[K"], []),
-        (["\router 1", "\n", "\rinner 1", "\x1b[A", "\router 2", "\n\rinner 2\x1b[A", "\n\n"], ["outer 2", "inner 2"]),
+        (
+            ["\router 1", "\n", "\rinner 1", "\x1b[A", "\router 2", "\n\rinner 2\x1b[A", "\n\n"],
+            ["outer 2", "inner 2"],
+        ),
         (["one\ntwo\n\x1b[2A\x1b[2Bthree\n"], ["one", "two", "three"]),
         (["x" * 5000 + "\n"], ["x" * 4096, "x" * 904]),
         (["Zürich 日本\n"], ["Zürich 日本"]),
