@@ -4,7 +4,7 @@
     eval/success_percent, eval/mean_return/taxi_1, eval/events/taxi_1.drop_off, eval/training/epsilon, ...
     eval/exact/value/taxi_1, eval/exact/optimal_value, ... with `evaluation: {exact: true}`
     train/logged/loss, ... logged by a loop
-    train/episode/length, train/episode/return/taxi_1, ... of each episode: in TensorBoard; of loops in MLflow
+    train/episode/length, train/episode/return/taxi_1, ... of each episode
 
 Unknown values (a mean over no episode, success where the environment does not define it) are left out, so
 every number is one that was recorded, unchanged.

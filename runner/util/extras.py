@@ -17,7 +17,6 @@ from runner.util.values import Json
 _PROJECT: Final = "dualtaxi"
 _PACKAGES: Final = {
     "PIL": "pillow",
-    "mlflow": "mlflow-skinny",
     "rerun": "rerun-sdk",
     "rerun_notebook": "rerun-notebook",
     "resvg_py": "resvg-py",

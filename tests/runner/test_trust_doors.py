@@ -258,7 +258,6 @@ WITHOUT_RUN = frozenset(
     {
         *("archive", "completion", "config check", "config copy", "config ls", "config schema"),
         *(
-            "export mlflow",
             "index rebuild",
             "init",
             "label",

@@ -111,6 +111,5 @@ for _command in (
     export_tables.csv,
     export_tools.minari,
     export_tools.tensorboard,
-    export_tools.mlflow,
 ):
     export_command.add_command(_command)

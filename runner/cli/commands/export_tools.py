@@ -1,8 +1,6 @@
-"""`dualtaxi export minari`, `tensorboard` and `mlflow`: runs for other tools."""
+"""`dualtaxi export minari` and `tensorboard`: runs for other tools."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import click
 
@@ -10,13 +8,10 @@ from runner.cli.command import Command, option
 from runner.cli.options import (
     Writing,
     episodes_option,
-    force_option,
-    json_option,
-    recordings_option,
     run_argument,
     writing_options,
 )
-from runner.cli.output import print_written, say
+from runner.cli.output import say
 from runner.cli.parameter_types import Ranges
 from runner.cli.progress import count_line, stage_line
 from runner.cli.runs import opened_run
@@ -90,49 +85,3 @@ def tensorboard(
         f"tensorboard --logdir {path.parent} --samples_per_plugin scalars=100000"
     )
     to.report(text, path, numbers=count)
-
-
-@click.command("mlflow", cls=Command, short_help="A run in an MLflow store.")
-def mlflow(
-    run_name: str = run_argument,
-    tracking: str = option(
-        "--tracking-uri",
-        envvar="MLFLOW_TRACKING_URI",
-        default="sqlite:///exports/mlflow.db",
-        show_default="$MLFLOW_TRACKING_URI, or sqlite:///exports/mlflow.db",
-        metavar="URI",
-        help="The store: a database or a server.",
-    ),
-    experiment: str = option(
-        "--experiment",
-        default="dualtaxi",
-        show_default=True,
-        help="The experiment; created if it is missing.",
-    ),
-    with_recording: bool = option(
-        "--with-recording", is_flag=True, help="Also store the recording as an artifact."
-    ),
-    force: bool = force_option,
-    recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
-    """Export RUN into MLflow: parameters, metrics over training steps, tags, and run.json as an artifact.
-
-    A run that is already in the store, recognised by its id and content digest, is left as it is.
-
-    Examples:
-      dualtaxi export mlflow @latest
-      dualtaxi export mlflow k3v9m2xq --tracking-uri http://127.0.0.1:5000 --with-recording
-    """
-    from runner.export.mlflow import export, require_packages
-
-    require_packages()
-    with opened_run(run_name, recordings) as (_, recording), stage_line("writing to the store"):
-        result = export(recording, tracking, experiment, with_recording, force)
-    for note in result.notes:
-        say(note)
-    if result.exists:
-        say("The run is in the store already, with this content; nothing was written. --force replaces it.")
-    text = f"{tracking}  experiment {experiment}, run {result.mlflow_run}, {result.metrics:,} metrics written"
-    place = {"tracking_uri": tracking, "experiment": experiment, "mlflow_run": result.mlflow_run}
-    print_written(text, as_json, already=result.exists, metrics=result.metrics, **place)

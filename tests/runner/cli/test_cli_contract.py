@@ -98,7 +98,6 @@ WORDS = {
     "config check": "{tiny}",
     "archive": "@latest --to {folder}/archive",
     "restore": "other",
-    "export mlflow": "@latest --tracking-uri sqlite:///{folder}/mlflow.db",
     "import": "{recording} --as-new",
     "remote push": "@latest",
     "remote pull": "@latest",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 import warnings
 from pathlib import Path
@@ -54,9 +53,6 @@ def killed(folder, taxis):
 def export(tmp_path, monkeypatch):
     """The command, in an empty folder."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv(
-        "MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlflow.db"
-    )  # MLflow keeps stores open, by name
 
     def call(*words, code=0):
         result = CliRunner().invoke(cli, ["export", *map(str, words)])
@@ -213,109 +209,12 @@ def test_tensorboard_reads_the_measures(export, taxis):
     }
 
 
-def read_mlflow():
-    """Return the runs in the store, as MLflow's client gives them."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        from mlflow.tracking import MlflowClient
-
-        store = os.environ["MLFLOW_TRACKING_URI"]
-        client = MlflowClient(tracking_uri=store, registry_uri=store)
-        experiment = client.get_experiment_by_name("dualtaxi")
-        return [read_run(client, run) for run in client.search_runs([experiment.experiment_id])]
-
-
-def read_run(client, run):
-    run_id = run.info.run_id
-    return {
-        "id": run_id,
-        "status": run.info.status,
-        "start": run.info.start_time,
-        "params": run.data.params,
-        "tags": run.data.tags,
-        "files": [file.path for file in client.list_artifacts(run_id)],
-        "facts": json.loads(Path(client.download_artifacts(run_id, "run.json")).read_text()),
-        "history": {
-            name: [(m.timestamp, m.step, m.value) for m in client.get_metric_history(run_id, name)]
-            for name in run.data.metrics
-        },
-    }
-
-
-def test_mlflow_has_the_run_once(export, taxis):
-    export("mlflow", taxis.recording, "--with-recording")
-    (found,) = read_mlflow()
-    assert "already" in export("mlflow", taxis.recording).stderr
-    (again,) = read_mlflow()
-    assert again["id"] == found["id"]
-    assert found["status"] == "FINISHED"
-    assert found["files"] == ["recording.mcap", "run.json"]
-    assert found["facts"]["config"] == taxis.facts["config"]
-    assert found["params"]["evaluation.trials"] == "3"
-    assert found["params"]["env.kwargs.max_episode_steps"] == "90"
-    assert json.loads(found["params"]["env.kwargs.map"]) == TAXIS["env"]["kwargs"]["map"]
-    assert found["tags"]["dualtaxi.content_digest"] == taxis.summary["content_digest"]
-    assert found["start"] == round(taxis.created.timestamp() * 1000)
-    expected: dict[str, list[tuple[int, int, float]]] = {}
-    with open_recording(taxis.recording) as recording:
-        began, clock = taxis.created.timestamp(), read_clock(recording)
-        for moment in measures(recording):
-            at = round((began + float(np.interp(moment.position, clock.positions, clock.seconds))) * 1000)
-            for name, value in moment.values.items():
-                expected.setdefault(f"{moment.phase}/{name}", []).append((at, moment.step, value))
-    assert {name: sorted(points) for name, points in found["history"].items()} == {
-        name: sorted(points) for name, points in expected.items()
-    }
-    export("mlflow", taxis.recording, "--force")
-    (replaced,) = read_mlflow()
-    assert replaced["id"] != found["id"]
-    assert replaced["files"] == ["run.json"]
-
-
-def test_mlflow_accepts_every_name_of_a_logged_number(export, tmp_path):
-    with runner.record(gymnasium.make("CartPole-v1"), tmp_path / "loops", config={"a b|c": 1}) as env:
-        env.reset(seed=0)
-        for value, name in enumerate(("mean |q|", "mean _q_", "a\nb", "../up", "/", "x" * 300)):
-            env.log(name, np.array([value]))
-    errors = export("mlflow", env.run.recording).stderr
-    assert "'train/logged/mean |q|' is called 'train/logged/mean _q_': MLflow takes no such name." in errors
-    (found,) = read_mlflow()
-    logged = {key.removeprefix("train/logged/"): points[0][2] for key, points in found["history"].items()}
-    assert sorted(logged.values()) == [0, 1, 2, 3, 4, 5]
-    assert (logged["mean _q_"], logged["mean _q__2"], logged["a_b"]) == (0, 1, 2)
-    assert found["params"]["config.a b_c"] == "1"
-
-
-def test_mlflow_gets_lengths_and_returns_of_a_loops_episodes(export, tmp_path):
-    with runner.record(gymnasium.make("CartPole-v1"), tmp_path / "loops") as env:
-        lengths = []
-        for seed in range(3):
-            env.reset(seed=seed)
-            env.action_space.seed(seed)
-            lengths.append(0)
-            ended = False
-            while not ended:
-                _, _, terminated, truncated, _ = env.step(env.action_space.sample())
-                ended, lengths[-1] = terminated or truncated, lengths[-1] + 1
-    export("mlflow", env.run.recording)
-    (found,) = read_mlflow()
-    history = found["history"]
-    assert [value for _, _, value in history["train/episode/length"]] == lengths
-    assert [step for _, step, _ in history["train/episode/length"]] == list(np.cumsum(lengths))
-    (returns,) = [points for name, points in history.items() if name.startswith("train/episode/return/")]
-    assert [value for _, _, value in returns] == lengths
-
-
 def test_the_error_for_a_loop_without_steps_does_not_suggest_rerecording(export, tmp_path):
     with runner.record(gymnasium.make("CartPole-v1"), tmp_path / "loops") as env:
         env.reset(seed=0)
     errors = export("csv", env.run.recording, code=2).stderr
     assert "found no steps to export" in errors
     assert "rerecord" not in errors
-
-
-def test_an_unusable_store_is_reported(export, taxis):
-    assert "cannot" in export("mlflow", taxis.recording, "--tracking-uri", "nonsense://x", code=2).stderr
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "minari"])
@@ -378,7 +277,6 @@ def test_the_layout_for_foxglove_names_what_a_recording_has(taxis):
         ("minari", "minari", "minari"),
         ("minari", "h5py", "minari"),
         ("tensorboard", "tensorboardX", "tensorboard"),
-        ("mlflow", "mlflow", "mlflow"),
     ],
 )
 def test_a_missing_package_is_reported_with_its_extra(export, taxis, monkeypatch, form, package, extra):

@@ -11,7 +11,6 @@ from runner.analysis.compare.sections import unpaired
 from runner.analysis.groups import groups_of
 from runner.analysis.series import read_series
 from runner.errors import RunNotFound
-from runner.export.mlflow import tags_of
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from tests.runner.loops.making import make, play
@@ -30,9 +29,6 @@ def test_a_recording_is_titled_by_its_seed_only_if_it_has_one(tmp_path):
         run = loop(tmp_path, seed)
         with open_recording(run.recording) as recording:
             assert (recording.seed, recording.title, run.title) == (seed, title, title)
-            tags = tags_of(recording)
-            assert tags["mlflow.runName"] == title
-            assert ("dualtaxi.seed" in tags) == (seed is not None)
 
 
 def test_an_ambiguous_name_lists_no_seed_of_loops_without_one(tmp_path):
