@@ -62,21 +62,31 @@ class Shape:
         steps = table(layout.STEPS, "/train/step", "/eval/step")
         episodes = table(layout.EPISODES, "/train/episode", "/eval/episode")
         log = (
-            *(table(layout.LOG, "/log"), table(layout.CLOCK, "/clock"), table(layout.HOST, "/host")),
+            table(layout.LOG, "/log"),
+            table(layout.CLOCK, "/clock"),
+            table(layout.HOST, "/host"),
             table(layout.CONSOLE, "/console"),
         )
         if self.kind == "job":
             return (
-                *(steps, episodes),
-                *(table(layout.TRAIN_METRICS, "/train/metrics"), table(layout.EVAL_METRICS, "/eval/metrics")),
-                *(table(layout.OPTIMALITY, "/eval/optimality"), *log),
+                steps,
+                episodes,
+                table(layout.TRAIN_METRICS, "/train/metrics"),
+                table(layout.EVAL_METRICS, "/eval/metrics"),
+                table(layout.OPTIMALITY, "/eval/optimality"),
+                *log,
             )
         return (
-            *(steps, episodes, table(layout.RESETS, "/train/reset", "/eval/reset")),
-            *(table(layout.INFOS, "/train/info", "/eval/info"), table(layout.SCALARS, "/scalar")),
+            steps,
+            episodes,
+            table(layout.RESETS, "/train/reset", "/eval/reset"),
+            table(layout.INFOS, "/train/info", "/eval/info"),
+            table(layout.SCALARS, "/scalar"),
             table(layout.ARRAYS, "/array"),
-            *(table(layout.FRAMES, "/train/frame", "/eval/frame", "/image"), *log),
-            *(table(layout.CHECKPOINTS, "/checkpoint"), table(layout.EXTRA_COLUMNS, "/extra")),
+            table(layout.FRAMES, "/train/frame", "/eval/frame", "/image"),
+            *log,
+            table(layout.CHECKPOINTS, "/checkpoint"),
+            table(layout.EXTRA_COLUMNS, "/extra"),
             *((table(layout.EXTRAS, "/train/extra", "/eval/extra"),) if self.extras else ()),
             table(layout.RESET_STATES, "/train/reset_state", "/eval/reset_state"),
         )
@@ -118,22 +128,30 @@ class Shape:
     @cached_property
     def _steps(self) -> list[Column]:
         return [
-            *(_plain("step", _INT64), _plain("episode", _INT64)),
-            *(_plain("t", _INT32), _plain("state", _INT32), _plain("action", _INT32)),
+            _plain("step", _INT64),
+            _plain("episode", _INT64),
+            _plain("t", _INT32),
+            _plain("state", _INT32),
+            _plain("action", _INT32),
             *(Column(name, _INT32, self._action_of(i)) for i, name in enumerate(self.own_actions)),
             _plain("next_state", _INT32),
             *self._summed("reward", "rewards"),
             *self._explored(),
-            *(_plain("terminated", _FLAG), _plain("truncated", _FLAG)),
+            _plain("terminated", _FLAG),
+            _plain("truncated", _FLAG),
         ]
 
     @cached_property
     def _transitions(self) -> list[Column]:
         return [
-            *(_plain("step", _INT64), _plain("episode", _INT64), _plain("t", _INT32)),
-            *(*self.spaces["action"].columns, *self.spaces["next_observation"].columns),
+            _plain("step", _INT64),
+            _plain("episode", _INT64),
+            _plain("t", _INT32),
+            *self.spaces["action"].columns,
+            *self.spaces["next_observation"].columns,
             *self._summed("reward", "rewards"),
-            *(_plain("terminated", _FLAG), _plain("truncated", _FLAG)),
+            _plain("terminated", _FLAG),
+            _plain("truncated", _FLAG),
             *(_plain(name, _INT32) for name in ("acted", "agents_terminated", "agents_truncated")),
         ]
 
@@ -148,7 +166,8 @@ class Shape:
 
         return [
             *(_plain(name, _INT64) for name in ("reset", "episode", "step")),
-            *(_plain("environment", _INT32), Column("seed", pa.uint64(), read_seed, write_seed)),
+            _plain("environment", _INT32),
+            Column("seed", pa.uint64(), read_seed, write_seed),
             *self.spaces["observation"].columns,
         ]
 
@@ -165,8 +184,10 @@ class Shape:
     @cached_property
     def _episodes(self) -> list[Column]:
         return [
-            *(_plain("episode", _INT64), _plain("last_step", _INT64)),
-            *(_plain("length", _INT32), _plain("penalties", _INT32)),
+            _plain("episode", _INT64),
+            _plain("last_step", _INT64),
+            _plain("length", _INT32),
+            _plain("penalties", _INT32),
             *self._summed("return", "returns"),
             *(_plain(name, _FLAG) for name in ("success", "terminated", "truncated")),
             *(_plain(name, _INT32, "events", i) for i, name in enumerate(self.event_columns)),
@@ -309,7 +330,8 @@ def records_of(topic: Topic, batch: pa.RecordBatch, shape: Shape) -> Records:
     """Return the message records of rows that are all of one topic."""
     records = _blanks(topic, shape.dtypes[topic], batch.num_rows)
     times = numbers(batch.column("position")).astype(np.uint64) * _TICK
-    records["log_time"] = records["publish_time"] = times
+    records["log_time"] = times
+    records["publish_time"] = times
     for column in shape.columns_of(topic.message):
         if column.write is not None:
             column.write(records, batch.column(column.name))

@@ -82,41 +82,56 @@ SCHEMAS: Final = {
     HOST: _numbers(schema.HOST_TOPIC),
     CONSOLE: pa.schema(
         [
-            *(*_PLACED, ("started", pa.float64()), ("seconds", pa.float64())),
-            *(("stream", pa.int64()), ("line", pa.int64()), ("text", pa.string())),
+            *_PLACED,
+            ("started", pa.float64()),
+            ("seconds", pa.float64()),
+            ("stream", pa.int64()),
+            ("line", pa.int64()),
+            ("text", pa.string()),
         ]
     ),
     Q_TABLES: pa.schema(
         [
             *_PLACED,
-            *(("step", pa.int64()), ("episode", pa.int64()), ("agent", pa.string())),
+            ("step", pa.int64()),
+            ("episode", pa.int64()),
+            ("agent", pa.string()),
             *((name, pa.int32()) for name in ("table", "states", "actions")),
-            *(("blake3", pa.string()), ("data", pa.binary())),
+            ("blake3", pa.string()),
+            ("data", pa.binary()),
         ]
     ),
     INFOS: pa.schema([*PLACED_IN_PHASE, ("step", pa.int64()), ("reset", pa.bool_()), ("json", pa.string())]),
     SCALARS: pa.schema([*PLACED_IN_PHASE, *_LOGGED, ("value", pa.float64())]),
     ARRAYS: pa.schema(
         [
-            *(*PLACED_IN_PHASE, *_LOGGED),
-            *(("shape", pa.list_(pa.int64())), ("dtype", pa.string()), ("data", pa.binary())),
+            *PLACED_IN_PHASE,
+            *_LOGGED,
+            ("shape", pa.list_(pa.int64())),
+            ("dtype", pa.string()),
+            ("data", pa.binary()),
         ]
     ),
     CHECKPOINTS: pa.schema(
         [
-            *(*PLACED_IN_PHASE, *_LOGGED),
-            *(("digest", pa.string()), ("size", pa.int64()), ("format", pa.string())),
+            *PLACED_IN_PHASE,
+            *_LOGGED,
+            ("digest", pa.string()),
+            ("size", pa.int64()),
+            ("format", pa.string()),
         ]
     ),
     EXTRA_COLUMNS: pa.schema([*_PLACED, ("json", pa.string())]),
     RESET_STATES: pa.schema(
         [
-            *(*PLACED_IN_PHASE, ("reset", pa.int64()), ("environment", pa.int32())),
+            *PLACED_IN_PHASE,
+            ("reset", pa.int64()),
+            ("environment", pa.int32()),
             *((name, pa.binary()) for name in ("np_random_seed", "bit_generator", "ale_state")),
         ]
     ),
     FRAMES: pa.schema(
-        [*(*PLACED_IN_PHASE, ("format", pa.string()), ("data", pa.binary())), (FRAME_ID, pa.string())]
+        [*PLACED_IN_PHASE, ("format", pa.string()), ("data", pa.binary()), (FRAME_ID, pa.string())]
     ),
 }
 """The columns of the tables that are the same in every archive."""

@@ -49,7 +49,8 @@ class Store:
             raise RunnerError(f"{location}: found a URL, expected a folder or {S3}BUCKET/PREFIX.")
         else:
             self._folder = Path(location).expanduser().absolute()
-            self._root = self._url = str(self._folder)
+            self._url = str(self._folder)
+            self._root = self._url
             self._files = fs.LocalFileSystem()
 
     def place(self, run_id: str) -> str:

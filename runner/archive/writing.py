@@ -68,7 +68,8 @@ class TableWriter:
             column_encoding=encodings or None,
         )
         self._waiting: list[pa.RecordBatch] = []
-        self._rows = self._bytes = 0
+        self._rows = 0
+        self._bytes = 0
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="parquet")
         self._under_way: Future[None] | None = None
 

@@ -19,8 +19,18 @@ _FOLLOWS = "default_factory_not_called"
 """The type of the error of a default that depends on another value, whose own error is reported."""
 _BRANCHES = frozenset(
     (
-        *("integer", "number", "array", "Linear", "Exponential", "Piecewise"),
-        *("RandomTable", "RunTable", "SeedRange", "Range", "path", "mapping"),
+        "integer",
+        "number",
+        "array",
+        "Linear",
+        "Exponential",
+        "Piecewise",
+        "RandomTable",
+        "RunTable",
+        "SeedRange",
+        "Range",
+        "path",
+        "mapping",
     )
 )
 """Names in a location that stand for the branch of a union; none is a key."""

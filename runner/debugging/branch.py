@@ -276,7 +276,7 @@ class _Player:
         settings = recording.config.get("config")
         wrap: Callable[..., Any] = record_parallel if self._is_game else record
         with trusting(recording.path, maker, task.trust) as is_trusted, marking_nothing(not is_trusted):
-            self.rec = stepper.env = wrap(
+            stepper.env = wrap(
                 env,
                 self._folder,
                 name=task.name or f"{recording.name[:90]}.branch",
@@ -284,6 +284,7 @@ class _Player:
                 config={**(settings if isinstance(settings, Mapping) else {}), "origin": self.origin},
                 make=maker.make if is_trusted and maker.make else None,
             )
+            self.rec = stepper.env
         self.rec._enter(self.phase)
 
     def play(self) -> str:

@@ -41,7 +41,8 @@ class Continuation:
     def __init__(self, learner: Learner, moment: Moment) -> None:
         self._learner, self._moment = learner, moment
         learner.begin_evaluation()
-        self._settings = rules = learner.segment_at(moment.trained_step).rules
+        rules = learner.segment_at(moment.trained_step).rules
+        self._settings = rules
         draws_actions = len(rules.algorithm) == algorithms.WOLF_PHC
         # Without learning all others act alike; SARSA would expect that its next action is chosen already.
         algorithm = rules.algorithm if draws_actions else (0,) * algorithms.Q_LEARNING

@@ -185,7 +185,11 @@ def answer(
         if settings[0].share is not None:
             strongest = next(i for i, each in enumerate(mixing.factors) if each.name == settings[0].name)
             step = first_step(
-                *(mixing, strongest, question.seeds[0], folder, own.name),
+                mixing,
+                strongest,
+                question.seeds[0],
+                folder,
+                own.name,
                 lambda done, total: report(done, total, EPISODES),
                 stop,
             )

@@ -106,8 +106,14 @@ def weights_of(
                 segment = learner.segment_at(end - 1)
                 first = max(segment.start, start)
                 filled = spread(
-                    *(model, segment.rules, cell.learner, first, updates[first - start : end - start]),
-                    *(ledger, stretch, shares),
+                    model,
+                    segment.rules,
+                    cell.learner,
+                    first,
+                    updates[first - start : end - start],
+                    ledger,
+                    stretch,
+                    shares,
                 )
                 counted += filled
                 largest = _largest(largest, shares[:filled], limit)

@@ -187,7 +187,8 @@ class _Branches:
         ]
         steps: NDArray[np.void] = blocks[0][: self._playing.play(action, *blocks)]
         times = self._step["log_time"] + np.arange(len(steps), dtype=np.uint64) * schema.STEP_NANOSECONDS
-        steps["log_time"] = steps["publish_time"] = times
+        steps["log_time"] = times
+        steps["publish_time"] = times
         if action == int(self._step["action"]):
             steps[0]["explored"] = self._step["explored"]
         end = next((end for end in ("terminated", "truncated") if steps[-1][end]), "stopped")

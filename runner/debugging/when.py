@@ -209,7 +209,8 @@ def _search(
 ) -> _Found:
     """Evaluate an expression after the steps from `start` to before `stop`; unless `every`, to the first."""
     moments: list[Moment] = []
-    count = steps = 0
+    count = 0
+    steps = 0
     holds, expected = False, start
     limit = 2 * min(intervals, MAX_INTERVALS, MAX_VALUES // (2 * max(1, len(expression.terms))))
     for block in recording.blocks(schema.TRAIN_STEP, start, stop):

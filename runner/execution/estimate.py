@@ -44,7 +44,8 @@ class Estimate:
 
 def estimate(config: ExperimentConfig, step_limit: int) -> Estimate:
     """Return the estimate of one seed of an experiment; `step_limit` of its environment must not be 0."""
-    evaluations = trials = 0
+    evaluations = 0
+    trials = 0
     if config.evaluation is not None:
         evaluations = _occasions(config.episodes, config.evaluation.every)
         trials = evaluations * config.evaluation.trials

@@ -45,8 +45,12 @@ from runner.runs.run import RECORDING_FILE, Run
 from runner.util.files import storage_errors
 
 DECISIVE: Final = (
-    *("dualtaxi", "python", "machine"),
-    *("package.numpy", "package.numba", "package.llvmlite"),
+    "dualtaxi",
+    "python",
+    "machine",
+    "package.numpy",
+    "package.numba",
+    "package.llvmlite",
 )
 """Provenance that must be the same at the beginning of a run and when it is resumed."""
 _REPLACEMENT: Final = ".resuming"

@@ -161,7 +161,8 @@ def paint_values(recording: Recording, phase: str, episode: int) -> Painted:
             own = unknown if observation is None else values.numbers_in(observation)
             yield np.append(own, unpaid if step is None else step["rewards"])
 
-    low = high = np.zeros(len(names))
+    low = np.zeros(len(names))
+    high = low
     for now in numbers():
         finite = np.where(np.isfinite(now), now, np.nan)
         low, high = np.fmin(low, finite), np.fmax(high, finite)

@@ -36,9 +36,14 @@ PATTERNS: Final = tuple(
 )
 _METRICS: Final = pa.schema(
     [
-        *(("run_id", pa.string()), ("phase", pa.string()), ("position", pa.int64()), ("step", pa.int64())),
-        *(("episode", pa.int64()), ("seconds", pa.float64())),
-        *(("metric", pa.string()), ("value", pa.float64())),
+        ("run_id", pa.string()),
+        ("phase", pa.string()),
+        ("position", pa.int64()),
+        ("step", pa.int64()),
+        ("episode", pa.int64()),
+        ("seconds", pa.float64()),
+        ("metric", pa.string()),
+        ("value", pa.float64()),
     ]
 )
 _ROWS: Final = 8192
@@ -100,8 +105,14 @@ def _metrics(recording: Recording) -> Iterator[pa.RecordBatch]:
     clock = wall_clock(recording)
     rows = (
         (
-            *(recording.run_id, moment.phase, moment.position, moment.step, moment.episode),
-            *(None if clock is None else clock(moment.position), name, value),
+            recording.run_id,
+            moment.phase,
+            moment.position,
+            moment.step,
+            moment.episode,
+            None if clock is None else clock(moment.position),
+            name,
+            value,
         )
         for moment in measures(recording)
         for name, value in moment.values.items()

@@ -137,7 +137,8 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
         Raises:
             RunnerError: one cannot record its environments.
         """
-        self._run = run = self._begin(algorithm)
+        run = self._begin(algorithm)
+        self._run = run
         for group in _groups(algorithm):
             reasons = group.foreach_env_runner(self._joining(group is not algorithm.env_runner_group))
             if reason := next(filter(None, reasons), ""):

@@ -91,7 +91,8 @@ class ScriptRun:
         self._options = {"on_error": "warn"} | options
         self.settings: Json = dict(settings or {})
         self.name, self.takes_writers = name, takes_writers
-        self.closed = self.has_writer = False
+        self.closed = False
+        self.has_writer = False
         self.log_last: Callable[[], None] = lambda: None
         """Logs what is known at the end only; called before the run is closed."""
         self._recordings, self._has_environment = recordings, has_environment
@@ -199,7 +200,8 @@ class ScriptRun:
 
     def _leave_loop(self) -> None:
         """Let values wait for the next recording: this one failed, or the script ended its own."""
-        self._loop = self._step = None
+        self._loop = None
+        self._step = None
         self._has_joined, self._since, self._waiting_bytes = not self._is_own, 0.0, 0
         if self._is_own:
             self._release()

@@ -70,7 +70,8 @@ def record(env: Any, recordings: str | os.PathLike[str] | None = None, **options
     if isinstance(base._env, Recorded):
         raise ConfigError("found an environment that is recorded already, expected one that is not")
     recorder: Any = record_vector if isinstance(base._env, VectorEnv) else record_env
-    base._env = made = recorder(base._env, recordings, **options)
+    made = recorder(base._env, recordings, **options)
+    base._env = made
     made.close = partial(_close, made)
     return env
 

@@ -305,7 +305,8 @@ def _improve_policy(
     policy, average = tables.extra[POLICY], tables.extra[AVERAGE_POLICY]
     visits = tables.visits[i, state] + 1.0
     tables.visits[i, state] = visits
-    worth = usual = 0.0
+    worth = 0.0
+    usual = 0.0
     for action in range(Index(width)):
         cell = row + action
         average[cell] += (policy[cell] - average[cell]) / visits

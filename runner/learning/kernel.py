@@ -149,7 +149,8 @@ def train(
     discount = schedule_value(rules.discount, episode, step)
     epsilon = exploring(rules, episode, step)
     place = step % window
-    filled = ended = 0
+    filled = 0
+    ended = 0
     while filled < len(steps) and ended < len(episodes) and episode < until_episode and step < until_step:
         if t == 0:
             state = _start_state(model, draws.draw(draws.key(seed, draws.START, episode), 0))
@@ -242,7 +243,8 @@ def evaluate(
     joint_actions = len(model.own_action)
     every_learner = (1 << learners) - 1
     chance = draws.key(seed, draws.EVALUATION_OUTCOME, episode)
-    filled = ended = 0
+    filled = 0
+    ended = 0
     while filled < len(steps) and ended < len(episodes) and episode < until_episode:
         if t == 0:
             if start >= 0:

@@ -135,7 +135,8 @@ def replay_watched(
     An update changes values of its step's state only. So a greedy path is followed again only when the greedy
     action changed in one of its states.
     """
-    at = filled = 0
+    at = 0
+    filled = 0
     for k in range(len(steps)):
         state = Index(steps[k].state)
         is_on_path = False

@@ -36,8 +36,10 @@ class NamedEnvironments(AnyVectorEnv):
         self.spec = SimpleNamespace(id=env_id, kwargs={})  # type: ignore[assignment]
         self.metadata = {"autoreset_mode": mode}
         self.num_envs = number
-        self.observation_space = self.single_observation_space = observation
-        self.action_space = self.single_action_space = action
+        self.observation_space = observation
+        self.single_observation_space = observation
+        self.action_space = action
+        self.single_action_space = action
 
 
 class RecordedBatches(Recorded[BatchRows]):

@@ -194,7 +194,8 @@ class Extras:
         for name, dtype in dtypes.items():
             own = self._columns.get(name)
             base, shape = np.dtype(dtype.base.str), (*self._batch, *dtype.shape)
-            self._columns[name] = column = _column(base, shape, self._max_rows + 1)
+            column = _column(base, shape, self._max_rows + 1)
+            self._columns[name] = column
             if own is not None:
                 column.values[:left] = own.values[:left]
 

@@ -149,7 +149,8 @@ class _Fold:
         self._left_out = left_out
         self._read: dict[int, Counter[str]] = {source.number: Counter() for source in sources}
         """The messages read of each process, by topic."""
-        self._first = first = sources[0].recording
+        first = sources[0].recording
+        self._first = first
         self._mdp = first.mdp if first.tabular else None
         self._outcomes = Outcomes(self._mdp)
         self._units, self._evaluated = self._ordered()
@@ -173,12 +174,13 @@ class _Fold:
                 file.add_metadata(f"{SHARD_MAKER}/{name}", maker.to_metadata())
             for name, media_type, data in first.attachments():
                 file.add_attachment(name, media_type, data)
-            self._recorder = recorder = Recorder(
+            recorder = Recorder(
                 file,
                 dtypes,
                 packing=packing,
                 watch=self._outcomes.take_records,
             )
+            self._recorder = recorder
             try:
                 off_table = self._copy_units()
                 with tempfile.TemporaryFile(dir=fresh.parent) as spool:

@@ -45,7 +45,14 @@ class _IgnoredRows:
         """Return a function that does nothing."""
         return self.ignore
 
-    open = commit = finish = extend = reshape = take = take_game = reset = ignore
+    open = ignore
+    commit = ignore
+    finish = ignore
+    extend = ignore
+    reshape = ignore
+    take = ignore
+    take_game = ignore
+    reset = ignore
 
 
 class Loop(Generic[R]):

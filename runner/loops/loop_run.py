@@ -155,7 +155,8 @@ class LoopRun:
     def describe(self) -> None:
         """Write what makes the recording self-contained, once; from then on dtypes are fixed."""
         if not self._is_described:
-            self._is_described = self.is_settled = True
+            self._is_described = True
+            self.is_settled = True
             environment = self.described.attachments(), self._maker
             write_description(self._file, self._facts, self._config, self._provenance, *environment)
 

@@ -70,7 +70,8 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
         """Take a step in every environment, and record it, with arrays [N, ...] of your own by name."""
         watch, frames_every = self._watch, self._options.frames_every
         watch.steps += 1
-        over = states = None
+        over = None
+        states = None
         if frames_every or (watch.steps > watch.due and self._rows.is_any_over):
             with self._loop.lock:  # the rows are committed by another thread
                 over = self._rows.over

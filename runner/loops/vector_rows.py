@@ -74,13 +74,15 @@ class VectorRows:
             int(space.start) if self._discrete else 0  # type: ignore[attr-defined]
             for space in (described.observation, described.action)
         )
-        self._n = n = described.environments
+        n = described.environments
+        self._n = n
         self._log = EpisodeLog(n, 1, None)
         self._reset_count = 0
         self._observation_dtype = recorder.dtype(self._resets)["observation"]
         self._current = np.zeros(n, self._observation_dtype)
         """The observations before the first row of the block."""
-        self._room = self._filled = 0
+        self._room = 0
+        self._filled = 0
         """Rows of the block that are in use, of `_room`."""
         self._over = np.zeros(n, np.bool_)
         self._state = np.full(n, -self._state_start)
@@ -107,7 +109,8 @@ class VectorRows:
     def _make_room(self) -> None:
         """Allocate the block; the dtype of actions is known."""
         n = self._n
-        self._room = rows = max(1, min(_MAX_STEPS, self._recorder.capacity(self._steps) // n))
+        rows = max(1, min(_MAX_STEPS, self._recorder.capacity(self._steps) // n))
+        self._room = rows
         records = self._recorder.dtype(self._steps)
         action = self._action_leaves[0].base if self._discrete else records["action"]
         self._actions = np.empty((rows, n), action)
@@ -279,7 +282,9 @@ class VectorRows:
         self._put_ends(episodes.ended)
         self._put_block_resets(np.vstack([episodes.number, self._log.episode]), only_reset, first)
         self._over = over_after
-        self._filled = self._counted = self._ended_here = 0
+        self._filled = 0
+        self._counted = 0
+        self._ended_here = 0
         self._block_resets, self._finals, self._autoreset_states = [], [], {}
 
     def _put_records(self, episodes: Episodes, first: int) -> None:

@@ -23,8 +23,15 @@ from runner.util.arrays import Array
 
 DIGEST_BYTES: Final = 16
 COLUMNS: Final = (
-    *("action", "episode", "t", "terminated", "truncated", "acted"),
-    *("agents_terminated", "agents_truncated", "log_time"),
+    "action",
+    "episode",
+    "t",
+    "terminated",
+    "truncated",
+    "acted",
+    "agents_terminated",
+    "agents_truncated",
+    "log_time",
 )
 """The fields of a step that are kept, in the order of a message."""
 NUMBERS: Final = ("episode", "t", "log_time")

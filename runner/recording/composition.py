@@ -13,8 +13,13 @@ from runner.util.values import JsonView, is_whole
 
 _CHANGE_NOTHING: Final = frozenset(
     (
-        *("HumanRendering", "Monitor", "OrderEnforcing", "PassiveEnvChecker"),
-        *("RecordEpisodeStatistics", "RecordVideo", "RenderCollection"),
+        "HumanRendering",
+        "Monitor",
+        "OrderEnforcing",
+        "PassiveEnvChecker",
+        "RecordEpisodeStatistics",
+        "RecordVideo",
+        "RenderCollection",
     )
 )
 """Classes of wrappers that are left out: no step is another one with them."""

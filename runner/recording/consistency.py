@@ -94,7 +94,8 @@ class _Phase:
 
     def __init__(self, recording: Recording, phase: str, complete: bool, on_block: OnBlock) -> None:
         self._recording, self._phase, self._complete = recording, phase, complete
-        self._n = n = recording.environments
+        n = recording.environments
+        self._n = n
         self._learners = len(recording.agents)
         self._mdp = recording.mdp if recording.tabular else None
         self._episodes = EpisodeLog(n, self._learners, self._mdp)

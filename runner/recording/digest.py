@@ -30,7 +30,8 @@ class ContentHash:
         """Take in whole message records of a topic, in canonical form."""
         if topic.digested and len(records):
             if (own := self._topics.get(topic.name)) is None:
-                own = self._topics[topic.name] = blake3()
+                own = blake3()
+                self._topics[topic.name] = own
             own.update(memoryview(records).cast("B"))
 
     def topics(self) -> dict[str, str]:

@@ -95,7 +95,8 @@ class HostSampler:
 
     def _used(self) -> tuple[float, float]:
         """Return processor time in seconds and resident memory in bytes, of the process and its children."""
-        processor = memory = 0.0
+        processor = 0.0
+        memory = 0.0
         for process in (self._process, *self._children):
             with contextlib.suppress(self._psutil.Error, OSError), process.oneshot():
                 times = process.cpu_times()
@@ -125,7 +126,9 @@ class _Gpus:
         """Return the values of `GPU_FIELDS`, one a GPU."""
         values: dict[str, list[float]] = {name: [] for name in GPU_FIELDS}
         for handle in self._handles:
-            use = used = total = math.nan
+            use = math.nan
+            used = math.nan
+            total = math.nan
             with contextlib.suppress(Exception):  # each of its errors is a class of its own
                 memory = self._nvml.nvmlDeviceGetMemoryInfo(handle)
                 used, total = float(memory.used), float(memory.total)

@@ -119,7 +119,8 @@ def check_without_steps(recording: Recording, phase: str, on_block: OnBlock) -> 
     for name in ("reset", "episode"):
         for _ in records_of(recording, f"/{phase}/{name}", on_block):
             pass
-    expected = last = 0
+    expected = 0
+    last = 0
     for rows in recording.actions(phase):
         if rows["step"][0] != expected or (np.diff(rows["log_time"].astype(np.int64)) <= 0).any():
             raise Inconsistent(f"/{phase}/actions: found step {rows['step'][0]:,}, expected {expected:,}")

@@ -196,7 +196,8 @@ def dtypes_in(
     kind: str, learners: int, events: int, spaces: JsonView, path: str
 ) -> dict[Topic, np.dtype[np.void]]:
     """Return what `dtypes_of` returns, of a recording of this kind, whose spaces have these descriptions."""
-    action = observation = None
+    action = None
+    observation = None
     if kind in _FIXED_KINDS:
         action, observation = (
             dtype_of(spaces[name], f"{path}: the {name} space") for name in ("action", "observation")

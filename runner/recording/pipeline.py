@@ -94,7 +94,8 @@ class Pipeline:
         self._packing = packing
         self._beat = beat
         self._closed = False
-        self._last_beat = self._last_sync = time.monotonic()
+        self._last_sync = time.monotonic()
+        self._last_beat = self._last_sync
         self._encoders: ThreadPoolExecutor | None = None
         self._writer: threading.Thread | None = None
         self._queue: queue.Queue[tuple[_Work, Future[Chunk] | None] | None]
@@ -303,7 +304,8 @@ class MessageBatches:
             self.flush_topic(topic)
             batch = None
         if batch is None:
-            batch = self._batches[topic] = _Batch()
+            batch = _Batch()
+            self._batches[topic] = batch
         batch.records += records
         batch.times += log_times
         batch.size += size

@@ -138,7 +138,8 @@ class Recording(RowReader):
         total, ended = self.step_count(phase), self.count(episodes)
         if not total:
             raise RecordingError(f"{self.path}: has no {phase_name} steps.")
-        start = stop = 0
+        start = 0
+        stop = 0
         if 0 <= episode < ended and len(records := self.episodes(phase, episode, episode + 1)):
             stop = int(records[0]["last_step"]) + 1
             start = stop - (int(records[0]["length"]) - 1) * stride - 1

@@ -46,8 +46,13 @@ UNREADABLE: Final = (struct.error, ValueError, KeyError, McapError)
 """What parsing damaged records raises."""
 IN_DATA: Final = frozenset(
     {
-        *(Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK),
-        *(Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.ATTACHMENT),
+        Opcode.HEADER,
+        Opcode.SCHEMA,
+        Opcode.CHANNEL,
+        Opcode.CHUNK,
+        Opcode.MESSAGE_INDEX,
+        Opcode.METADATA,
+        Opcode.ATTACHMENT,
     }
 )
 """The kinds of records in the data section; after any other, nothing can be relied on."""

@@ -222,7 +222,8 @@ class _Salvage:
         topic, count = chunk.topic, chunk.summary.messages
         if topic not in self._topics:
             raise RecordingError(f"{where}: found messages of another kind of run.")
-        first = expected = self._next[topic]
+        expected = self._next[topic]
+        first = expected
         if topic is schema.EXTRA_COLUMNS_TOPIC:
             self._take_extra_columns(chunk)
         if topic.message is schema.EXTRA and len(chunk.records) // count not in self._extra_widths:

@@ -183,7 +183,8 @@ def _parse_summary(record: JsonView, prefix: str, problems: list[str]) -> Summar
     fields = {key: values[key] for key in _SUMMARY if values.get(key) is not None}
     for key, make, checks in _NESTED:
         if key in fields:
-            values[key] = figures = _valid(fields[key], checks, f"{prefix}{key}.", problems)
+            figures = _valid(fields[key], checks, f"{prefix}{key}.", problems)
+            values[key] = figures
             fields[key] = make({name: figures.get(name) for name in checks})
     return Summary(**fields, values_by_key=values)
 

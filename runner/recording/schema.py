@@ -265,9 +265,21 @@ CHECKPOINT = MessageType(
 CLOCK = MessageType("Clock", (Field(1, "started", _DOUBLE), Field(2, "seconds", _DOUBLE)))
 """How much time had passed at its position; `clock` describes its fields."""
 _HOST_FIELDS = (
-    *("started", "seconds", "cpu_percent", "memory_bytes", "host_cpu_percent", "host_memory_bytes"),
-    *("host_memory_total", "disk_read_bytes", "disk_written_bytes", "disk_free_bytes"),
-    *("network_received_bytes", "network_sent_bytes", "gpu_percent", "gpu_memory_bytes", "gpu_memory_total"),
+    "started",
+    "seconds",
+    "cpu_percent",
+    "memory_bytes",
+    "host_cpu_percent",
+    "host_memory_bytes",
+    "host_memory_total",
+    "disk_read_bytes",
+    "disk_written_bytes",
+    "disk_free_bytes",
+    "network_received_bytes",
+    "network_sent_bytes",
+    "gpu_percent",
+    "gpu_memory_bytes",
+    "gpu_memory_total",
 )
 HOST = MessageType(
     "Host",
@@ -320,8 +332,15 @@ Q_TABLE_TOPIC = Topic("/q_table", 7, Q_TABLE)
 LOG_TOPIC = Topic("/log", 8, LOG, digested=False)
 OPTIMALITY_TOPIC = Topic("/eval/optimality", 23, OPTIMALITY, "eval")
 TOPICS: Final = (
-    *(TRAIN_STEP, EVAL_STEP, TRAIN_EPISODE, EVAL_EPISODE, TRAIN_METRICS_TOPIC, EVAL_METRICS_TOPIC),
-    *(Q_TABLE_TOPIC, LOG_TOPIC, OPTIMALITY_TOPIC),
+    TRAIN_STEP,
+    EVAL_STEP,
+    TRAIN_EPISODE,
+    EVAL_EPISODE,
+    TRAIN_METRICS_TOPIC,
+    EVAL_METRICS_TOPIC,
+    Q_TABLE_TOPIC,
+    LOG_TOPIC,
+    OPTIMALITY_TOPIC,
 )
 """The topics of what the runner itself learned, which a job determines."""
 
@@ -352,17 +371,32 @@ LOOP_TOPICS: Final = {
     "step": (TRAIN_STEP, EVAL_STEP, TRAIN_RESET, EVAL_RESET),
     "transition": (TRAIN_TRANSITION, EVAL_TRANSITION, TRAIN_RESET, EVAL_RESET),
     "variable": (
-        *(TRAIN_TRANSITION_VARIABLE, EVAL_TRANSITION_VARIABLE),
-        *(TRAIN_RESET_VARIABLE, EVAL_RESET_VARIABLE),
+        TRAIN_TRANSITION_VARIABLE,
+        EVAL_TRANSITION_VARIABLE,
+        TRAIN_RESET_VARIABLE,
+        EVAL_RESET_VARIABLE,
     ),
 }
 """The topics of steps and resets in the recording of a loop, by the kind of its spaces."""
 _EVERY_LOOP: Final = (
-    *(TRAIN_EPISODE, EVAL_EPISODE, TRAIN_INFO, EVAL_INFO),
-    *(SCALAR_TOPIC, ARRAY_TOPIC, TRAIN_FRAME, EVAL_FRAME, LOG_TOPIC),
-    *(TRAIN_RESET_STATE, EVAL_RESET_STATE),
-    *(EXTRA_COLUMNS_TOPIC, TRAIN_EXTRA, EVAL_EXTRA, CHECKPOINT_TOPIC),
-    *(TRAIN_ACTIONS, EVAL_ACTIONS, IMAGE_TOPIC),
+    TRAIN_EPISODE,
+    EVAL_EPISODE,
+    TRAIN_INFO,
+    EVAL_INFO,
+    SCALAR_TOPIC,
+    ARRAY_TOPIC,
+    TRAIN_FRAME,
+    EVAL_FRAME,
+    LOG_TOPIC,
+    TRAIN_RESET_STATE,
+    EVAL_RESET_STATE,
+    EXTRA_COLUMNS_TOPIC,
+    TRAIN_EXTRA,
+    EVAL_EXTRA,
+    CHECKPOINT_TOPIC,
+    TRAIN_ACTIONS,
+    EVAL_ACTIONS,
+    IMAGE_TOPIC,
 )
 KINDS: Final = {
     "job": (*TOPICS, *MACHINE_TOPICS),

@@ -39,7 +39,8 @@ class Syncer:
         self._waiting: deque[tuple[Path, Failed]] = deque()
         self._lock, self._syncing = threading.Lock(), threading.Lock()
         self._thread: threading.Thread | None = None
-        self._is_exiting = self._ends_with_process = False
+        self._is_exiting = False
+        self._ends_with_process = False
 
     def add(self, path: Path, failed: Failed) -> None:
         """Sync a finished file within seconds; at once if the interpreter ends."""

@@ -258,7 +258,8 @@ def _held(found: Iterator[RedoneSteps], is_last: bool) -> Iterator[RedoneSteps]:
         _Astray: they do not, and there is another place to begin.
     """
     held: list[RedoneSteps] = []
-    count = size = 0
+    count = 0
+    size = 0
     is_holding, begun = not is_last, time.monotonic()
     for steps in found:
         is_early = count < _HELD_STEPS and size < _HELD_BYTES

@@ -23,8 +23,19 @@ MAIN: Final = "__main__"
 _script: tuple[str, str] = "", ""
 """Path and digest of the script whose definitions may be used now."""
 _PURE: Final = (
-    *("collections", "dataclasses", "enum", "fractions", "functools", "gymnasium", "itertools"),
-    *("math", "numpy", "pathlib", "string", "types", "typing"),
+    "collections",
+    "dataclasses",
+    "enum",
+    "fractions",
+    "functools",
+    "gymnasium",
+    "itertools",
+    "math",
+    "numpy",
+    "pathlib",
+    "string",
+    "types",
+    "typing",
 )
 """Modules that an assignment may use: what they give is known before the script runs."""
 _OUTSIDE: Final = frozenset(["__import__", "eval", "exec", "input", "open"])

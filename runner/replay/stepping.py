@@ -59,7 +59,8 @@ class Results:
         self.frames: list[Frame] = []
         """After each row; of a vector, after each step of all environments, of the one that is drawn."""
         self.first_frames: list[Frame] = []
-        self.done = self.resets_done = 0
+        self.done = 0
+        self.resets_done = 0
         """Rows and resets that are filled in; fewer than all if the environment raised `error`."""
         self.error: Exception | None = None
 

@@ -33,8 +33,16 @@ if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
 
 PACKAGES: Final = (
-    *("ale_py", "dualtaxi", "gymnasium", "gymnasium_robotics", "highway_env"),
-    *("minigrid", "miniworld", "mo_gymnasium", "mpe2", "pettingzoo"),
+    "ale_py",
+    "dualtaxi",
+    "gymnasium",
+    "gymnasium_robotics",
+    "highway_env",
+    "minigrid",
+    "miniworld",
+    "mo_gymnasium",
+    "mpe2",
+    "pettingzoo",
 )
 """Packages whose environments are made without trust, if they are installed."""
 WRAPPERS: Final[Mapping[str, frozenset[str]]] = {

@@ -38,8 +38,19 @@ _FRESH_SECONDS: Final = 10.0
 _SOURCES: Final = frozenset(
     {
         *SETTINGS_FILES,
-        *(".py", ".pyx", ".pyi", ".c", ".cc", ".cpp", ".cu", ".h", ".hpp"),
-        *(".rs", ".jl", ".sh", ".gin"),
+        ".py",
+        ".pyx",
+        ".pyi",
+        ".c",
+        ".cc",
+        ".cpp",
+        ".cu",
+        ".h",
+        ".hpp",
+        ".rs",
+        ".jl",
+        ".sh",
+        ".gin",
     }
 )
 """Suffixes of untracked files that are recorded."""

@@ -29,15 +29,22 @@ MAX_PATCH_BYTES: Final = 8 << 20
 _MAX_STATUS_BYTES: Final = 32 << 20
 _MAX_MESSAGE_BYTES: Final = 1 << 16
 _SETTINGS: Final = (
-    *("core.fsmonitor=false", f"core.hooksPath={os.devnull}", "core.sshCommand=false", "core.pager=cat"),
-    *("core.quotePath=false", "core.safecrlf=false", "credential.helper=", "protocol.allow=never"),
-    *("diff.external=", "diff.noprefix=false", "diff.mnemonicPrefix=false", "diff.relative=false"),
-    *(
-        "diff.submodule=short",
-        "safe.bareRepository=explicit",
-        "submodule.recurse=false",
-        "status.relativePaths=false",
-    ),
+    "core.fsmonitor=false",
+    f"core.hooksPath={os.devnull}",
+    "core.sshCommand=false",
+    "core.pager=cat",
+    "core.quotePath=false",
+    "core.safecrlf=false",
+    "credential.helper=",
+    "protocol.allow=never",
+    "diff.external=",
+    "diff.noprefix=false",
+    "diff.mnemonicPrefix=false",
+    "diff.relative=false",
+    "diff.submodule=short",
+    "safe.bareRepository=explicit",
+    "submodule.recurse=false",
+    "status.relativePaths=false",
 )
 _VARIABLES: Final = {
     "GIT_OPTIONAL_LOCKS": "0",

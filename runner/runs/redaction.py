@@ -14,7 +14,15 @@ from typing import Final
 
 REDACTED: Final = "[redacted]"
 SECRET_NAMES: Final = (
-    *("token", "secret", "password", "passwd", "passphrase", "key", "credential", "cookie", "authorization"),
+    "token",
+    "secret",
+    "password",
+    "passwd",
+    "passphrase",
+    "key",
+    "credential",
+    "cookie",
+    "authorization",
 )
 """A name that contains one of these, in any case, is that of a secret; `tokenizer` is not."""
 _MIN_VARIABLE: Final = 12
@@ -67,9 +75,37 @@ SHAPES: Final = (
 )
 """Tokens known by their shape: what they are for, and a regular expression."""
 _HINTS: Final = (
-    *("token", "secret", "pass", "key", "credential", "cookie", "auth", "bearer ", "://", "akia", "asia"),
-    *("gho_", "ghp_", "ghu_", "ghs_", "ghr_", "github_pat_", "glpat-", "xox", "sk-", "hf_", "aiza", "ya29."),
-    *("npm_", "pypi-", "k_live_", "k_test_", "sg.", "r8_", "dualtaxi_", "eyj"),
+    "token",
+    "secret",
+    "pass",
+    "key",
+    "credential",
+    "cookie",
+    "auth",
+    "bearer ",
+    "://",
+    "akia",
+    "asia",
+    "gho_",
+    "ghp_",
+    "ghu_",
+    "ghs_",
+    "ghr_",
+    "github_pat_",
+    "glpat-",
+    "xox",
+    "sk-",
+    "hf_",
+    "aiza",
+    "ya29.",
+    "npm_",
+    "pypi-",
+    "k_live_",
+    "k_test_",
+    "sg.",
+    "r8_",
+    "dualtaxi_",
+    "eyj",
 )
 """Each secret that is known by its name or shape has one of these around it, in any case."""
 _SHAPES: Final = re.compile("|".join(shape for _, shape in SHAPES))

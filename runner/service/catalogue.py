@@ -40,7 +40,10 @@ class Catalogue:
         self._scanner = ThreadPoolExecutor(1, thread_name_prefix="catalogue")
         self._lock = threading.Lock()
         self._scan: Future[None] | None = None
-        self._started = self._changed = self._scanned = self._fully_scanned = NEVER
+        self._started = NEVER
+        self._changed = NEVER
+        self._scanned = NEVER
+        self._fully_scanned = NEVER
         self._duration = 0.0
         self._scanned_version = NOTHING
 

@@ -267,7 +267,8 @@ def system(path: Path) -> bytes:
 def pictures(path: Path) -> bytes:
     """Return the last pictures and films that were logged under a name, the newest first, as HTML."""
     last: deque[tuple[str, int, bytes]] = deque()
-    size = total = 0
+    size = 0
+    total = 0
     with open_recording(path) as recording:
         for image in recording.decoded(schema.IMAGE_TOPIC):
             total, size = total + 1, size + len(image["data"])

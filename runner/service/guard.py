@@ -102,7 +102,8 @@ class Guard:
         is_read = request.method in SAFE_METHODS
         path = request.scope["path"]
         if not any(path.startswith(each) if each.endswith("/") else path == each for each in OPEN_PATHS):
-            token = request.state.token = self._token(request)
+            token = self._token(request)
+            request.state.token = token
             if token is not None and not is_read and not token.can_write:
                 raise Refused(
                     HTTPStatus.FORBIDDEN,

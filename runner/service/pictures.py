@@ -51,7 +51,8 @@ class PictureStream:
         """None while a response is being sent."""
         self._last = b""
         self._end: RunnerError | None = None
-        self._has_ended = self.is_closed = False
+        self._has_ended = False
+        self.is_closed = False
         self._loop = asyncio.get_running_loop()
         self._made: asyncio.Queue[bytes | str | RunnerError | None] = asyncio.Queue()
         self._places = threading.Semaphore(AHEAD)

@@ -77,7 +77,8 @@ def parse_table(text: str, name: str) -> dict[str, Bounds]:
         try:
             zero, one = (float(own[score]) for score in _SCORES)
         except (KeyError, TypeError, ValueError):
-            zero = one = math.nan
+            zero = math.nan
+            one = math.nan
         if not math.isfinite(one - zero) or len(own) != len(_SCORES):
             raise RunnerError(f"{name}: {task}: found {own}, expected finite numbers, random and expert.")
         if zero == one or task in table:

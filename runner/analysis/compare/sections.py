@@ -82,9 +82,15 @@ def metric_section(metric: MetricResult, profile: bool = True) -> Section:
         count = f"{word} / equal / {'lower' if word == 'higher' else 'worse'}"
         together = any(not math.isnan(pair.simultaneous.value) for pair in metric.pairs)
         headings = (
-            *("A - B, seed by seed", "seeds", "median", "IQM", "95 %"),
+            "A - B, seed by seed",
+            "seeds",
+            "median",
+            "IQM",
+            "95 %",
             *(["together"] if together else []),
-            *(f"P(A {word})", "95 %", count),
+            f"P(A {word})",
+            "95 %",
+            count,
         )
         grids.append(Grid(headings, [_pair(pair, together) for pair in metric.pairs]))
     if profile and len(metric.thresholds) > 1:

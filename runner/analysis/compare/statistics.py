@@ -146,7 +146,8 @@ def bootstrap_means(values: Values) -> list[Estimate]:
     The values are of the same seeds in each row, [rows, seeds]; of one seed the interval is nan.
     """
     n = values.shape[1]
-    low = high = np.full(len(values), np.nan)
+    low = np.full(len(values), np.nan)
+    high = low
     if n > 1:
         low, high = np.quantile(_weights(n, RESAMPLES) @ values.T, _TAILS, axis=0)
     rows = zip(values.mean(axis=1).tolist(), low.tolist(), high.tolist(), strict=True)

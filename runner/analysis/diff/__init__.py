@@ -175,7 +175,8 @@ def _diff_branch(
 def _diff_loops(difference: RunDiff, a: Recording, b: Recording) -> RunDiff:
     """Add to the difference of two runs, of which one is a loop, where they diverge."""
     notes: list[str] = []
-    train = evaluation = None
+    train = None
+    evaluation = None
     if not have_same_spaces(a, b):
         notes.append("the environments have other spaces: no steps are compared")
     elif not difference.same_content:

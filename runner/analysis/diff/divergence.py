@@ -29,13 +29,28 @@ from runner.util.arrays import Array
 Block = NDArray[np.void]
 
 FIELDS: Final = (
-    *("episode", "t", "state", "explored", "action", "next_state"),
-    *("rewards", "terminated", "truncated"),
+    "episode",
+    "t",
+    "state",
+    "explored",
+    "action",
+    "next_state",
+    "rewards",
+    "terminated",
+    "truncated",
 )
 """The fields of a step that are compared, in the order in which a step comes about."""
 _TRANSITION_FIELDS: Final = (
-    *("episode", "t", "acted", "action", "next_observation", "rewards"),
-    *("terminated", "truncated", "agents_terminated", "agents_truncated"),
+    "episode",
+    "t",
+    "acted",
+    "action",
+    "next_observation",
+    "rewards",
+    "terminated",
+    "truncated",
+    "agents_terminated",
+    "agents_truncated",
 )
 """The same of a step in spaces that are not both `Discrete`."""
 _EVALUATION_FIELDS: Final = FIELDS[1:]  # trials are numbered over all evaluations of a run

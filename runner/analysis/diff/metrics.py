@@ -78,7 +78,8 @@ def _metric_diff(name: str, a: dict[int, float], b: dict[int, float], level: flo
 
 def loop_means(recording: Recording) -> dict[str, float]:
     """Return mean length and return over the training episodes of a recording; nothing without any."""
-    episodes = length = 0
+    episodes = 0
+    length = 0
     total = 0.0
     for block in recording.blocks(TRAIN_EPISODE):
         episodes += len(block)

@@ -69,7 +69,10 @@ class VisitsDiff:
 def training_overlap(a: Recording, b: Recording) -> tuple[Overlap, tuple[Lengths, Lengths]]:
     """Return how far the training of two runs is the same, and the visits to each state, [S], of either."""
     left, right = _Steps(a), _Steps(b)
-    episodes = equal_episodes = equal_steps = compared = 0
+    episodes = 0
+    equal_episodes = 0
+    equal_steps = 0
+    compared = 0
     total = np.zeros(2, np.int64)
     for ours, theirs in _common_lengths(a, b):
         agree = _agreement(left, right, ours, theirs)

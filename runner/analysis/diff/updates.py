@@ -56,7 +56,8 @@ def replay_to(a: Recording, b: Recording, stop: int) -> tuple[list[TableReplay],
 
 def _last_equal_snapshot(a: Recording, b: Recording, stop: int) -> int:
     """Return the last step before `stop` at which both runs have snapshots, all of them equal; or 0."""
-    last = step = 0
+    last = 0
+    step = 0
     equal = True
     for left, right in zip(a.snapshots(), b.snapshots(), strict=False):
         if left.step != right.step or left.step > stop:

@@ -52,8 +52,13 @@ def checkpoints_command(
         return
     rows = (
         (
-            *(each.reference, each.phase, f"{each.episode:,}", each.format, size(each.size)),
-            *(each.digest[:16], "here" if each.is_here else "missing"),
+            each.reference,
+            each.phase,
+            f"{each.episode:,}",
+            each.format,
+            size(each.size),
+            each.digest[:16],
+            "here" if each.is_here else "missing",
         )
         for each in checkpoints
     )

@@ -43,15 +43,37 @@ _SPOOL_BYTES: Final = 8 << 20
 """Output up to this size is kept in memory, longer output in a temporary file."""
 
 _DEFAULT_COLUMNS: Final = (
-    *("id", "name", "config", "seed", "status", "tag", "episodes", "success_percent", "mean_return"),
-    *("logged", "bytes", "age", "same_as", "parent", "folder"),
+    "id",
+    "name",
+    "config",
+    "seed",
+    "status",
+    "tag",
+    "episodes",
+    "success_percent",
+    "mean_return",
+    "logged",
+    "bytes",
+    "age",
+    "same_as",
+    "parent",
+    "folder",
 )
 """Columns of the table, unless they hold nothing of interest."""
 _OPTIONAL: Final = ("config", "logged", "bytes", "episodes", "seed", "folder", "age")
 """Columns left out where a terminal is narrow, in this order."""
 _LEFT: Final = (Kind.START, Kind.TEXT, Kind.STATUS, Kind.PROSE, Kind.TAGS, Kind.DATE)
 _SHRINKING: Final = (
-    *("name", "config", "tags", "note", "logged", "environment", "host", "archive", "folder", "path"),
+    "name",
+    "config",
+    "tags",
+    "note",
+    "logged",
+    "environment",
+    "host",
+    "archive",
+    "folder",
+    "path",
 )
 _MIN_WIDTH: Final = 14
 """The width at which a shrinking column can still be read."""

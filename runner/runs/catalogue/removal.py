@@ -34,8 +34,17 @@ from runner.util.humanize import listed
 _STRAY_SECONDS: Final = 60
 """The rest of a removal that is older than this is deleted: no other process is at it any more."""
 _COLUMNS: Final = (
-    *("root", "entry", "id", "name", "seed", "config", "status", "tags"),
-    *("success_percent", "created", "archive"),
+    "root",
+    "entry",
+    "id",
+    "name",
+    "seed",
+    "config",
+    "status",
+    "tags",
+    "success_percent",
+    "created",
+    "archive",
 )
 
 

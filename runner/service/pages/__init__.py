@@ -28,7 +28,21 @@ __all__ = ["add_error_handlers", "refused", "router"]
 
 router = APIRouter(include_in_schema=False)
 for _module in (
-    *(runs, rerun, run, setup, replay, debugging, branch, environments, episodes),
-    *(compare, machine, submit, jobs, sweeps, explanations, static),
+    runs,
+    rerun,
+    run,
+    setup,
+    replay,
+    debugging,
+    branch,
+    environments,
+    episodes,
+    compare,
+    machine,
+    submit,
+    jobs,
+    sweeps,
+    explanations,
+    static,
 ):
     router.include_router(_module.router)
