@@ -7,7 +7,6 @@ import io
 import json
 import math
 import os
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -38,7 +37,7 @@ from runner.analysis.series import (
     values_left_out,
 )
 from runner.export.plots.curves import curves_sheet
-from runner.export.plots.image import check_suffix, save
+from runner.export.plots.image import svg_file
 from runner.export.plots.style import CurveStyle
 from runner.export.rerun.cache import cached_export
 from runner.export.rerun.selection import Request
@@ -281,14 +280,10 @@ def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:
     return bytes(sink.getvalue())
 
 
-def plot(path: Path, form: str, axis: str, style: CurveStyle) -> bytes:
-    """Return every metric of a run over an axis in one figure, as `svg`, `png` or `pdf`."""
-    check_suffix(Path(f"plot.{form}"))
+def plot(path: Path, axis: str, style: CurveStyle) -> bytes:
+    """Return every metric of a run over an axis in one figure, as SVG."""
     groups = groups_of(series_of([path], axis_of(axis)))
-    with tempfile.TemporaryDirectory() as folder:
-        picture = Path(folder, f"plot.{form}")
-        save(curves_sheet(groups, panels_of(groups), style), picture)
-        return picture.read_bytes()
+    return svg_file(curves_sheet(groups, panels_of(groups), style))
 
 
 def difference(a: Run, b: Run, ignore: Sequence[str], first: bool, targets: Sequence[str]) -> bytes:

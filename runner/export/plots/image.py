@@ -35,9 +35,14 @@ def check_suffix(path: Path) -> None:
 def save(canvas: Canvas, path: Path) -> None:
     """Write a canvas to a file, in the format of its suffix."""
     if path.suffix.lower() == ".svg":
-        path.write_text('<?xml version="1.0" encoding="utf-8"?>\n' + canvas.svg(for_page=False), "utf-8")
+        path.write_bytes(svg_file(canvas))
     else:
         write_image(canvas, path, path.suffix.lower()[1:])
+
+
+def svg_file(canvas: Canvas) -> bytes:
+    """Return a canvas as an SVG file."""
+    return ('<?xml version="1.0" encoding="utf-8"?>\n' + canvas.svg(for_page=False)).encode()
 
 
 def write_image(canvas: Canvas, target: Path | IO[bytes], form: str, dpi: int = _DPI) -> None:

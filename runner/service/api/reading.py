@@ -34,7 +34,7 @@ router = APIRouter(
 )
 ARROW: Final = "application/vnd.apache.arrow.stream"
 OCTETS: Final = "application/octet-stream"
-MEDIA: Final = {"svg": "image/svg+xml", "png": "image/png", "pdf": "application/pdf"}
+SVG: Final = "image/svg+xml"
 DEFAULT_RECORDS: Final = 1000
 """Records in a response by default."""
 
@@ -263,15 +263,14 @@ async def whole_q_table(
 
 
 @router.get(
-    "/plot.{form}",
+    "/plot.svg",
     response_class=Response,
-    responses=media_docs(*MEDIA.values()) | BUSY_ERRORS,
+    responses=media_docs(SVG) | BUSY_ERRORS,
     summary="Every metric in one figure.",
 )
 async def plot(
     run: RecordedRun,
     compute: ComputationOf,
-    form: Literal["svg", "png", "pdf"],
     axis: AxisName = EPISODES.name,
     smooth: Smooth = 0,
     log_x: Annotated[bool, Query(description="A logarithmic horizontal axis.")] = False,
@@ -279,7 +278,7 @@ async def plot(
 ) -> Response:
     """Return the figure that `dualtaxi plot` draws."""
     style = CurveStyle(smooth=smooth, log_x=log_x, log_y=log_y)
-    return Response(await compute(computed.plot, run.recording, form, axis, style), media_type=MEDIA[form])
+    return Response(await compute(computed.plot, run.recording, axis, style), media_type=SVG)
 
 
 def _refuse_both(step: int | None, episode: int | None) -> None:

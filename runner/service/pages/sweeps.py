@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Final, Literal
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Request, Response
 from fastapi import Path as InPath
 from fastapi.responses import HTMLResponse
 from starlette.concurrency import run_in_threadpool
@@ -100,16 +100,12 @@ async def sweep(
     settings: SettingsOf,
     catalogue: CatalogueOf,
     cache: CacheOf,
-    processes: SweepProcesses,
     jobs: JobsOf,
-    whole: Annotated[bool, Query(description="Wait for results and pictures.")] = False,
 ) -> Response:
     """Show the results of a sweep, at once, with placeholders for the parts that are not ready yet."""
     state = await run_in_threadpool(_state_of, name, settings.recordings, catalogue)
-    parts: dict[str, str | None] = {}
-    for part in PARTS:
-        body = await _part_html(state, part, cache, processes) if whole else cache.get(_key(state, part))
-        parts[part] = None if body is None else body.decode()
+    cached = {part: cache.get(_key(state, part)) for part in PARTS}
+    parts = {part: None if body is None else body.decode() for part, body in cached.items()}
 
     def show() -> Response:
         own = [job for job in jobs.store.jobs() if job.kind == "sweep" and job.name == name]
@@ -139,7 +135,11 @@ async def sweep_part(
 ) -> Response:
     """Return a part of the page of a sweep: the ranking, the importance of parameters, or the pictures."""
     state = await run_in_threadpool(_state_of, name, settings.recordings, catalogue)
-    return HTMLResponse(await _part_html(state, part, cache, processes))
+    make = PARTS[part]
+    body = await cache.get_or_await(
+        _key(state, part), lambda: processes(make, state.name, state.folder, state.digest), ALWAYS
+    )
+    return HTMLResponse(body)
 
 
 @dataclass(frozen=True)
@@ -181,11 +181,3 @@ def _tagged(catalogue: Catalogue, name: str) -> int:
 
 def _key(state: _SweepState, part: str) -> tuple[str, _SweepState]:
     return f"sweep {part}", state
-
-
-async def _part_html(state: _SweepState, part: str, cache: CacheOf, processes: SweepProcesses) -> bytes:
-    """Return the HTML of a part, cached or made by a child process."""
-    make = PARTS[part]
-    return await cache.get_or_await(
-        _key(state, part), lambda: processes(make, state.name, state.folder, state.digest), ALWAYS
-    )

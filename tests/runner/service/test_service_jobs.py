@@ -199,11 +199,14 @@ def test_a_sweep_uses_the_free_workers(client, submit, recordings, tmp_path):
 
     def texts():
         """Return the pages, which change once more when the index notices that the last runs are over."""
-        return [client.get(f"/sweeps/small{rest}").text for rest in ("?whole=true", "", "/results")]
+        return [
+            client.get(f"/sweeps/small{rest}").text for rest in ("/results", "/importance", "/pictures", "")
+        ]
 
-    page, _, table = until(lambda seen: seen[0] == seen[1] and seen[2] in seen[0], texts)
+    table, _, pictures, page = until(lambda seen: all(part in seen[3] for part in seen[:3]), texts)
     assert all(f'href="/runs/{run.run_id}"' in table for run in runs)
-    assert 'aria-label="Length of evaluation trials over training episodes"' in page
+    assert 'aria-label="Length of evaluation trials over training episodes"' in pictures
+    assert "data-later" not in page
 
 
 def test_a_job_whose_worker_dies_is_retried_and_then_fails(client, submit):
