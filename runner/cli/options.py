@@ -249,14 +249,14 @@ def limit_option(default: int | str) -> Declared:
     )
 
 
-def workers_option(default: int | str) -> Declared:
+def workers_option(default: int | str, text: str = "Number of runs to do in parallel.") -> Declared:
     """Return the option --workers, with a default number, or a text that describes the default."""
     return option(
         "--workers",
         type=click.IntRange(1, 1024),
         default=default if isinstance(default, int) else None,
         metavar="N",
-        help=f"Number of runs to do in parallel.  [default: {default}]",
+        help=f"{text}  [default: {default}]",
     )
 
 

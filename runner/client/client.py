@@ -29,13 +29,16 @@ class Client(Connection):
 
     # --- jobs -----------------------------------------------------------------------------------------
 
-    def submit(self, text: str, source: str = "job.yaml") -> RemoteJob:
+    def submit(self, text: str, source: str = "job.yaml", workers: int | None = None) -> RemoteJob:
         """Submit the text of a configuration or a sweep; `source` is the file's name, for messages.
+
+        A sweep holds that many `workers` of the server while it is running, all of them by default.
 
         Raises:
             ServerError: it was refused, each mistake with its line; or the server is unavailable.
         """
-        options = {"params": {"source": source}, "content": text.encode()}
+        params = {"source": source} | ({} if workers is None else {"workers": workers})
+        options = {"params": params, "content": text.encode()}
         return RemoteJob.from_json(self.request_object("POST", "/jobs", **options))
 
     def job(self, number: int) -> RemoteJob:

@@ -160,6 +160,8 @@ class RemoteJob:
     state: str
     runs: int
     """Its number of runs."""
+    workers: int
+    """How many workers of the server it holds while it is running."""
     error: str
     progress: Json | None
     """Its progress, if it is running and its worker has reported any."""
@@ -178,7 +180,7 @@ class RemoteJob:
         Raises:
             RunnerError: there is none in it.
         """
-        keys = ("number", "kind", "name", "state", "runs", "error", "progress")
+        keys = ("number", "kind", "name", "state", "runs", "workers", "error", "progress")
         try:
             begun = {int(run["seed"]): str(run["run_id"]) for run in response["begun"]}
             return cls(**{key: response[key] for key in keys}, begun=begun)

@@ -12,7 +12,7 @@ import click
 
 from runner.cli import error_as_json, exit_code_of
 from runner.cli.command import Group, argument, option, record
-from runner.cli.options import json_option, limit_option, recordings_option
+from runner.cli.options import json_option, limit_option, recordings_option, workers_option
 from runner.cli.output import draw, facts, print_json, say, table
 from runner.cli.parameter_types import FILE, ConfigName, RunName
 from runner.cli.progress import bytes_line
@@ -203,6 +203,7 @@ def submit(
     is_watched: bool = option(
         "--watch", is_flag=True, help="Wait until the job is over, and show its progress."
     ),
+    workers: int | None = workers_option("all of the server", "Number of the server's workers for a sweep."),
     server: Server = server_options,
     as_json: bool = json_option,
 ) -> None:
@@ -222,7 +223,7 @@ def submit(
 
     with server.client() as client:
         file = config_path(file)
-        job = client.submit(self_contained_text(file), file.name)
+        job = client.submit(self_contained_text(file), file.name, workers)
         runs = counted(job.runs, "run")
         say(f"Job {job.number}: {job.name}, {runs}; {client.url}/queue/{job.number}")
         if is_watched:
@@ -244,9 +245,12 @@ def jobs(limit: int = limit_option(20), server: Server = server_options, as_json
     if as_json:
         print_json({"jobs": [_job_as_json(job) for job in newest]})
     elif newest:
-        rows = [(str(job.number), job.kind, job.name, job.state, f"{job.runs:,}") for job in newest]
+        rows = [
+            (str(job.number), job.kind, job.name, job.state, f"{job.runs:,}", str(job.workers))
+            for job in newest
+        ]
         left = ("kind", "name", "state")
-        draw(table("job", *left, "runs", rows=rows, left=left, shrinking=("name",)))
+        draw(table("job", *left, "runs", "workers", rows=rows, left=left, shrinking=("name",)))
     else:
         say("No jobs yet. `dualtaxi remote submit FILE` submits one.")
 

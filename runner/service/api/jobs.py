@@ -48,6 +48,7 @@ class JobResponse(BaseModel):
     name: str
     state: State
     runs: int = Field(description="Its number of runs.")
+    workers: int = Field(description="The workers that it holds while it is running.")
     created: str
     started: str
     ended: str
@@ -83,6 +84,10 @@ Source = Annotated[
         pattern=r"^[^/\\\x00-\x1f]+$",
         description="The file's name, for messages; the default name of the job.",
     ),
+]
+Workers = Annotated[
+    int | None,
+    Query(ge=1, le=1024, description="How many workers a sweep may hold; default: all of the server."),
 ]
 _YAML: Final[dict[str, object]] = {
     "requestBody": {
@@ -122,13 +127,18 @@ Text = Annotated[str, Depends(text_of)]
     summary="Submit a configuration or a sweep.",
 )
 async def submit(
-    jobs: JobsOf, text: Text, response: Response, request: Request, source: Source = DEFAULT_SOURCE
+    jobs: JobsOf,
+    text: Text,
+    response: Response,
+    request: Request,
+    source: Source = DEFAULT_SOURCE,
+    workers: Workers = None,
 ) -> JobResponse:
     """Check the text, and queue it; each mistake is reported with its line and key."""
     checked = await jobs.checker.check(text, source)  # may take long, so no thread waits for it
 
     def add() -> JobResponse:
-        return created(jobs.add(text, checked), jobs, request, response)
+        return created(jobs.add(text, checked, workers), jobs, request, response)
 
     return await run_sync(add)
 

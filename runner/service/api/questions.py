@@ -51,7 +51,8 @@ async def explain(jobs: JobsOf, sent: ExplainQuestion, request: Request, respons
 async def queue_explanation(jobs: JobQueue, question: ExplainQuestion) -> Job:
     """Check an explanation, and queue it."""
     what = f"{question.a} and {question.b}"
-    return await _queue(jobs, await jobs.checker.call(what, check_explanation, question, jobs.recordings))
+    checked = await jobs.checker.call(what, check_explanation, question, jobs.recordings)
+    return await _queue(jobs, checked, question.workers)
 
 
 async def queue_branch(run: Run, jobs: JobQueue, question: BranchQuestion) -> Job:
@@ -69,5 +70,5 @@ def _require_own(run: Run, recordings: Path) -> None:
         )
 
 
-async def _queue(jobs: JobQueue, checked: CheckedJob) -> Job:
-    return await run_in_threadpool(jobs.add, write_yaml(checked.values), checked)
+async def _queue(jobs: JobQueue, checked: CheckedJob, workers: int | None = None) -> Job:
+    return await run_in_threadpool(jobs.add, write_yaml(checked.values), checked, workers)

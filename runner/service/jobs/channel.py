@@ -38,6 +38,8 @@ class JobSpec:
     """Whether to resume runs that were started by other code."""
     retry: bool
     """Whether to repeat failed runs of a sweep."""
+    workers: int | None
+    """How many processes may train at once; None for as many as a cluster has."""
     ray: str | None
     """The address of the Ray cluster that runs the job; None for this machine."""
 
@@ -50,14 +52,7 @@ class Outcome:
     error: str = ""
 
 
-@dataclass(frozen=True)
-class Slots:
-    """How many processes a job uses, or is allowed to use if it uses fewer."""
-
-    count: int
-
-
-Message = Outcome | Slots | JobProgress | RunEvent | tuple[LogEvent, ...]
+Message = Outcome | JobProgress | RunEvent | tuple[LogEvent, ...]
 """What a worker sends to the server."""
 
 
@@ -74,13 +69,11 @@ class JobChannel(Protocol):
 class PipeChannel:
     """The worker's end of the pipe to the server.
 
-    The server sends how many `Slots` the job may use, and None when it must stop. If the server dies, the
-    worker stops as well: it closes its recording, so that the next server of the folder can resume it.
+    The server sends one message: that the job must stop. If the server dies, the worker stops as well: it
+    closes its recording, so that the next server of the folder can resume it.
     """
 
     def __init__(self, pipe: Connection) -> None:
-        self.slots = 1
-        """How many processes may train at once."""
         self._pipe = pipe
         self._parent = os.getppid()
         self._stopping = threading.Event()
@@ -102,8 +95,7 @@ class PipeChannel:
 
     def _receive(self) -> None:
         with contextlib.suppress(EOFError, OSError):
-            while (slots := self._pipe.recv()) is not None:
-                self.slots = slots.count
+            self._pipe.recv()
         self.request_stop()
 
 

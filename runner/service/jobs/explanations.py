@@ -28,7 +28,7 @@ from runner.errors import ConfigError, RunNotFound
 from runner.runs.resolve import find_run
 from runner.service.jobs.channel import REPORT_SECONDS, JobSpec, Outcome, PipeChannel
 from runner.service.jobs.checking import MAX_RUNS, CheckedJob, is_path
-from runner.service.jobs.sweeps import slotted_workers
+from runner.sweep.cluster import worker_pool
 from runner.sweep.local import Workers
 
 BUSY: Final = "busy"
@@ -47,6 +47,7 @@ class ExplainQuestion(BaseModel, extra="forbid", frozen=True):
     metric: str | None = Field(default=None, description="A metric of evaluations.")
     at: int | None = Field(default=None, description="Training episodes; the end of each by default.")
     seeds: int = DEFAULT_SEEDS
+    workers: int | None = Field(default=None, ge=1, description="Of the server; default: all of them.")
 
 
 def check_explanation(given: ExplainQuestion, recordings: Path) -> CheckedJob:
@@ -92,7 +93,7 @@ def run_explain_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
 
     workers: Workers[Measurement, Measured]
     try:
-        with slotted_workers(spec, channel, question.mixtures[1]) as workers:
+        with worker_pool(spec.workers, spec.ray, question.mixtures[1]) as workers:
             while True:
                 try:
                     result = answer(question, workers, report, stop=channel.stop)

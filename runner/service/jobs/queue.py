@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
+from runner.client.jobs import LogEvent
 from runner.errors import StorageError
 from runner.execution.estimate import free_bytes
 from runner.service.errors import JobStateConflict
 from runner.service.jobs.checking import CheckedJob, JobChecker
-from runner.service.jobs.store import Job, JobStore, now
+from runner.service.jobs.store import WITHOUT_RUNS, Job, JobStore, now
 from runner.service.jobs.workers import WorkerPool
 from runner.sweep.cluster import require_ray
 from runner.util.humanize import size
@@ -59,8 +60,11 @@ class JobQueue:
         self.checker.close()
         self.store.close()
 
-    def add(self, text: str, checked: CheckedJob) -> Job:
+    def add(self, text: str, checked: CheckedJob, workers: int | None = None) -> Job:
         """Queue a text that was checked.
+
+        `workers` are what it asks for, by default all for a sweep or an explanation. A job gets no more than
+        it can use, and than there are; its log says so.
 
         Raises:
             StorageError: the disk would not hold its recordings.
@@ -74,9 +78,14 @@ class JobQueue:
         with self.store.lock:
             if checked.kind == "sweep":
                 self._refuse_running_sweep(checked.name)
-            return self.store.add(
-                checked.kind, checked.name, checked.runs, text, checked.values, keep=self.pool.busy
+            given = min(workers or self.pool.size, self._usable_workers(checked))
+            job = self.store.add(
+                checked.kind, checked.name, checked.runs, text, checked.values, given, keep=self.pool.busy
             )
+            if workers is not None and workers > given:
+                line = f"{workers} workers were requested; it gets {given}, the most that it can use here"
+                self.store.log(job.number, [LogEvent(line)])
+            return job
 
     def cancel(self, number: int) -> Job:
         """Cancel a job; its worker closes its recording, which stays.
@@ -120,6 +129,12 @@ class JobQueue:
             free_bytes(self.recordings),
             self.pool.waiting_for(),
         )
+
+    def _usable_workers(self, checked: CheckedJob) -> int:
+        """Return the most workers that a job can use; a cluster has its own for the runs of a job."""
+        if checked.kind not in WITHOUT_RUNS or self.pool.is_on_cluster:
+            return 1
+        return min(checked.runs, self.pool.size)
 
     def _refuse_running_sweep(self, name: str) -> None:
         for job in self.store.jobs():

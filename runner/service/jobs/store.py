@@ -62,6 +62,8 @@ class Job:
     runs: int
     """Number of runs: a configuration's seeds; a sweep's trials, times its seeds."""
     created: str
+    workers: int = 1
+    """How many workers it holds while it is running."""
     state: State = "queued"
     started: str = ""
     ended: str = ""
@@ -91,6 +93,7 @@ class _JobRow(Model):
     name = TextField()
     runs = IntegerField()
     created = TextField()
+    workers = IntegerField(default=1)
     state = TextField()
     started = TextField()
     ended = TextField()
@@ -155,6 +158,9 @@ class JobStore:
             with self._transaction("move it away to start with an empty queue"):
                 for table in _TABLES:
                     SchemaManager(table, self._database).create_all()
+                if not any(column.name == "workers" for column in self._database.get_columns("jobs")):
+                    # The file is of a server whose jobs did not state their workers.
+                    self._database.execute_sql("ALTER TABLE jobs ADD COLUMN workers INTEGER DEFAULT 1")  # type: ignore[no-untyped-call]
                 columns = [getattr(_JobRow, field.name) for field in fields(Job)]
                 rows = self._tuples(_JobRow.select(*columns).order_by(_JobRow.number))
                 self._jobs = {row[0]: Job(*row) for row in rows}
@@ -194,7 +200,14 @@ class JobStore:
         return job
 
     def add(
-        self, kind: Kind, name: str, runs: int, submitted: str, values: JsonView, keep: Container[int] = ()
+        self,
+        kind: Kind,
+        name: str,
+        runs: int,
+        submitted: str,
+        values: JsonView,
+        workers: int = 1,
+        keep: Container[int] = (),
     ) -> Job:
         """Append a job to the queue, on disk, and return it.
 
@@ -210,7 +223,7 @@ class JobStore:
                 raise QueueFull(
                     f"{unfinished:,} jobs are unfinished, the maximum; wait until one of them is over."
                 )
-            job = Job(max(self._jobs, default=0) + 1, kind, name, runs, now())
+            job = Job(max(self._jobs, default=0) + 1, kind, name, runs, now(), workers)
             over = [old.number for old in self._jobs.values() if old.is_over and old.number not in keep]
             forgotten = over[: max(0, len(over) - self._max_over)]
             with self._transaction():

@@ -1,4 +1,4 @@
-"""A sweep's job: run by processes within the slots there are, or by a Ray cluster."""
+"""A sweep's job: run by the processes that it was given, or by a Ray cluster."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
-from typing import Generic, Self
 
 from runner.client.jobs import BestTrial, LogEvent, SweepProgress
 from runner.service.jobs.channel import (
@@ -16,13 +14,12 @@ from runner.service.jobs.channel import (
     JobSpec,
     Outcome,
     PipeChannel,
-    Slots,
     wait_for_owners,
 )
 from runner.sweep import state, sweeps_in
-from runner.sweep.cluster import RayWorkers
+from runner.sweep.cluster import worker_pool
 from runner.sweep.loading import from_values
-from runner.sweep.local import LocalWorkers, R, T, Workers
+from runner.sweep.local import Workers
 from runner.sweep.plan import limit_of, plan_of, require_disk
 from runner.sweep.running import INTERRUPTED, SweepStatus, run_sweep
 from runner.sweep.task import Result, Task
@@ -42,7 +39,7 @@ def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
         require_disk(plan, before, spec.recordings)
         reporter = _SweepReporter(channel)
         workers: Workers[Task, Result]
-        with slotted_workers(spec, channel, plan.runs) as workers:
+        with worker_pool(spec.workers, spec.ray, plan.runs) as workers:
             _, status = run_sweep(
                 sweep,
                 spec.recordings,
@@ -76,59 +73,6 @@ def _locked_sweep(spec: JobSpec, stop: Callable[[], bool]) -> Iterator[None]:
                     raise
                 time.sleep(REPORT_SECONDS)
         yield
-
-
-def slotted_workers(
-    spec: JobSpec, channel: PipeChannel, runs: int
-) -> AbstractContextManager[Workers[T, R], None]:
-    """Return what runs the job's tasks: processes of this machine within the slots, or a cluster."""
-    if spec.ray is not None:
-        return RayWorkers(None, spec.ray, runs)
-    return SlottedWorkers(LocalWorkers(runs), channel)
-
-
-class SlottedWorkers(Generic[T, R]):
-    """Workers of which at most as many are busy as the server grants slots at the moment."""
-
-    def __init__(self, workers: LocalWorkers[T, R], channel: PipeChannel) -> None:
-        self._workers, self._channel = workers, channel
-        self._busy, self._sent = 0, (0, 0)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._workers.__exit__(*error)
-
-    @property
-    def idle(self) -> int:
-        """How many more tasks can be given."""
-        slots = self._channel.slots
-        self._report(slots)
-        return max(0, min(self._workers.idle, slots - self._busy))
-
-    def submit(self, task: T) -> None:
-        """Start a task on an idle worker."""
-        self._busy += 1
-        self._report(self._channel.slots)
-        self._workers.submit(task)
-
-    def collect(self, seconds: float) -> list[tuple[T, R | None]]:
-        """Return what is done, waiting that long for it; None for a worker that died and was replaced."""
-        done = self._workers.collect(seconds)
-        self._busy -= len(done)
-        self._report(self._channel.slots)
-        return done
-
-    def stop(self) -> None:
-        """Have every worker close its recording and return its task as interrupted."""
-        self._workers.stop()
-
-    def _report(self, slots: int) -> None:
-        """Confirm the number of slots, and report how many are in use, if either has changed."""
-        if self._sent != (slots, self._busy):
-            self._sent = slots, self._busy
-            self._channel.send(Slots(max(slots, self._busy)))
 
 
 class _SweepReporter:

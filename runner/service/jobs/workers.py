@@ -17,7 +17,7 @@ from runner.config import from_mapping
 from runner.errors import StorageError
 from runner.execution.estimate import free_bytes
 from runner.runs.run import new_run_id
-from runner.service.jobs.channel import JobSpec, Message, Outcome, Slots
+from runner.service.jobs.channel import JobSpec, Message, Outcome
 from runner.service.jobs.store import WITHOUT_RUNS, Job, JobStore, now
 from runner.service.jobs.worker import work
 from runner.service.logs import LOG
@@ -37,25 +37,17 @@ RETRY_SECONDS: Final = 5.0
 
 @dataclass
 class _Worker:
-    number: int
-    """The number of its job."""
+    job: Job
     process: BaseProcess
     pipe: Any
-    slots: int = 1
-    """How many processes it may use."""
-    confirmed: int = 1
-    """How many it last reported to use, or to be allowed."""
     outcome: Outcome | None = None
     stopped: float | None = None
     """When the request to stop was sent."""
 
-    def send(self, slots: Slots | None) -> None:
-        with contextlib.suppress(OSError):  # it is dead
-            self.pipe.send(slots)
-
     def stop(self) -> None:
         self.stopped = self.stopped or time.monotonic()
-        self.send(None)
+        with contextlib.suppress(OSError):  # it is dead
+            self.pipe.send(None)
 
 
 class WorkerPool:
@@ -91,6 +83,11 @@ class WorkerPool:
         return self._thread.is_alive() and not self._start_problem
 
     @property
+    def is_on_cluster(self) -> bool:
+        """Whether a Ray cluster runs the jobs."""
+        return self._ray is not None
+
+    @property
     def busy(self) -> Container[int]:
         """The numbers of the jobs that have a worker."""
         return self._busy
@@ -106,7 +103,11 @@ class WorkerPool:
         return self._progress.get(number)
 
     def waiting_for(self) -> str:
-        """Return why no further job is started although there is a worker; empty if one would be."""
+        """Return why the next job is not started although a worker is free; empty if it would be."""
+        job, free = self._next_job(), self._free()
+        needed = 0 if job is None else self._needed(job)
+        if job is not None and needed > free > 0:
+            return f"job {job.number} waits for {needed} workers; free: {free}"
         return self._start_problem or self._short_of_disk()
 
     def _run(self) -> None:
@@ -114,7 +115,6 @@ class WorkerPool:
         while not self._stopping.is_set():
             with _logged(), self._lock:
                 self._start_next()
-                self._share_slots()
             with _logged():
                 self._receive()
         with self._lock:
@@ -125,13 +125,12 @@ class WorkerPool:
                 self._receive()
 
     def _start_next(self) -> None:
-        """Start a worker for the first queued job, if there is a slot."""
-        job = next((job for job in self._store.jobs() if job.state == "queued"), None)
+        """Start the first queued job, if the workers that it needs are free."""
+        job = self._next_job()
         if job is None:
             self._start_problem = ""
             return
-        slots = sum(max(worker.slots, worker.confirmed) for worker in self._busy.values())
-        if slots >= self.size or job.number in self._busy or self._short_of_disk():
+        if self._needed(job) > self._free() or job.number in self._busy or self._short_of_disk():
             return
         if time.monotonic() < self._retry_at:
             return
@@ -164,6 +163,7 @@ class WorkerPool:
             recordings=self._store.recordings,
             accept_changes=job.accept_changes,
             retry=job.retry,
+            workers=self._needed(job) if self._ray is None else None,
             ray=self._ray,
         )
         ours, theirs = self._context.Pipe()
@@ -176,7 +176,7 @@ class WorkerPool:
             except BaseException:
                 ours.close()
                 raise
-        return _Worker(job.number, process, ours)
+        return _Worker(job, process, ours)
 
     def _reserved_runs(self, job: Job, values: dict[str, object]) -> dict[int, str]:
         """Return the run id of each seed, stored before the run exists: so no run is started twice."""
@@ -188,20 +188,16 @@ class WorkerPool:
         self._store.reserve_runs(job.number, missing)
         return run_ids | missing
 
-    def _share_slots(self) -> None:
-        """Give the slots that no job waits for to the first sweep, and take them back when one does."""
-        if self._ray is not None:
-            return  # a sweep's workers are the cluster's
-        jobs = {job.number: job for job in self._store.jobs()}
-        is_waiting = any(job.state == "queued" for job in jobs.values()) and not self._short_of_disk()
-        spare = max(0, self.size - len(self._busy) - is_waiting)
-        for number, worker in sorted(self._busy.items()):
-            slots = 1
-            if jobs[number].kind in WITHOUT_RUNS:
-                slots, spare = 1 + spare, 0
-            if slots != worker.slots:
-                worker.slots = slots
-                worker.send(Slots(slots))
+    def _next_job(self) -> Job | None:
+        """Return the job that is started next: jobs start in the order of their numbers."""
+        return next((job for job in self._store.jobs() if job.state == "queued"), None)
+
+    def _needed(self, job: Job) -> int:
+        """Return how many workers a job uses: this server may have fewer than the one it was submitted to."""
+        return min(job.workers, self.size)
+
+    def _free(self) -> int:
+        return self.size - sum(self._needed(worker.job) for worker in list(self._busy.values()))
 
     def _short_of_disk(self) -> str:
         free = free_bytes(self._store.recordings)
@@ -232,13 +228,11 @@ class WorkerPool:
                 worker.process.kill()
             self._remove(worker)
             return
-        number = worker.number
+        number = worker.job.number
         with self._lock:
             if isinstance(message, Outcome):
                 worker.outcome = message
                 self._store_outcome(self._store.job(number), message)
-            elif isinstance(message, Slots):
-                worker.confirmed = message.count
             elif isinstance(message, RunEvent):
                 self._store.start_run(number, message.seed, message.run_id)
             elif isinstance(message, tuple):
@@ -263,8 +257,8 @@ class WorkerPool:
             worker.process.kill()
             worker.process.join()
         with self._lock:
-            del self._busy[worker.number]
-            job = self._store.job(worker.number)
+            del self._busy[worker.job.number]
+            job = self._store.job(worker.job.number)
             if worker.outcome is not None or job.state != "running":
                 return
             code, deaths = worker.process.exitcode, job.deaths + 1

@@ -20,7 +20,7 @@ from runner.export.reports.rendering import View
 from runner.service.dependencies import CatalogueOf, JobsOf
 from runner.service.errors import Refused
 from runner.service.jobs.checking import SWEEP_KEYS, CheckedJob
-from runner.service.pages.rendering import Form, page, viewer_of
+from runner.service.pages.rendering import Form, number_in, page, viewer_of
 from runner.service.problems import error_body
 from runner.sweep.model import SweepFile
 from runner.util.values import Json, JsonView
@@ -124,7 +124,7 @@ async def submit(request: Request, sent: Form, jobs: JobsOf) -> Response:
         checked = await jobs.checker.check(text)
         if sent.get("action") == "check":
             return await run_in_threadpool(page, request, _view(text, checked=checked))
-        job = await run_in_threadpool(jobs.add, text, checked)
+        job = await run_in_threadpool(jobs.add, text, checked, number_in(sent, "workers"))
     except RunnerError as error:
         view = _view(text, _problems(request, text, error))
         return await run_in_threadpool(page, request, view, HTTPStatus.UNPROCESSABLE_ENTITY)

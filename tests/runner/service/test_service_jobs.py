@@ -209,6 +209,27 @@ def test_a_sweep_uses_the_free_workers(client, submit, recordings, tmp_path):
     assert "data-later" not in page
 
 
+def test_jobs_hold_the_workers_that_they_ask_for_and_start_in_order(client, submit):
+    number = submit(ENDLESS)
+    job_until(client, number, lambda job: job["progress"] is not None)
+    asked = client.post("/api/v1/jobs", params={"workers": 5}, content=json.dumps(SWEEP)).json()
+    assert (asked["workers"], job(client, number)["workers"]) == (2, 1)
+    last = submit(CONFIG | {"seeds": [0]})
+    waiting = f"job {asked['number']} waits for 2 workers; free: 1"
+    until(lambda queue: queue["waiting_for"] == waiting, lambda: client.get("/api/v1/jobs").json()["queue"])
+    assert job(client, last)["state"] == "queued", "it does not overtake the sweep"
+    client.post(f"/api/v1/jobs/{number}/cancel")
+    done = job_until(client, last, lambda job: job["state"] == "finished")
+    assert done["workers"] == 1
+    log = [data["text"] for _, event, data in watched(client, asked["number"]) if event == "log"]
+    assert log[0] == "5 workers were requested; it gets 2, the most that it can use here"
+    one = client.post("/api/v1/jobs", params={"workers": 1}, content=json.dumps(SWEEP | {"name": "alone"}))
+    number = one.json()["number"]
+    running = [data["running"] for _, event, data in watched(client, number) if event == "progress"]
+    assert max(running) == 1
+    assert client.post("/api/v1/jobs", params={"workers": 0}, content="episodes: 3").status_code == 422
+
+
 def test_a_job_whose_worker_dies_is_retried_and_then_fails(client, submit):
     import psutil
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import sqlite3
 
 import peewee
 import pytest
@@ -86,6 +88,15 @@ def test_a_file_that_is_no_database_is_reported_and_kept(tmp_path):
     with pytest.raises(StorageError, match="move it away to start with an empty queue"):
         JobStore(tmp_path)
     assert path.read_bytes().startswith(b"no database")
+
+
+def test_the_jobs_of_a_server_that_gave_no_workers_are_read(tmp_path):
+    with JobStore(tmp_path) as store:
+        before, path = added(store), store.path
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.execute("ALTER TABLE jobs DROP COLUMN workers")
+    with JobStore(tmp_path) as store:
+        assert store.jobs() == [before]
 
 
 def test_a_reader_continues_after_the_last_event_it_saw(store):
