@@ -80,12 +80,11 @@ def run(command: Sequence[str], environment: Mapping[str, str] | None = None, ex
 def run_config(
     config: str,
     *overrides: str,
-    options: Sequence[str] = (),
     environment: Mapping[str, str] | None = None,
 ) -> JobRun:
     """Run a shipped configuration in a temporary folder and return the measurements."""
     with tempfile.TemporaryDirectory() as recordings:
-        process = run([*run_command(config, recordings, *overrides), *options], environment)
+        process = run(run_command(config, recordings, *overrides), environment)
         (facts_file,) = Path(recordings).glob("*/run.json")
         facts: dict[str, Any] = json.loads(facts_file.read_bytes())
         summary = facts["summary"]

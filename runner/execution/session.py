@@ -8,10 +8,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.config.job import Job
 from runner.environments.loading import load_mdp
@@ -61,19 +60,6 @@ class Progress:
     """The log so far; of a resumed run, what its recording did not have before."""
 
 
-class Observer(Protocol):
-    """Sees every step and metric as they come; must return at once, and copy what it keeps."""
-
-    def begin(self, mdp: Mdp, learners: tuple[str, ...]) -> None:
-        """See the environment and the names of the learners before the first step."""
-
-    def steps(self, phase: str, before: int, steps: NDArray[np.void]) -> None:
-        """See new steps of a phase; `before` steps of both phases were executed before the first."""
-
-    def metrics(self, phase: str, time: int, metrics: Message) -> None:
-        """See new metrics of a phase, after `time` steps of both."""
-
-
 Report = Callable[[Progress], None]
 Stop = Callable[[], bool]
 
@@ -83,7 +69,6 @@ def run_job(
     run: Run,
     report: Report = lambda _: None,
     stop: Stop = lambda: False,
-    observer: Observer | None = None,
     mdp: Mdp | None = None,
     threads: bool = True,
     initial: Sequence[NamedTables] | None = None,
@@ -113,7 +98,7 @@ def run_job(
             run = run.update(provenance=runs.made_by(provenance))
         beat = code.beat(run, file)
         recorder = recorder_for(job, learner, file, beat=beat, threads=threads, packed=packed)
-        return execute(Session(job, learner, recorder, report, stop, observer), file, run, started, code)
+        return execute(Session(job, learner, recorder, report, stop), file, run, started, code)
 
 
 def execute(session: Session, file: RecordingFile, run: Run, started: float, code: CodeCollector) -> Run:
@@ -165,10 +150,8 @@ class Session:
         recorder: Recorder,
         report: Report = lambda _: None,
         stop: Stop = lambda: False,
-        observer: Observer | None = None,
     ) -> None:
         self._config = job.config
-        self._observer = observer
         self._learner = learner
         self.recorder = recorder
         self._report = report
@@ -184,8 +167,6 @@ class Session:
 
     def run(self) -> bool:
         """Run the whole job; return False if it was stopped before the end."""
-        if self._observer is not None:
-            self._observer.begin(self._learner.mdp, self._learner.agents)
         self._log(f"training {self._config.episodes} episodes with {self._config.algorithm}")
         for episode in self._boundaries():
             if not self._train(episode):
@@ -231,10 +212,9 @@ class Session:
             next_log = (learner.step // every + 1) * every
             records, ends = recorder.block(schema.TRAIN_STEP), recorder.block(schema.TRAIN_EPISODE)
             steps, episodes = learner.train(records, ends, until_episode, next_log)
-            self._show("train", records[:steps])
             recorder.commit("train", steps, episodes)
             if learner.step == next_log:
-                self._measure("train", schema.TRAIN_METRICS_TOPIC, learner.training_metrics())
+                self._measure(schema.TRAIN_METRICS_TOPIC, learner.training_metrics())
             self._report_progress()
         return True
 
@@ -253,13 +233,12 @@ class Session:
             records = recorder.block(schema.EVAL_EPISODE)
             played = recorder.block(schema.EVAL_STEP)
             steps, ended = learner.evaluate(played, records, first + plan.trials)
-            self._show("eval", played[:steps])
             trials.append(records[:ended].copy())
             recorder.commit("eval", steps, ended)
             done += ended
             self._report_progress()
         metrics = evaluation_metrics(learner, self._evaluated, np.concatenate(trials))
-        self._measure("eval", schema.EVAL_METRICS_TOPIC, metrics)
+        self._measure(schema.EVAL_METRICS_TOPIC, metrics)
         self._evaluated += 1
         self._progress.evaluations.append(metrics)
         if plan.exact:
@@ -268,23 +247,14 @@ class Session:
         self._report_progress(now=True)
         return True
 
-    def _show(self, phase: str, steps: NDArray[np.void]) -> None:
-        """Show the observer steps that are not committed yet."""
-        if self._observer is not None:
-            self._observer.steps(phase, sum(self.recorder.steps.values()), steps)
-
-    def _measure(self, phase: str, topic: schema.Topic, metrics: dict[str, object]) -> None:
-        """Record metrics, and show them to the observer."""
+    def _measure(self, topic: schema.Topic, metrics: Message) -> None:
         self.recorder.message(topic, encode(topic.message, metrics))
-        if self._observer is not None:
-            self._observer.metrics(phase, sum(self.recorder.steps.values()), metrics)
 
     def _measure_exactly(self, metrics: Message) -> None:
         """Record what the evaluated policy gets from every start state, and the optimum."""
         exact = self._exact_evaluator.measure(self._learner.policy, metrics["discount"])
         position = {name: metrics[name] for name in ("step", "episode", "evaluation")}
-        topic = schema.OPTIMALITY_TOPIC
-        self.recorder.message(topic, encode(topic.message, position | exact))
+        self._measure(schema.OPTIMALITY_TOPIC, position | exact)
         self._progress.evaluations[-1] = metrics | {"optimality": exact}
 
     @cached_property

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import signal
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import click
 
 from runner.cli.command import Command, option
 from runner.cli.options import config_argument, json_option, recordings_option, set_option, workers_option
 from runner.cli.output import console, draw, facts, print_json, say
-from runner.cli.parameter_types import COUNT, INDEX
+from runner.cli.parameter_types import INDEX
 from runner.cli.progress import count_line, progress_line
 from runner.cli.runs import command_for, compilation_notice, run_as_json, run_facts
 from runner.errors import ExitCode
@@ -27,12 +25,6 @@ if TYPE_CHECKING:  # a run is written to disk before heavy packages are imported
 
     from runner.config import ExperimentConfig
     from runner.config.job import Job
-    from runner.export.rerun.live import LiveView
-
-    Watch = Callable[[Run], LiveView]
-
-LIVE_EPISODES: Final = 200
-"""Training episodes shown live by default, about."""
 
 
 @click.command("run", cls=Command)
@@ -43,16 +35,6 @@ def run_command(
     ),
     overrides: tuple[str, ...] = set_option,
     name: str | None = option("--name", help="Name of the run.  [default: the configuration's name]"),
-    live: bool = option("--live", is_flag=True, help="Open the Rerun viewer and watch the training in it."),
-    live_every: int | None = option(
-        "--live-every",
-        type=COUNT,
-        metavar="N",
-        help=f"Show every Nth episode, step by step.  [default: about {LIVE_EPISODES} of them]",
-    ),
-    live_url: str | None = option(
-        "--live-url", metavar="URL", help="Connect to a running viewer at this URL instead of starting one."
-    ),
     workers: int = workers_option(1),
     recordings: Path | None = recordings_option,
     as_json: bool = json_option,
@@ -67,8 +49,6 @@ def run_command(
     trials and the first 500 training episodes last half the step limit, and later ones a tenth; "at most" is
     all of the limit.
 
-    With --live the Rerun viewer shows training as it happens: all metrics, and every Nth episode.
-
     --json prints one line for each run.
 
     Examples:
@@ -77,20 +57,16 @@ def run_command(
       dualtaxi run cooperative --seed 7 --set discount=0.9 --name patient
       dualtaxi run quick --set 'seeds={count: 3}' --json
       dualtaxi run quick --set 'seeds={count: 100}' --set recording.steps=none --workers 2
-      dualtaxi run cooperative --live --live-every 100
     """
     from runner.api import experiment_of, jobs_in
 
     experiment = experiment_of(config, overrides, seed)
     run_name, folder = checked_name(name), recordings_folder(recordings)
     if workers > 1:
-        if live or live_every or live_url:
-            raise click.UsageError("--live shows one run at a time: leave out --workers.")
         _run_parallel(experiment, folder, run_name, workers, as_json)
         return
-    watch = _watcher(experiment, live, live_every, live_url)
     for number, job in enumerate(jobs_in(experiment, folder)):
-        run, is_interrupted = _run_one(job, folder, run_name, number, watch)
+        run, is_interrupted = _run_one(job, folder, run_name, number)
         _print_run(run, number, as_json)
         if is_interrupted:
             episodes = f"{run.summary['episodes']:,} of {experiment.episodes:,} episodes"
@@ -101,7 +77,7 @@ def run_command(
             raise click.exceptions.Exit(ExitCode.INTERRUPTED)
 
 
-def _run_one(job: Job, folder: Path, name: str | None, number: int, watch: Watch | None) -> tuple[Run, bool]:
+def _run_one(job: Job, folder: Path, name: str | None, number: int) -> tuple[Run, bool]:
     """Run a job; return its run, and whether it was interrupted."""
     from runner.api import interruptible
 
@@ -116,14 +92,11 @@ def _run_one(job: Job, folder: Path, name: str | None, number: int, watch: Watch
         with (
             interruptible(second=signal.SIG_DFL) as interrupt,
             progress_line(label, job.config.episodes) as report,
-            contextlib.nullcontext() if watch is None else watch(run) as view,
         ):
             from runner.execution.session import run_job
 
             with compilation_notice():
-                run = run_job(job, run, report, interrupt, view)
-    if view is not None and (view.dropped or view.failure):
-        say(f"Recorded in full, but not all was shown live: {view.failure or 'the viewer was too slow'}.")
+                run = run_job(job, run, report, interrupt)
     return run, interrupt.came
 
 
@@ -152,20 +125,6 @@ def _run_parallel(
                 say(f"Interrupted: {run.recording}; `{command_for(run, 'resume')}` continues from there.")
         _print_not_begun(config, len(runs))
         raise click.exceptions.Exit(ExitCode.INTERRUPTED)
-
-
-def _watcher(config: ExperimentConfig, live: bool, every: int | None, url: str | None) -> Watch | None:
-    """Return the function that makes a live view of a run, if there is one; open a viewer if necessary."""
-    if not (live or every or url):
-        return None
-    from runner.export.rerun import viewer
-    from runner.export.rerun.live import LiveView
-
-    viewer.require_rerun("run --live")
-    address = viewer.check_address(url) if url else viewer.live_window(viewer.free_port())
-    one_in = every or max(1, config.episodes // LIVE_EPISODES)
-    say(f"Live: every metric, and the steps of one episode in {one_in:,}, at {address}")
-    return lambda run: LiveView(f"{run.title} ({run.run_id})", run.run_id, one_in, address)
 
 
 def _announce(config: ExperimentConfig, folder: Path) -> None:

@@ -13,7 +13,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
-from urllib.parse import urlsplit
 
 from runner.errors import RunnerError
 from runner.export.places import write_new
@@ -24,9 +23,6 @@ if TYPE_CHECKING:
 
 LOOPBACK: Final = "127.0.0.1"
 START_SECONDS: Final = 20.0
-SCREEN_SECONDS: Final = 0.5
-"""A viewer that finds no screen has ended this long after it began to listen."""
-ANSWER_SECONDS: Final = 5.0
 DRAW_SECONDS: Final = 4.0
 """A viewer without a screen has drawn everything this long after the step was set."""
 NOTICE_SECONDS: Final = 2.5
@@ -85,39 +81,13 @@ def check_port(port: int) -> int:
         return int(probe.getsockname()[1])
 
 
-def check_address(url: str) -> str:
-    """Return the address of a viewer if something listens there.
-
-    Raises:
-        RunnerError: it is no address of a viewer.
-        ViewerError: nothing listens there.
-    """
-    parts = urlsplit(url)
-    try:
-        if not parts.scheme.startswith("rerun") or parts.hostname is None:
-            raise ValueError
-        address = (parts.hostname, parts.port or (443 if parts.scheme.endswith("https") else 80))
-    except ValueError:
-        raise RunnerError(
-            f"--live-url: found {url!r}, expected a viewer's address such as "
-            "rerun+http://127.0.0.1:9876/proxy"
-        ) from None
-    try:
-        socket.create_connection(address, timeout=ANSWER_SECONDS).close()
-    except OSError as error:
-        raise ViewerError(
-            f"{url}: nothing answers there ({error.strerror or error}); start a viewer by `rerun`."
-        ) from error
-    return url
-
-
 class Viewer:
-    """A viewer that listens on a port of loopback, and writes to a log; detached, it survives this program.
+    """A viewer that listens on a port of loopback, and writes to a log.
 
     The options are more arguments of its command line.
     """
 
-    def __init__(self, log: Path, port: int, *options: str, detached: bool = False) -> None:
+    def __init__(self, log: Path, port: int, *options: str) -> None:
         self._log = log
         self.url = f"rerun+http://{LOOPBACK}:{port}/proxy"
         arguments = [str(viewer_program()), "--bind", LOOPBACK, "--port", str(port), *options]
@@ -128,7 +98,6 @@ class Viewer:
                 env=environment,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                start_new_session=detached,
             )
         try:
             self.wait_for(port)
@@ -164,7 +133,7 @@ class Viewer:
         if any(word in text for word in ("graphics adapter", "libEGL", "Vulkan", "libxkbcommon")):
             reason = f": it finds no graphics. On Debian: apt-get install {MESA_PACKAGES}"
         elif "DISPLAY is set" in text:
-            reason = ": there is no screen. Start `rerun` on a machine with one, and pass its address."
+            reason = ": there is no screen; --web and --screenshot need none."
         else:
             reason = next((f": {line}" for line in reversed(text.splitlines()) if line.strip()), ".")
         return ViewerError(f"the Rerun viewer {what}{reason}")
@@ -215,17 +184,6 @@ def screenshot(path: Path, step: int, picture: Path, size: str = "1600x900") -> 
         if not drawn.exists():
             raise ViewerError(f"{picture}: the Rerun viewer has not drawn it.")
         write_new(picture, True, lambda temporary: shutil.copyfile(drawn, temporary))
-
-
-def live_window(port: int) -> str:
-    """Open a window that stays when this program ends; return the address that runs can be sent to."""
-    with tempfile.TemporaryDirectory() as folder:
-        log = Path(folder) / "viewer.log"
-        started = Viewer(log, port, "--hide-welcome-screen", detached=True)
-        with contextlib.suppress(subprocess.TimeoutExpired):  # it listens before it looks for a screen
-            started.process.wait(SCREEN_SECONDS)
-            raise started.error("does not start")
-    return started.url
 
 
 def open_window(path: Path, step: int, port: int) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -13,23 +12,17 @@ import urllib.request
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
-from rerun.chunk import RrdReader
 
 from runner.analysis.step_reference import StepRef
 from runner.cli import cli
 from runner.cli.commands import view
 from runner.errors import RunnerError, StorageError
-from runner.export.rerun import live as live_view
 from runner.export.rerun import viewer, writing
 from runner.export.rerun.cache import cached_export
-from runner.export.rerun.live import LiveView
 from runner.export.rerun.location import locate
 from runner.export.rerun.selection import Request
-from runner.recording import schema
-from runner.recording.reader import open_recording
 
 PLOTS = {"Success %", "Mean length", "Mean return", "Mean penalties"}
 PLOTS |= {"Q-table filled (%)", "Epsilon, step size", "Rewards (% of the last steps)"}
@@ -145,51 +138,3 @@ def test_the_web_viewer_ends_with_the_command(pictured):
         assert process.wait(30) == 128 + signal.SIGTERM
     with pytest.raises(urllib.error.URLError, match="refused"):
         urllib.request.urlopen(address, timeout=20)
-
-
-def test_a_live_view_takes_one_episode_in_n(pictured, monkeypatch):
-    run = pictured("rivals")
-    with open_recording(run.recording) as recording:
-        steps = np.concatenate(list(recording.blocks(schema.TRAIN_STEP)))
-    taken = []
-    live = LiveView("live", "live", 10, "rerun+http://127.0.0.1:9/proxy")
-    monkeypatch.setattr(live, "_put", taken.append)
-    for part in np.array_split(steps, 7):
-        live.steps("train", int(part["step"][0]), part)
-    shown = np.concatenate([piece.content for piece in taken])
-    assert shown.tobytes() == steps[steps["episode"] % 10 == 0].tobytes()
-    assert [piece.time for piece in taken] == [int(piece.content["step"][0]) + 1 for piece in taken]
-
-
-@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # the viewer is ended, and writes none
-def test_a_viewer_receives_the_steps_of_a_live_view(pictured, tmp_path, monkeypatch):
-    monkeypatch.setattr(live_view, "END_SECONDS", 120.0)  # a busy machine
-    run = pictured("rivals")
-    with open_recording(run.recording) as recording:
-        (steps, *_), mdp = recording.blocks(schema.TRAIN_STEP), recording.mdp
-        metrics = recording.metrics("eval")[-1]
-    port, path = viewer.free_port(), tmp_path / "live.rrd"
-    live = LiveView("live", "live", 10, f"rerun+http://127.0.0.1:{port}/proxy")
-    with viewer.viewer(port, "--save", str(path)), live:
-        live.begin(mdp, ("taxi_1", "taxi_2"))
-        live.steps("train", 0, steps)
-        live.metrics("eval", len(steps), metrics)
-    assert (live.dropped, live.failure) == (0, "")
-    shown = steps[steps["episode"] % 10 == 0]
-    chunks = RrdReader(str(path)).stream().filter(content="/train/grid/things").to_chunks()
-    moving = [chunk.to_record_batch() for chunk in chunks if not chunk.is_static]
-    times = [step for batch in moving for step in batch.column("step").to_pylist()]
-    assert sorted(set(times)) == (shown["step"] + 1).tolist()
-
-
-@pytest.mark.parametrize(
-    ("url", "message"),
-    [
-        ("127.0.0.1:9876", "expected a viewer's address such as rerun+http://127.0.0.1:9876/proxy"),
-        ("rerun+http://127.0.0.1:9/proxy", "nothing answers there"),
-        ("rerun+http://127.0.0.1:port/proxy", "expected a viewer's address"),
-    ],
-)
-def test_an_address_without_a_viewer_is_refused_before_the_run(url, message):
-    with pytest.raises(RunnerError, match=re.escape(message)):
-        viewer.check_address(url)
