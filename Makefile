@@ -20,6 +20,7 @@ run: $(VENV)/.installed  ## train the tutorial's cooperative job, every step rec
 serve: $(VENV)/.installed-service  ## open the runs in the browser
 	$(BIN)/dualtaxi serve
 
+test: export PYTHONDONTWRITEBYTECODE :=  # the tests start hundreds of processes: compile modules for them once
 test: $(VENV)/.installed-dev  ## run all tests
 	$(BIN)/python -m pytest -n 2
 

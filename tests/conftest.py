@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Iterator
@@ -15,6 +16,12 @@ hypothesis.settings.load_profile("untimed")
 if sys.platform == "linux":
     os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported
 os.environ["DUALTAXI_CODE"] = "off"  # thousands of runs need not ask git; tests of the user's code turn it on
+
+
+def pytest_collection_finish() -> None:
+    """Leave what the collected tests consist of, millions of objects, out of every search for garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -109,26 +109,27 @@ def message(topic: schema.Topic, payload: bytes) -> bytes:
 
 
 BOMBS = {
-    "chunks of 60 MB each": [chunk_body(steps_of_zeros(60 * MEGABYTE), "zstd")] * 4,
-    "more unpacked than a thousand times the file": [chunk_body(bytes(64 * MEGABYTE), "zstd")] * 40,
-    "messages of nothing": [chunk_body(message(schema.EVAL_METRICS_TOPIC, b"") * 400_000, "zstd")],
-    "one message of 40 MB": [
+    "chunks of 60 MB each": lambda: [chunk_body(steps_of_zeros(60 * MEGABYTE), "zstd")] * 4,
+    "more unpacked than a thousand times the file": lambda: [chunk_body(bytes(64 * MEGABYTE), "zstd")] * 40,
+    "messages of nothing": lambda: [chunk_body(message(schema.EVAL_METRICS_TOPIC, b"") * 400_000, "zstd")],
+    "one message of 40 MB": lambda: [
         chunk_body(message(schema.TRAIN_METRICS_TOPIC, b"\x22" + bytes(40 * MEGABYTE)), "zstd")
     ],
-    "chunks of nothing": [bytes(16) + struct.pack("<Q", 31) + bytes(16)] * 500_000,
-    "a chunk that repeats itself": [
+    "chunks of nothing": lambda: [bytes(16) + struct.pack("<Q", 31) + bytes(16)] * 500_000,
+    "a chunk that repeats itself": lambda: [
         chunk_body(b"", "", size=60 * MEGABYTE)[:-8]
         + struct.pack("<Q", len(zstandard.compress(bytes(2**28))))
         + zstandard.compress(bytes(2**28))
     ],
 }
+"""The chunks of each, made when a test needs them."""
 
 
 @linux
 @pytest.mark.parametrize("finished", [True, False])
 @pytest.mark.parametrize("bomb", BOMBS)
 def test_recordings_made_to_exhaust_memory_do_not(bomb, finished, recordings, path):
-    path.write_bytes(with_chunks(recordings["tiny-0"], BOMBS[bomb], finished))
+    path.write_bytes(with_chunks(recordings["tiny-0"], BOMBS[bomb](), finished))
     assert _peak(path) < MOST_MEMORY
 
 
@@ -146,40 +147,46 @@ def replaced(data: bytes, opcode: int, name: str, body: bytes) -> bytes:
     return join(records)
 
 
-ZEROS = zstandard.compress(b"\x93NUMPY\x01\x00\x80\x00" + b"x" * 128 + bytes(2**28))
+REWARDS = "environment/rewards.npy.zst"
+ARRAY = b"\x93NUMPY\x01\x00\x80\x00"
 HUGE = b"{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999, 9999999999), }".ljust(127) + b"\n"
 DESCRIPTIONS = {
-    "deeply nested": (METADATA, "config", metadata_body("config", {"json": "[" * 10**6})),
-    "config of 60 MB": (METADATA, "config", metadata_body("config", {"json": "[[]," * 15 * MEGABYTE})),
+    "deeply nested": (METADATA, "config", lambda: described("[" * 10**6)),
+    "config of 60 MB": (METADATA, "config", lambda: described("[[]," * 15 * MEGABYTE)),
     "a million entries": (
         METADATA,
         "provenance",
-        metadata_body("provenance", {str(k): "" for k in range(10**6)}),
+        lambda: metadata_body("provenance", {str(k): "" for k in range(10**6)}),
     ),
     "a scene of 50 MB": (
         ATTACHMENT,
         "environment.json",
-        attachment_body("environment.json", b'{"scene": [' + b"{}," * 17 * MEGABYTE),
+        lambda: attachment_body("environment.json", b'{"scene": [' + b"{}," * 17 * MEGABYTE),
     ),
     "an array that is not what it says": (
         ATTACHMENT,
-        "environment/rewards.npy.zst",
-        attachment_body("environment/rewards.npy.zst", ZEROS),
+        REWARDS,
+        lambda: attachment_body(REWARDS, zstandard.compress(ARRAY + b"x" * 128 + bytes(2**28))),
     ),
     "an array as large as can be said": (
         ATTACHMENT,
-        "environment/rewards.npy.zst",
-        attachment_body(
-            "environment/rewards.npy.zst", zstandard.compress(b"\x93NUMPY\x01\x00\x80\x00" + HUGE)
-        ),
+        REWARDS,
+        lambda: attachment_body(REWARDS, zstandard.compress(ARRAY + HUGE)),
     ),
 }
+"""What each replaces, and a function that makes its body."""
+
+
+def described(text: str) -> bytes:
+    """Return the body of a configuration with this text."""
+    return metadata_body("config", {"json": text})
 
 
 @linux
 @pytest.mark.parametrize("kind", DESCRIPTIONS)
 def test_a_description_made_to_exhaust_memory_does_not(kind, recordings, path):
-    path.write_bytes(replaced(recordings["tiny-0"], *DESCRIPTIONS[kind]))
+    opcode, name, make_body = DESCRIPTIONS[kind]
+    path.write_bytes(replaced(recordings["tiny-0"], opcode, name, make_body()))
     assert _peak(path) < MOST_MEMORY
 
 
@@ -194,10 +201,10 @@ HEADERS = {
 
 @pytest.mark.parametrize("kind", HEADERS)
 def test_an_array_whose_header_is_no_description_of_numbers_is_refused(kind, recordings, path):
-    name, header = "environment/rewards.npy.zst", HEADERS[kind] + b"\n"
+    header = HEADERS[kind] + b"\n"
     array = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
-    body = attachment_body(name, zstandard.compress(array))
-    path.write_bytes(replaced(recordings["tiny-0"], ATTACHMENT, name, body))
+    body = attachment_body(REWARDS, zstandard.compress(array))
+    path.write_bytes(replaced(recordings["tiny-0"], ATTACHMENT, REWARDS, body))
     with open_recording(path) as recording, pytest.raises(RecordingError, match=r"found no .* of numbers"):
         _ = recording.mdp
 
