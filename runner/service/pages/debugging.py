@@ -20,7 +20,7 @@ from runner.service.dependencies import ComputationOf, OpenRecording, RecordedRu
 from runner.service.fragments import ShownBranches, ShownWhen
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import message_of, page
-from runner.service.pages.replay import BEFORE, ShownStep, T, shown_step
+from runner.service.pages.replay import BEFORE, Stage, T, stage_of
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 
@@ -107,7 +107,7 @@ class _WhatIfView(RunView):
     at: str
     title: str
     found: ShownBranches
-    step: ShownStep
+    stage: Stage
     source: str
     """Address of the branch's data."""
     recorded: str
@@ -137,7 +137,7 @@ async def what_if(
             at=str(step),
             title=f"What if? {step.episode_name}, step {step.t:,}",
             found=branches,
-            step=shown_step(branches.part, shown_t),
+            stage=stage_of(branches.part, shown_t),
             source=f"/api/v1/runs/{run.run_id}/what-if/{step}/{branches.action}",
             recorded=f"/runs/{run.run_id}/replay/{step.episode_path}?t={step.t}",
         )

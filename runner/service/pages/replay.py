@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from itertools import islice
 from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple
 
-import numpy as np
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
@@ -31,7 +30,6 @@ from runner.service.catalogue import Catalogue
 from runner.service.dependencies import EPISODES, CatalogueOf, ComputationOf, PicturesOf, RecordedRun
 from runner.service.pages.frame import RunView, head_of
 from runner.service.pages.rendering import message_of, page
-from runner.util.humanize import capitalised
 from runner.util.values import JsonView
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
@@ -70,23 +68,22 @@ class Panel:
 
 
 @dataclass(frozen=True)
-class ShownStep:
-    """A step of an episode."""
+class Stage:
+    """What a page shows of an episode before its script fills in the step."""
 
     title: str
     description: str
     length: int
     """Steps of the episode."""
     t: int
-    picture: str
-    """The grid, as SVG; empty without a scene."""
+    """The step that the script shows first."""
+    scene: str
+    """The grid, as SVG, whose things the script moves; empty without a scene."""
     key: str
     broad: bool
-    facts: list[tuple[str, str]]
-    """What is known of the step, by name."""
-    note: str = ""
-    """Why there is no picture."""
-    has_pictures: bool = False
+    note: str
+    """Why there is no picture, or no better one."""
+    has_pictures: bool
     """Whether pictures are fetched."""
 
 
@@ -103,7 +100,7 @@ class _ReplayView(RunView):
     TEMPLATE: ClassVar = "run_replay.html"
     which: tuple[int, ...]
     """(episode,) of training, or (training episodes before, trial) of an evaluation."""
-    step: ShownStep | None
+    stage: Stage | None
     problem: str
     episodes: int
     """Training episodes of the run."""
@@ -204,7 +201,7 @@ def _add_route(path: str, episode: Callable[..., StepRef]) -> None:
             if isinstance(part, RunnerError):
                 view = _view(run, at, branches, None, message_of(part, request))
                 return page(request, view, HTTPStatus.NOT_FOUND)
-            return page(request, _view(run, at, branches, shown_step(json.loads(part), t)))
+            return page(request, _view(run, at, branches, stage_of(json.loads(part), t)))
 
         return await run_in_threadpool(show)
 
@@ -229,9 +226,7 @@ def _branches(recording: Recording, run: Run, catalogue: Catalogue) -> list[Link
     ]
 
 
-def _view(
-    run: Run, at: StepRef, branches: list[Link], step: ShownStep | None, problem: str = ""
-) -> _ReplayView:
+def _view(run: Run, at: StepRef, branches: list[Link], stage: Stage | None, problem: str = "") -> _ReplayView:
     with open_recording(run.recording) as recording:
         episodes = recording.count(recording.topic("/train/episode"))
         environments, is_job = recording.environments, recording.is_job
@@ -249,7 +244,7 @@ def _view(
         run=head_of(run),
         here="replay",
         which=at.which,
-        step=step,
+        stage=stage,
         problem=problem,
         episodes=episodes,
         evaluations=evaluations,
@@ -264,45 +259,22 @@ def _view(
     )
 
 
-def shown_step(part: JsonView, t: int) -> ShownStep:
-    """Return a step of a part of an episode, see `fragments.episode_part`."""
+def stage_of(part: JsonView, t: int) -> Stage:
+    """Return the stage of a part of an episode, see `fragments.episode_part`."""
     episode = part["episode"]
     at = min(t, episode["length"])
-    i = at - episode["first"]
-    picture, key, broad = "", "", False
-    if episode["grid"]:
-        drawing = svg.Drawing(part["scene"])
-        frames = episode["grid"]["at"]
-        places = np.array(episode["grid"]["places"], np.int16)[frames].reshape(len(frames), -1, 3)
-        picture = drawing.frame(places[i], f"The grid after {at} steps", places[: i + 1], style="")
-        key, broad = drawing.key(), drawing.width > svg.BROAD
-    return ShownStep(
+    drawing = svg.Drawing(part["scene"]) if episode["grid"] else None
+    return Stage(
         title=episode["title"],
         description=episode["description"],
         length=episode["length"],
         t=at,
-        picture=picture,
-        key=key,
-        broad=broad,
-        facts=_facts(episode, i),
-        note="" if picture else part["picture_note"],
-        has_pictures=part["has_pictures"] and not picture,
+        scene=drawing.frame(None, f"The grid after {at} steps", style="") if drawing else "",
+        key=drawing.key() if drawing else "",
+        broad=drawing is not None and drawing.width > svg.BROAD,
+        note="" if drawing else part["picture_note"],
+        has_pictures=part["has_pictures"] and not drawing,
     )
-
-
-def _facts(episode: JsonView, i: int) -> list[tuple[str, str]]:
-    """Return what is known of frame i of a part of an episode, by name, for readers without scripts."""
-
-    def named(one: Mapping[str, object]) -> str:
-        return capitalised(f"{one['agent']} {one['name']}".strip().replace("_", " "))
-
-    facts = [(named(text), text["values"][text["at"][i]]) for text in episode["texts"]]
-    if i == 0:
-        facts.append(("Last action", "none yet: the episode begins"))
-    else:
-        facts += [(named(action), action["values"][action["at"][i - 1]]) for action in episode["actions"]]
-        facts.append(("Reward", ", ".join(map(str, episode["reward"][i - 1]))))
-    return facts + [(named(series), str(series["values"][i])) for series in episode["series"]]
 
 
 def _whole(text: str) -> int:

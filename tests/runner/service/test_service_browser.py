@@ -238,11 +238,18 @@ def test_any_episode_is_scrubbed_and_each_step_has_an_address(page, folder, addr
     wait(browser, lambda: browser.current_url.endswith("?t=1"))
 
 
-def test_a_step_is_shown_without_scripts(served):
+def test_a_replay_has_the_space_of_its_picture_and_facts_before_scripts_run(page, served):
     with urllib.request.urlopen(f"{served}/runs/first/replay/train/7?t=2") as answer:
         html = answer.read().decode()
     assert 'data-thing="0"' in html
-    assert '<a href="?t=3">' in html
+    assert "dualtaxi play" in html
+    browser = page("/runs/first/replay/train/7?t=2")
+    wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, ".choice ol"))
+    height = "return arguments[0].getBoundingClientRect().height"
+    caption = browser.find_element(By.CSS_SELECTOR, ".caption")
+    filled = browser.execute_script(height, caption)
+    browser.execute_script("arguments[0].replaceChildren()", caption)
+    assert browser.execute_script(height, caption) == filled
 
 
 def test_two_runs_are_chosen_in_the_table_and_replayed_in_step(page):

@@ -109,8 +109,9 @@ def test_without_a_picture_the_page_gives_the_reason_and_the_values(loops_client
     text = page(loops_client, "/runs/rooms/replay/train/0?t=2")
     assert "There is no picture." in text
     assert "data-pictures" not in text
-    assert "<dt>Mission</dt>" in text
-    assert "<dt>Position[1]</dt>" in text
+    shown = part(loops_client, "rooms/replay/train/0")
+    assert [one["name"] for one in shown["texts"]] == ["mission"]
+    assert "position[1]" in [one["name"] for one in shown["series"]]
     found, problem = pictures(loops_client, "rooms/replay/train/0")
     assert found == []
     assert problem.startswith("There is no picture.")
