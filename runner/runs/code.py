@@ -68,13 +68,18 @@ class _Sources:
     left_out: list[str] = field(default_factory=list)
     budget: int = MAX_CODE_BYTES
 
+    def has_room(self, name: str, size: int) -> bool:
+        """Return whether so many bytes fit; else note that they are left out."""
+        if size <= min(self.budget, MAX_FILE_BYTES):
+            return True
+        self.left_out.append(f"{name} ({size:,} bytes)")
+        return False
+
     def add(self, path: str, text: str) -> None:
         """Add a file without its secrets, or note that it does not fit."""
         text = redacted_text(text)
         size = len(text.encode(errors="replace"))
-        if size > min(self.budget, MAX_FILE_BYTES) or len(self.files) == MAX_FILES:
-            self.left_out.append(f"{path} ({size:,} bytes)")
-        else:
+        if self.has_room(path, size):
             self.files[path] = text
             self.budget -= size
 
@@ -90,9 +95,7 @@ class _Sources:
             return
         try:
             with open_regular(root / path, follow_link=False) as stream:
-                size = os.fstat(stream.fileno()).st_size
-                if size > min(self.budget, MAX_FILE_BYTES):
-                    self.left_out.append(f"{path} ({size:,} bytes)")
+                if not self.has_room(path, os.fstat(stream.fileno()).st_size):
                     return
                 data = stream.read(MAX_FILE_BYTES + 1)
         except OSError:
@@ -107,8 +110,10 @@ class RecordedCode:
 
     entries: dict[str, str]
     attachment: bytes = b""
-    root: Path = Path()
-    """The folder that was searched: of the repository, or of the script."""
+
+
+_recent: dict[tuple[object, ...], tuple[float, RecordedCode]] = {}
+"""The code that was read last, by what it was read for, and the time of `time.monotonic`."""
 
 
 class CodeCollector:
@@ -123,24 +128,28 @@ class CodeCollector:
         """The entries of the metadata record; empty until it is written."""
         self._is_wanted = is_wanted and is_code_wanted()
         self._found: RecordedCode | None = None
-        self._folder = Path()
+        self._commit: dict[str, str] = {}
+        """The entries of commit, branch and remote, which are known before the rest."""
         self._deadline = time.monotonic() + WAIT_SECONDS
-        if not self._is_wanted:
-            return
-        cells = _cells()
-        with contextlib.suppress(OSError):  # there is no current folder: the thread notes it
-            recordings = recordings.absolute()
-            self._folder = _recent.place(cells)[0]
-            self._found = _recent.fresh(cells, recordings)
-        if self._found is None:
+        if self._is_wanted:
+            with contextlib.suppress(OSError):  # there is no current folder: the thread notes it
+                recordings = recordings.absolute()
             self._thread = threading.Thread(
-                target=self._collect, args=(cells, recordings), name="recording-code", daemon=True
+                target=self._collect, args=(_cells(), recordings), name="recording-code", daemon=True
             )
             self._thread.start()
 
     def _collect(self, cells: str, recordings: Path) -> None:
         try:
-            self._found = _recent.read(cells, recordings)
+            script = user_script()
+            folder = Path.cwd() if script is None else script.parent
+            key = folder, script, cells, recordings
+            read_at, code = _recent.get(key, (0.0, None))
+            if code is None or time.monotonic() - read_at > _FRESH_SECONDS:
+                code = collect(folder, script, cells, recordings, self._commit.update)
+                _recent.clear()
+                _recent[key] = time.monotonic(), code
+            self._found = code
         except Exception as error:  # a run is worth more than what is known of its code
             self._found = RecordedCode({"code.not_recorded": f"{type(error).__name__}: {error}"[:500]})
 
@@ -178,9 +187,9 @@ class CodeCollector:
             if not wait:
                 return
             entries = {"code.not_recorded": f"reading it took more than {WAIT_SECONDS:g} s"}
-            if commit := _recent.commit(self._folder, self._deadline - WAIT_SECONDS):
+            if self._commit:
                 missing = f"what differs from the commit: reading it took more than {WAIT_SECONDS:g} s"
-                entries |= commit | {"git.not_recorded": missing}
+                entries |= self._commit | {"git.not_recorded": missing}
             code = RecordedCode(entries)
         try:
             file.add_metadata(CODE_RECORD, code.entries)
@@ -193,66 +202,6 @@ class CodeCollector:
 
 
 # --- what is collected --------------------------------------------------------------------------------------
-
-
-class _Recent:
-    """The code that was read last, for other runs that begin within seconds of it."""
-
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
-        self.key: tuple[str, ...] = ()
-        self.read_at = 0.0
-        self.code = RecordedCode({})
-        self.recordings = Path()
-        self._commit: tuple[Path, float, dict[str, str]] = Path(), 0.0, {}
-        """The folder of the code that is being read, when its commit was known, and the entries of that."""
-
-    def unlock(self) -> None:
-        """Replace the lock, in a forked process."""
-        self.lock = threading.Lock()
-
-    def fresh(self, cells: str, recordings: Path) -> RecordedCode | None:
-        """Return the code of this process, if it was read a few seconds ago."""
-        _, _, key = self.place(cells)
-        code, before = self.code, self.recordings
-        if key != self.key or time.monotonic() - self.read_at > _FRESH_SECONDS:
-            return None
-        is_same = recordings == before or _within(code.root, recordings) == _within(code.root, before)
-        return code if is_same else None
-
-    def read(self, cells: str, recordings: Path) -> RecordedCode:
-        """Return the code of this process, read now or a few seconds ago."""
-        folder, script, key = self.place(cells)
-        with self.lock:
-            if (recent := self.fresh(cells, recordings)) is not None:
-                return recent
-
-            def note(commit: dict[str, str]) -> None:
-                self._commit = folder, time.monotonic(), commit
-
-            self._commit = folder, 0.0, {}
-            code = collect(folder, script, cells, recordings, note)
-            # In this order: `fresh` is called without the lock.
-            self.key, self.code, self.recordings = (), code, recordings
-            self.key, self.read_at = key, time.monotonic()
-            return code
-
-    def commit(self, folder: Path, began: float) -> dict[str, str]:
-        """Return the entries of commit, branch and remote of a folder that were read for a run, if any."""
-        read, known_at, entries = self._commit
-        return entries if read == folder and known_at >= began - _FRESH_SECONDS else {}
-
-    @staticmethod
-    def place(cells: str) -> tuple[Path, Path | None, tuple[str, ...]]:
-        """Return the folder of the user's script, the script, and a key of what is collected."""
-        script = user_script()
-        folder = Path.cwd() if script is None else script.parent
-        return folder, script, (str(folder), str(script), cells)
-
-
-_recent = _Recent()
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_recent.unlock)  # a thread that is not there may hold it
 
 
 def collect(
@@ -305,7 +254,6 @@ def collect(
     return RecordedCode(
         {key: as_utf8(text) for key, text in entries.items() if text},
         code.to_attachment() if code.files or code.patch else b"",
-        root,
     )
 
 
@@ -329,15 +277,13 @@ def _fitting_patch(repository: Repository, sources: _Sources) -> str:
     """Return the parts of the patch that fit, and note the others as left out."""
     fitting = []
     for path, part in patch_parts(repository.patch).items():
-        limit = min(sources.budget, MAX_FILE_BYTES)
-        is_short = len(part) <= limit  # redaction takes seconds for megabytes
-        shown = redacted_text(part) if is_short else part
-        size = len(shown.encode())
-        if size > limit:
-            sources.left_out.append(f"the changes of {path} ({size:,} bytes)")
-        else:
-            fitting.append(shown)
-            sources.budget -= size
+        name = f"the changes of {path}"
+        if sources.has_room(name, len(part)):  # redaction takes seconds for megabytes
+            shown = redacted_text(part)
+            size = len(shown.encode())
+            if sources.has_room(name, size):
+                fitting.append(shown)
+                sources.budget -= size
     return "".join(fitting)
 
 

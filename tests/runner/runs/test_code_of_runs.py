@@ -56,7 +56,7 @@ def _recorded_code(monkeypatch):
 def project(tmp_path, monkeypatch):
     folder = new_project(tmp_path / "project")
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(code_module, "_recent", code_module._Recent())
+    monkeypatch.setattr(code_module, "_recent", {})
     return folder
 
 
@@ -118,7 +118,7 @@ def test_a_resumed_run_has_the_code_of_its_beginning_or_of_its_end(project):
     stopped = run_job(Job(config, 0), run, stop=stopping_after(3))
     first = code_of(stopped.recording)
     (project / "train.py").write_text("rate = 3\n")
-    code_module._recent.read_at = 0.0
+    code_module._recent.clear()
     done = resume(stopped)
     assert done.status == "finished"
     entries, code = code_of(done.recording)
