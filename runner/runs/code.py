@@ -69,7 +69,7 @@ class _Sources:
     budget: int = MAX_CODE_BYTES
 
     def has_room(self, name: str, size: int) -> bool:
-        """Return whether so many bytes fit; else note that they are left out."""
+        """Return whether this number of bytes fits; else note that they are left out."""
         if size <= min(self.budget, MAX_FILE_BYTES):
             return True
         self.left_out.append(f"{name} ({size:,} bytes)")
