@@ -8,22 +8,30 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sqlite3
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
-from peewee import SchemaManager, SqliteDatabase
-
-from runner.runs.catalogue.rows import Expression, Row, SqlRow
+from runner.runs.catalogue.rows import SEED_SHIFT, STORED
 from runner.util.files import cache_folder, replacing
 
 Report = Callable[[str], None]
 
 INDEX_FILE: Final = "catalogue.sqlite"
 _APPLICATION: Final = 0x44546178  # "DTax"
-_VERSION: Final = zlib.crc32(",".join(["9", *Row._meta.sorted_field_names]).encode()) >> 1
-"""Identifies the columns, and by the number indexes and contents; an index of another version is replaced."""
+_SCHEMA: Final = (
+    f"CREATE TABLE runs ({', '.join(' '.join(column) for column in STORED.items())}, "
+    "PRIMARY KEY (root, entry)) WITHOUT ROWID",
+    "CREATE INDEX runs_states ON runs (root, entry, fingerprint, mark, stable, status)",
+    "CREATE INDEX runs_ids ON runs (id)",
+    "CREATE INDEX runs_digests ON runs (digest)",
+    "CREATE INDEX runs_parents ON runs (parent)",
+    "CREATE INDEX runs_names ON runs (root, created, id, name, seed)",
+)
+_VERSION: Final = zlib.crc32("10".join(_SCHEMA).encode()) >> 1
+"""Identifies the schema, and by the number the contents; an index of another version is replaced."""
 _HEAD_BYTES: Final = 100
 """The header of an SQLite file; at 24 it has the number of changes."""
 _BUSY_SECONDS: Final = 60
@@ -51,14 +59,15 @@ def version() -> Version | None:
         return None
 
 
-def open_index(report: Report) -> SqliteDatabase:
+def open_index(report: Report) -> sqlite3.Connection:
     """Open the index; create it first if it is missing, foreign or of another version."""
     path = index_path()
     if not path.exists():
         renew()
     for _ in range(2):
         database = _connected(os.fspath(path))
-        if (database.application_id, database.user_version) == (_APPLICATION, _VERSION):
+        pragmas = [pragma(database, name) for name in ("application_id", "user_version")]
+        if pragmas == [_APPLICATION, _VERSION]:
             return database
         database.close()
         report(f"The index {path} is of another version; it is rebuilt.")
@@ -88,33 +97,41 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return None
 
 
-def _connected(path: str) -> SqliteDatabase:
+def _connected(path: str) -> sqlite3.Connection:
     """Return the database at a path; its writers wait for one another."""
-    pragmas = {"busy_timeout": _BUSY_SECONDS * 1000, "synchronous": "normal"}
-    database = SqliteDatabase(path, pragmas=pragmas, lock_type="IMMEDIATE", timeout=_BUSY_SECONDS)
-    database.connect()
+    database = sqlite3.connect(path, timeout=_BUSY_SECONDS, isolation_level=None)
+    database.execute("PRAGMA synchronous = NORMAL")
     return database
 
 
-def create(path: str) -> SqliteDatabase:
+def create(path: str) -> sqlite3.Connection:
     """Return a new, empty index."""
     database = _connected(path)
-    SchemaManager(Row, database).create_all()
-    database.application_id, database.user_version = _APPLICATION, _VERSION
+    for statement in _SCHEMA:
+        database.execute(statement)
+    database.execute(f"PRAGMA application_id = {_APPLICATION}")
+    database.execute(f"PRAGMA user_version = {_VERSION}")
     return database
 
 
-def tuples_of(database: SqliteDatabase, query: Expression) -> Iterator[SqlRow]:
-    """Return the rows of a query as tuples of SQLite's values, without peewee's conversions."""
-    rows: Iterator[SqlRow] = database.execute(query)  # type: ignore[no-untyped-call]
-    return rows
+def pragma(database: sqlite3.Connection, name: str) -> int:
+    """Return the value of a pragma."""
+    return int(database.execute(f"PRAGMA {name}").fetchone()[0])
 
 
-def write_rows(database: SqliteDatabase, rows: Sequence[Mapping[str, object]]) -> None:
+@contextlib.contextmanager
+def transaction(database: sqlite3.Connection, kind: Literal["DEFERRED", "IMMEDIATE"]) -> Iterator[None]:
+    """Make the block a transaction, or a part of the one that has begun."""
+    if database.in_transaction:
+        yield
+        return
+    database.execute(f"BEGIN {kind}")
+    with database:
+        yield
+
+
+def write_rows(database: sqlite3.Connection, rows: Iterable[Mapping[str, Any]]) -> None:
     """Write whole rows, replacing those of the same folders; within a transaction."""
-    fields = Row._meta.sorted_fields
-    columns = ", ".join(f'"{field.column_name}"' for field in fields)
-    places = ", ".join("?" * len(fields))
-    values = [[field.db_value(row[field.name]) for field in fields] for row in rows]
-    statement = f"INSERT OR REPLACE INTO {Row._meta.table_name} ({columns}) VALUES ({places})"
-    database.connection().executemany(statement, values)  # type: ignore[no-untyped-call]
+    places = ", ".join(f":{name}" for name in STORED)
+    shifted = ({**row, "seed": None if row["seed"] is None else row["seed"] - SEED_SHIFT} for row in rows)
+    database.executemany(f"INSERT OR REPLACE INTO runs VALUES ({places})", shifted)

@@ -14,18 +14,15 @@ from __future__ import annotations
 import functools
 import glob
 import math
-import operator
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
-from peewee import Value, fn
-
 from runner.errors import RunnerError, nearest
 from runner.runs.catalogue.columns import FIELDS, SETTING, STATUSES, TEXT_KINDS, Column, Kind, field_of
-from runner.runs.catalogue.rows import SEEDS, Expression, Row
+from runner.runs.catalogue.rows import SEED_SHIFT, Sql
 from runner.util.values import is_utf8
 
 if TYPE_CHECKING:
@@ -42,9 +39,6 @@ _PLACE: Final = re.compile(
 )
 _MISTAKEN: Final = {"and": "AND", "or": "OR", "not": "NOT", "&&": "AND", "||": "OR", "&": "AND", "|": "OR"}
 _COMPARISON: Final = re.compile(r"([A-Za-z_][\w.-]*)\s*([<>]=?|!=|==?)(.*)", re.DOTALL)
-_OPERATORS: Final[dict[str, Callable[[Expression, Expression], Expression]]] = {
-    **{"=": operator.eq, "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
-}
 _OPPOSITE: Final = {"<": ">", "<=": ">=", ">": "<", ">=": "<="}
 _SPAN: Final = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|d|w)")
 _SECONDS: Final = {"s": 1, "m": 60, "min": 60, "h": 3600, "d": 86400, "w": 7 * 86400}
@@ -56,14 +50,15 @@ _BYTES: Final = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
 class Filter:
     """A parsed filter."""
 
-    condition: Expression
-    """The condition on a row, for peewee; None if any row matches."""
+    condition: Sql | None
+    """The condition on a row; None if any row matches."""
     settings: frozenset[str] = frozenset()
     """The paths of configurations in it."""
 
-    def also(self, condition: Expression) -> Filter:
+    def also(self, condition: Sql) -> Filter:
         """Return the filter for rows that match another condition as well."""
-        return Filter(condition if self.condition is None else condition & self.condition, self.settings)
+        own = [] if self.condition is None else [self.condition]
+        return Filter(_joined("AND", [condition, *own]), self.settings)
 
 
 ANY_RUN: Final = Filter(None)
@@ -104,7 +99,7 @@ class _Translation:
         self._text, self._now = text, now
         self.settings: set[str] = set()
 
-    def condition(self, item: Item, field: Column | None = None, depth: int = 0) -> Expression:
+    def condition(self, item: Item, field: Column | None = None, depth: int = 0) -> Sql:
         """Return the condition of a node on a field, or on the whole run."""
         from luqum import tree
 
@@ -115,17 +110,18 @@ class _Translation:
             case tree.Prohibit() if field is not None and isinstance(item.a, tree.Word):
                 return self._compare(field, "=", item, "-" + item.a.value)
             case tree.Not() | tree.Prohibit():
-                return ~within(item.a)
+                negated = within(item.a)
+                return Sql(f"NOT {negated.text}", negated.values)
             case tree.Plus() | tree.Group() | tree.FieldGroup():
                 return within(item.children[0])
             case tree.BaseOperation():
-                how = operator.or_ if isinstance(item, tree.OrOperation) else operator.and_
+                how = "OR" if isinstance(item, tree.OrOperation) else "AND"
                 return _joined(how, [within(part) for part in item.children])
             case tree.SearchField():
                 return self.condition(item.expr, self._field(item, field), depth + 1)
         return self._anywhere(item) if field is None else self._leaf(item, field)
 
-    def _leaf(self, item: Item, field: Column) -> object:
+    def _leaf(self, item: Item, field: Column) -> Sql:
         from luqum import tree
 
         match item:
@@ -144,7 +140,7 @@ class _Translation:
                     (high, "<=" if item.include_high else "<", item.high),
                 )
                 parts = [self._compare(field, sign, at, end) for end, sign, at in ends if end != "*"]
-                return _joined(operator.and_, parts) if parts else self._compare(field, "=", item, "*")
+                return _joined("AND", parts) if parts else self._compare(field, "=", item, "*")
         raise self._unexpected(item)
 
     def _field(self, item: Item, outer: Column | None) -> Column:
@@ -161,7 +157,7 @@ class _Translation:
         except RunnerError as error:
             raise self._error(item, str(error).removesuffix(".")) from None
 
-    def _anywhere(self, item: object) -> object:
+    def _anywhere(self, item: object) -> Sql:
         """Return the condition that a word is in the id, the names, the tags or the note of a run."""
         from luqum import tree
 
@@ -179,22 +175,24 @@ class _Translation:
             raise self._error(
                 item, f"found {item.value!r}, expected {before}{compared[1]}:{sign}{compared[3] or 'VALUE'}"
             )
-        return fn.matches(Row.words, f"*{_pattern(item.value)}*")
+        return Sql("matches(words, ?)", (f"*{_pattern(item.value)}*",))
 
-    def _compare(self, field: Column, sign: str, item: Item, value: str) -> object:
+    def _compare(self, field: Column, sign: str, item: Item, value: str) -> Sql:
         """Return the condition that a field compares so with a value; `item` is its place in the text."""
         try:
             if field.name.startswith(SETTING):
                 condition = _setting_condition(field.name.removeprefix(SETTING), sign, value)
             else:
-                column = getattr(Row, field.stored[0])
+                column = field.stored[0]
                 if sign == "=" and value == "*":
-                    has_value = column.is_null(False)
-                    return has_value & (column != "") if field.kind in TEXT_KINDS else has_value
+                    not_empty = f" AND {column} != ''" if field.kind in TEXT_KINDS else ""
+                    return Sql(f"({column} IS NOT NULL{not_empty})")
                 condition = _condition(field, column, sign, value, self._now)
         except ValueError as error:
             raise self._error(item, f"{field.name}: found {value!r}, expected {error}") from None
-        return fn.COALESCE(condition, 0) == 1  # false, not unknown, where there is no value
+        return Sql(
+            f"(COALESCE({condition.text}, 0) = 1)", condition.values
+        )  # false, not unknown, where there is no value
 
     def _unexpected(self, item: Item) -> RunnerError:
         found = str(item).strip()
@@ -230,12 +228,13 @@ def _error_at(text: str, at: int, message: str) -> RunnerError:
     return RunnerError(f"filter: {message}{end}\n  {shown}\n  {' ' * (at - start)}^")
 
 
-def _joined(how: Callable[[object, object], object], parts: Sequence[object]) -> object:
+def _joined(how: str, parts: Sequence[Sql]) -> Sql:
     """Return conditions joined in pairs, so that many of them do not nest deeply."""
     if len(parts) == 1:
         return parts[0]
     middle = len(parts) // 2
-    return how(_joined(how, parts[:middle]), _joined(how, parts[middle:]))
+    first, second = _joined(how, parts[:middle]), _joined(how, parts[middle:])
+    return Sql(f"({first.text} {how} {second.text})", first.values + second.values)
 
 
 def _plain(value: str) -> str:
@@ -253,7 +252,7 @@ def _pattern(value: str) -> str:
     return "".join(wild or glob.escape(escaped or plain or stray) for escaped, wild, plain, stray in pieces)
 
 
-def _condition(field: Column, column: Expression, sign: str, value: str, now: datetime) -> Expression:
+def _condition(field: Column, column: str, sign: str, value: str, now: datetime) -> Sql:
     """Return the condition that a column compares so with a value.
 
     Raises:
@@ -262,32 +261,27 @@ def _condition(field: Column, column: Expression, sign: str, value: str, now: da
     plain = _plain(value)
     match field.kind:
         case Kind.WHOLE:
-            return _OPERATORS[sign](column, seed_of(plain))
+            return Sql(f"{column} {sign} ?", (seed_of(plain) - SEED_SHIFT,))
         case Kind.NUMBER | Kind.SIZE:
             bound = size_of(plain) if field.kind is Kind.SIZE else number_of(plain)
-            # peewee would convert 1.5 to the whole number of a column of steps
-            return _OPERATORS[sign](column, Value(bound, converter=lambda number: number))
+            return Sql(f"{column} {sign} ?", (bound,))
         case Kind.DATE:
             start, stop = date_span(plain)
             if sign == "=":
-                return (column >= start) & (column < stop)
-            return (
-                column < (start if sign == "<" else stop)
-                if "<" in sign
-                else column >= (stop if sign == ">" else start)
-            )
+                return Sql(f"({column} >= ? AND {column} < ?)", (start, stop))
+            return Sql(f"{column} {sign[0].replace('>', '>=')} ?", (start if sign in ("<", ">=") else stop,))
         case Kind.AGE:
             then = int((now.timestamp() - seconds_of(plain)) * 1000)
             if sign == "=":
                 raise ValueError(f"{Kind.AGE.value}, as in {field.name}:<{value}")
-            return _OPERATORS[_OPPOSITE[sign]](column, then)
+            return Sql(f"{column} {_OPPOSITE[sign]} ?", (then,))
     assert field.kind is not None
     if sign != "=":
         raise ValueError(f"{field.kind.value}: text has no order")
     if field.kind is Kind.STATUS and not set("*?") & set(value) and plain.casefold() not in STATUSES:
         raise ValueError(f"{field.kind.value}.{nearest(plain, STATUSES)}".removesuffix("."))
     before, after = {Kind.PROSE: ("*", "*"), Kind.START: ("", "*")}.get(field.kind, ("", ""))
-    return fn.matches(column, f"{before}{_pattern(value)}{after}")
+    return Sql(f"matches({column}, ?)", (f"{before}{_pattern(value)}{after}",))
 
 
 def setting_path(path: str) -> str:
@@ -295,26 +289,26 @@ def setting_path(path: str) -> str:
     return '$."' + path.replace("\\", "").replace('"', "") + '"'
 
 
-def _setting_condition(path: str, sign: str, value: str) -> object:
+def _setting_condition(path: str, sign: str, value: str) -> Sql:
     """Return the condition that a value of the configuration compares so."""
-    kind = fn.json_type(Row.settings, setting_path(path))
-    setting = fn.json_extract(Row.settings, setting_path(path))
-    plain = _plain(value)
-    numeric = kind.in_(("integer", "real"))
+    kind, setting = "json_type(settings, ?)", "json_extract(settings, ?)"
+    at, plain = setting_path(path), _plain(value)
     try:
         number = number_of(plain)
     except ValueError:
         number = None
+    if sign != "=" and number is None:
+        raise ValueError("a number: text has no order")
+    numeric = Sql(f"({kind} IN ('integer', 'real') AND {setting} {sign} ?)", (at, at, number))
     if sign != "=":
-        if number is None:
-            raise ValueError("a number: text has no order")
-        return numeric & _OPERATORS[sign](setting, number)
+        return numeric
     if value == "*":
-        return kind.is_null(False)
-    as_text = (kind == "text") & fn.matches(setting, _pattern(value))
+        return Sql(f"({kind} IS NOT NULL)", (at,))
+    as_text = Sql(f"({kind} = 'text' AND matches({setting}, ?))", (at, at, _pattern(value)))
     if number is not None:
-        return as_text | (numeric & (setting == number))
-    return as_text | (kind == plain) if plain in ("true", "false", "null") else as_text
+        return _joined("OR", [as_text, numeric])
+    named = [Sql(f"{kind} = ?", (at, plain))] if plain in ("true", "false", "null") else []
+    return _joined("OR", [as_text, *named])
 
 
 def number_of(text: str) -> int | float:
@@ -336,8 +330,8 @@ def number_of(text: str) -> int | float:
 
 def seed_of(text: str) -> int:
     """Return a seed: a whole number from 0 to 2^64 - 1."""
-    if not re.fullmatch(r"\d{1,20}", text, re.ASCII) or int(text) >= SEEDS:
-        raise ValueError(f"{Kind.WHOLE.value} from 0 to {SEEDS - 1}")
+    if not re.fullmatch(r"\d{1,20}", text, re.ASCII) or int(text) >= 2 * SEED_SHIFT:
+        raise ValueError(f"{Kind.WHOLE.value} from 0 to {2 * SEED_SHIFT - 1}")
     return int(text)
 
 

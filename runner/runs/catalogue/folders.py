@@ -8,17 +8,15 @@ files, takes 10 us, and also notices files that were changed in place. Files are
 from __future__ import annotations
 
 import os
+import sqlite3
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from peewee import SqliteDatabase, chunked
-
 from runner.recording.labels import LABELS_FILE
-from runner.runs.catalogue.database import tuples_of, write_rows
-from runner.runs.catalogue.rows import Row, row_of
+from runner.runs.catalogue.database import transaction, write_rows
+from runner.runs.catalogue.rows import STORED, row_of
 from runner.runs.listing import run_entries, run_in
 from runner.runs.run import RECORDING_FILE, RUN_FILE
 
@@ -27,12 +25,9 @@ _STABLE_NS: Final = 2 * 10**9
 _RUN_FILES: Final = (RUN_FILE, LABELS_FILE, RECORDING_FILE)
 _BATCH: Final = 2000
 """Rows in memory at once, written in one transaction."""
-_FEW: Final = 500
-"""Values in one statement."""
 
 
-@dataclass(frozen=True)
-class Difference:
+class Difference(NamedTuple):
     """How a recordings folder differs from the index; runs are given by the names of their folders."""
 
     root: str
@@ -49,7 +44,7 @@ class Folders:
 
     def __init__(
         self,
-        database: SqliteDatabase,
+        database: sqlite3.Connection,
         roots: Sequence[str],
         quick: bool = False,
     ) -> None:
@@ -66,37 +61,42 @@ class Folders:
 
     def apply(self, found: Sequence[Difference]) -> None:
         """Read what changed and write it to the index, a transaction for each batch."""
-        for difference in found:
-            root, here = difference.root, Row.root == difference.root
-            # In the order of the table, which then grows at its end.
-            for entries in chunked(sorted(difference.changed), _BATCH):
-                rows = [self._row(root, entry) for entry in entries]
-                with self._database.atomic("IMMEDIATE"):
+        for root, changed, died, gone in found:
+            changed.sort()  # in the order of the table, which then grows at its end
+            for start in range(0, len(changed), _BATCH):
+                rows = [self._row(root, entry) for entry in changed[start : start + _BATCH]]
+                with transaction(self._database, "IMMEDIATE"):
                     write_rows(self._database, rows)
-            for entries in chunked(difference.died, _FEW):
-                died = Row.update(status="interrupted").where(here & Row.entry.in_(entries))
-                died.execute(self._database)
-            for entries in chunked(difference.gone, _FEW):
-                Row.delete().where(here & Row.entry.in_(entries)).execute(self._database)
+            with transaction(self._database, "IMMEDIATE"):
+                for what, entries in (
+                    ("UPDATE runs SET status = 'interrupted'", died),
+                    ("DELETE FROM runs", gone),
+                ):
+                    places = [(root, entry) for entry in entries]
+                    self._database.executemany(f"{what} WHERE root = ? AND entry = ?", places)
 
     def expire(self) -> None:
         """Have all runs of these folders read again, and delete the rows of folders that no longer exist."""
-        roots = [root for (root,) in tuples_of(self._database, Row.select(Row.root).distinct())]
-        stale = [root for root in roots if not os.path.isdir(root)]  # noqa: PTH112
-        Row.delete().where(Row.root.in_(stale)).execute(self._database)
-        Row.update(fingerprint="", mark="").where(Row.root.in_(self._roots)).execute(self._database)
+        with transaction(self._database, "IMMEDIATE"):
+            for (root,) in self._database.execute("SELECT DISTINCT root FROM runs").fetchall():
+                if not os.path.isdir(root):  # noqa: PTH112
+                    self._database.execute("DELETE FROM runs WHERE root = ?", (root,))
+            expired = "UPDATE runs SET fingerprint = '', mark = '' WHERE root = ?"
+            self._database.executemany(expired, [(root,) for root in self._roots])
 
     def _difference(self, root: str) -> Difference:
         """Return the difference of one folder; entries without files of a run are left out, or gone."""
-        stored = Row.mark if self._quick else Row.fingerprint
-        own = Row.select(Row.entry, stored).where(Row.root == root)
-        indexed: dict[str, str] = dict(tuples_of(self._database, own))
+        stored = "mark" if self._quick else "fingerprint"
+        indexed: dict[str, str] = dict(
+            self._database.execute(f"SELECT entry, {stored} FROM runs WHERE root = ?", (root,))
+        )
         tokens = self._tokens_of(root)
         changed = [entry for entry, token in tokens.items() if indexed.get(entry) != token]
-        unsteady = (Row.status == "running") | (Row.stable == False)  # noqa: E712 - an expression of SQL
-        rows = Row.select(Row.entry, Row.status, Row.stable).where((Row.root == root) & unsteady)
+        unsteady = (
+            "SELECT entry, status, stable FROM runs WHERE root = ? AND (status = 'running' OR NOT stable)"
+        )
         running = set()
-        for entry, status, stable in tuples_of(self._database, rows):
+        for entry, status, stable in self._database.execute(unsteady, (root,)):
             if status == "running":
                 running.add(entry)
             may_differ = not stable or self._quick  # the recording of a running one grows in place
@@ -174,4 +174,4 @@ def _is_running(root: str, entry: str) -> bool:
     return run is not None and run.status == "running"
 
 
-_EMPTY: Final[dict[str, object]] = dict.fromkeys(Row._meta.sorted_field_names)
+_EMPTY: Final[dict[str, object]] = dict.fromkeys(STORED)

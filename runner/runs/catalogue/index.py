@@ -9,19 +9,27 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, TypeVar
 
-from peewee import DatabaseError, OperationalError, SqliteDatabase, chunked, fn
-
 from runner.errors import RunnerError, nearest
 from runner.runs.branches import BranchNode, Origin, parse_origin
 from runner.runs.catalogue.columns import SETTING, IndexRow, Kind, field_of, with_same_as
-from runner.runs.catalogue.database import Report, create, index_path, open_index, renew, tuples_of, version
+from runner.runs.catalogue.database import (
+    Report,
+    create,
+    index_path,
+    open_index,
+    pragma,
+    renew,
+    transaction,
+    version,
+)
 from runner.runs.catalogue.filters import ANY_RUN, Filter, matches, setting_path
 from runner.runs.catalogue.folders import Folders
-from runner.runs.catalogue.rows import Candidate, Expression, Row, SqlRow, text
+from runner.runs.catalogue.rows import SEED_SHIFT, Candidate, Sql, text
 from runner.runs.run import check_folder_name
 
 Result = TypeVar("Result")
@@ -29,54 +37,52 @@ Result = TypeVar("Result")
 MAX_TREE: Final = 300
 """Runs in a tree of branches."""
 _MAX_VALUES: Final = 1000
-"""Values in one query."""
+"""Contents that are asked for by their digests, and names that are offered."""
+_NEWEST: Final = Sql("created DESC, id, root")
+_AMONG: Final = "IN (SELECT value FROM json_each(?))"
+"""The condition on a column to have one of the values in a JSON list."""
 
 
 class Index:
     """The index of some recordings folders, up to date when it was opened."""
 
-    def __init__(self, database: SqliteDatabase, roots: Sequence[str]) -> None:
+    def __init__(self, database: sqlite3.Connection, roots: Sequence[str]) -> None:
         self._database = database
         self.roots = roots
-        database.register_function(matches, "matches", 2, deterministic=True)
+        database.create_function("matches", 2, matches, deterministic=True)
 
     def problems(self) -> list[str]:
         """Return the problems of folders whose run files cannot be read."""
-        damaged = Row.select(Row.problem).where(Row.root.in_(self.roots) & Row.problem.is_null(False))
-        return [problem for (problem,) in self._tuples(damaged.order_by(Row.root, Row.entry))]
+        where = f"root {self._is_here} AND problem IS NOT NULL ORDER BY root, entry"
+        damaged = self._database.execute(f"SELECT problem FROM runs WHERE {where}", self.roots)
+        return [problem for (problem,) in damaged]
 
-    def select(
-        self, chosen: Filter, *order: Expression, columns: Sequence[str] | None = None
-    ) -> list[IndexRow]:
+    def select(self, chosen: Filter, *order: Sql, columns: Sequence[str] = ("*",)) -> list[IndexRow]:
         """Return the rows that match a filter; arguments as for `rows`."""
         return list(self.rows(chosen, *order, columns=columns))
 
-    def rows(
-        self, chosen: Filter, *order: Expression, columns: Sequence[str] | None = None
-    ) -> Iterator[IndexRow]:
+    def rows(self, chosen: Filter, *order: Sql, columns: Sequence[str] = ("*",)) -> Iterator[IndexRow]:
         """Yield the rows that match a filter, the newest first.
 
         Args:
-            order: expressions to sort by before the age.
+            order: what to sort by before the age.
             columns: the stored columns that are needed; all by default.
         """
         self._check_settings(chosen)
-        query = self._of(chosen, *_stored(columns)).order_by(*order, Row.created.desc(), Row.id, Row.root)
-        return iter(query.dicts().bind(self._database).iterator())
+        return _as_rows(self._query(", ".join(columns), chosen, _ordered(*order, _NEWEST)))
 
     def count(self, chosen: Filter = ANY_RUN) -> int:
         """Return how many rows match a filter."""
         self._check_settings(chosen)
-        ((count,),) = self._tuples(self._of(chosen, fn.COUNT(Row.entry)))
-        return int(count)
+        return int(self._query("COUNT(*)", chosen).fetchone()[0])
 
     def page(
         self,
         chosen: Filter,
-        *order: Expression,
+        *order: Sql,
         limit: int | None,
         offset: int = 0,
-        columns: Sequence[str] | None = None,
+        columns: Sequence[str] = ("*",),
     ) -> tuple[list[IndexRow], int]:
         """Return some of the rows that match a filter, and how many match.
 
@@ -87,25 +93,15 @@ class Index:
             every = self.select(chosen, *order, columns=columns)
             return every[offset:], len(every)
         self._check_settings(chosen)
-        query = self._of(chosen, Row.root, Row.entry)
-        query = query.order_by(*order, Row.created.desc(), Row.id, Row.root)
+        ordered = _ordered(*order, _NEWEST)
         if chosen.condition is None:  # counted in an index of SQLite, without reading the rows
-            places, total = list(self._tuples(query.limit(limit).offset(offset))), self.count(chosen)
+            part = Sql(f"{ordered.text} LIMIT ? OFFSET ?", (*ordered.values, limit, offset))
+            places, total = self._query("root, entry", chosen, part).fetchall(), self.count(chosen)
         else:  # a filter may be slow: it is evaluated once for each row
-            places = list(self._tuples(query))
+            places = self._query("root, entry", chosen, ordered).fetchall()
             places, total = places[offset : offset + limit], len(places)
-        return self._at(places, columns), total
-
-    def _at(self, places: Sequence[SqlRow], columns: Sequence[str] | None) -> list[IndexRow]:
-        """Return the rows of folders, given by root and entry, in their order."""
-        by_place: dict[tuple[str, str], IndexRow] = {}
-        for root in {root for root, _ in places}:
-            for entries in chunked([entry for there, entry in places if there == root], _MAX_VALUES):
-                some: Expression = Row.select(*_stored(columns)).where(
-                    (Row.root == root) & Row.entry.in_(entries)
-                )
-                by_place |= {(root, row["entry"]): row for row in some.dicts().bind(self._database)}
-        return [by_place[place] for place in places]
+        select = f"SELECT {', '.join(columns)} FROM runs WHERE root = ? AND entry = ?"
+        return [row for place in places for row in _as_rows(self._database.execute(select, place))], total
 
     def originals(self, digests: Sequence[str] | None = None) -> dict[str, tuple[str, str, str]]:
         """Return root, entry and id of the first run with each content that was recorded twice or more.
@@ -113,15 +109,19 @@ class Index:
         Args:
             digests: the contents; all by default, or if they are very many.
         """
-        recorded = Row.select(Row.digest).where(Row.digest.is_null(False) & Row.root.in_(self.roots))
+        recorded, values = f"digest IS NOT NULL AND root {self._is_here}", [*self.roots]
         if digests is not None and len(digests) <= _MAX_VALUES:
-            recorded = recorded.where(Row.digest.in_(digests))
-        several = recorded.group_by(Row.digest).having(fn.COUNT(Row.entry) > 1)
-        if not list(self._tuples(several.limit(1))):
+            recorded, values = f"{recorded} AND digest {_AMONG}", [*values, json.dumps(digests)]
+        several = f"SELECT digest FROM runs WHERE {recorded} GROUP BY digest HAVING COUNT(*) > 1"
+        repeated = [digest for (digest,) in self._database.execute(several, values)]
+        if not repeated:
             return {}
-        first = self._of(Filter(Row.digest.in_(several)), Row.digest, Row.root, Row.entry, Row.id)
-        ordered = first.order_by(Row.created.desc(), Row.id.desc(), Row.root.desc(), Row.entry.desc())
-        return {digest: (root, entry, run_id) for digest, root, entry, run_id in self._tuples(ordered)}
+        first = self._query(
+            "digest, root, entry, id",
+            Filter(Sql(f"digest {_AMONG}", (json.dumps(repeated),))),
+            Sql("ORDER BY created DESC, id DESC, root DESC, entry DESC"),
+        )
+        return {digest: (root, entry, run_id) for digest, root, entry, run_id in first}
 
     def with_same_as(self, rows: list[IndexRow]) -> list[IndexRow]:
         """Return rows with `same_as`: the id of another run that recorded the same content first, or None."""
@@ -129,7 +129,7 @@ class Index:
 
     def branches(self, run_id: str) -> dict[str, Origin]:
         """Return the branches of a run by run id, the newest first."""
-        rows = self.rows(Filter(Row.parent == run_id), columns=("id", "origin"))
+        rows = self.rows(Filter(Sql("parent = ?", (run_id,))), columns=("id", "origin"))
         return {row["id"]: origin for row in rows if (origin := parse_origin(json.loads(row["origin"])))}
 
     def branch_tree(self, run_id: str) -> BranchNode:
@@ -139,16 +139,17 @@ class Index:
         """
         columns = ("id", "name", "status", "success_percent", "mean_return", "parent", "origin")
         above, top = {run_id}, run_id
-        while (rows := self.select(Filter(Row.id == top), columns=("parent",))) and rows[0]["parent"]:
+        while (rows := self.select(_of_id(top), columns=("parent",))) and rows[0]["parent"]:
             top = rows[0]["parent"]
             if top in above or len(above) == MAX_TREE:
                 break  # a configuration that names itself
             above.add(top)
-        by_id = {row["id"]: row for row in self.rows(Filter(Row.id == top), columns=columns)}
+        by_id = {row["id"]: row for row in self.rows(_of_id(top), columns=columns)}
         below: dict[str, list[str]] = {}
         level = [top]
         while level and len(by_id) < MAX_TREE:
-            rows = self.select(Filter(Row.parent.in_(level[:_MAX_VALUES])), Row.created, columns=columns)
+            children = Filter(Sql(f"parent {_AMONG}", (json.dumps(level),)))
+            rows = self.select(children, Sql("created"), columns=columns)
             new = {row["id"]: row for row in rows[: MAX_TREE - len(by_id)] if row["id"] not in by_id}
             for row in new.values():
                 below.setdefault(row["parent"], []).append(row["id"])
@@ -171,32 +172,40 @@ class Index:
 
     def named(self, name: str) -> list[Candidate]:
         """Return the runs of a name, or whose ids begin with it, the newest first."""
-        return self._names(_begins(Row.id, name) | (Row.name == text(name)))
+        ids = _begins("id", name)
+        return self._names(Sql(f"({ids.text} OR name = ?)", (*ids.values, text(name))))
 
     def with_id_prefix(self, beginning: str) -> list[Candidate]:
         """Return runs whose ids begin with a text, at most the 1,000 newest."""
-        return self._names(_begins(Row.id, beginning), _MAX_VALUES)
+        return self._names(_begins("id", beginning), _MAX_VALUES)
 
     def names_from(self, beginning: str) -> list[tuple[str, int]]:
         """Return names that begin with a text, at most 1,000, and how many runs have each."""
-        query = self._of(Filter(_begins(Row.name, beginning)), Row.name, fn.COUNT(Row.entry))
-        return [(name, count) for name, count in self._tuples(query.group_by(Row.name).limit(_MAX_VALUES))]
+        part = Sql("GROUP BY name LIMIT ?", (_MAX_VALUES,))
+        return list(self._query("name, COUNT(*)", Filter(_begins("name", beginning)), part))
 
     def newest(self, name: str = "", limit: int = 1) -> list[Candidate]:
         """Return the newest runs, of a name if one is given."""
-        return self._names(Row.name == text(name) if name else None, limit)
+        return self._names(Sql("name = ?", (text(name),)) if name else None, limit)
 
-    def _names(self, condition: Expression, limit: int | None = None) -> list[Candidate]:
-        columns = (Row.root, Row.entry, Row.id, Row.name, Row.seed, Row.created)
-        query = self._of(Filter(condition), *columns).order_by(Row.created.desc(), Row.id.desc())
-        return [Candidate(*row) for row in query.limit(limit).tuples().bind(self._database)]
+    def _names(self, condition: Sql | None, limit: int = -1) -> list[Candidate]:
+        columns = "root, entry, id AS run_id, name, seed, created AS milliseconds"
+        part = Sql("ORDER BY created DESC, id DESC LIMIT ?", (limit,))
+        return [Candidate(**row) for row in _as_rows(self._query(columns, Filter(condition), part))]
 
-    def _of(self, chosen: Filter, *columns: Expression) -> Expression:
-        is_run = Row.root.in_(self.roots) & Row.id.is_null(False)
-        return Row.select(*columns).where(is_run if chosen.condition is None else is_run & chosen.condition)
+    @property
+    def _is_here(self) -> str:
+        """The condition on a root to be one of these folders, whose parameters they are."""
+        return f"IN ({', '.join('?' * len(self.roots))})"
 
-    def _tuples(self, query: Expression) -> Iterator[SqlRow]:
-        return tuples_of(self._database, query)
+    def _query(self, columns: str, chosen: Filter, part: Sql = Sql("")) -> sqlite3.Cursor:  # noqa: B008 - frozen
+        """Select columns of the runs that match a filter; `part` follows the condition."""
+        condition = chosen.condition or Sql("TRUE")
+        return self._database.execute(
+            f"SELECT {columns} FROM runs WHERE root {self._is_here} AND id IS NOT NULL "
+            f"AND {condition.text} {part.text}",
+            (*self.roots, *condition.values, *part.values),
+        )
 
     def _check_settings(self, chosen: Filter) -> None:
         """Refuse a filter with a path that no configuration has.
@@ -205,12 +214,11 @@ class Index:
             RunnerError: it has one; the message suggests a similar path.
         """
         for path in sorted(chosen.settings):
-            kind = fn.json_type(Row.settings, setting_path(path))
-            some = self._of(ANY_RUN, Row.entry).limit(1)
-            if list(self._tuples(some.where(kind.is_null(False)))) or not list(self._tuples(some)):
+            kind = Sql("json_type(settings, ?) IS NOT NULL", (setting_path(path),))
+            if self._query("1", Filter(kind), Sql("LIMIT 1")).fetchone() or not self.count():
                 continue
-            newest = self._of(ANY_RUN, Row.settings).order_by(Row.created.desc()).limit(200)
-            paths = {path for (settings,) in self._tuples(newest) for path in json.loads(settings)}
+            newest = self._query("settings", ANY_RUN, Sql("ORDER BY created DESC LIMIT 200"))
+            paths = {path for (settings,) in newest for path in json.loads(settings)}
             raise RunnerError(f"filter: no run's configuration has {path!r}.{nearest(path, paths)}")
 
 
@@ -239,13 +247,13 @@ def look(
         try:
             with contextlib.closing(open_index(report)) as database:
                 if cached and before is not None and before.file == (version() or before).file:
-                    with database.atomic("DEFERRED"):
+                    with transaction(database, "DEFERRED"):
                         return work(Index(database, places))
                 return _look(database, places, work, quick, rebuild)
-        except (OperationalError, OSError) as error:
+        except (sqlite3.OperationalError, OSError) as error:
             report(f"The index {index_path()} cannot be used ({error}); the folders are read without it.")
             break
-        except DatabaseError as error:
+        except sqlite3.DatabaseError as error:
             report(f"The index {index_path()} is damaged ({error}); it is rebuilt.")
             renew()
             cached = False
@@ -253,7 +261,7 @@ def look(
         return _look(database, places, work, quick, rebuild)
 
 
-def order_of(text: str) -> list[Expression]:
+def order_of(text: str) -> list[Sql]:
     """Return the order by a list of fields, `-FIELD` for descending, to sort rows by.
 
     Missing values come last. A value of the configuration is a field too: `config.discount`.
@@ -262,17 +270,17 @@ def order_of(text: str) -> list[Expression]:
     for name in filter(None, (part.strip() for part in text.split(","))):
         descending, wanted = name.startswith("-"), name.removeprefix("-")
         if wanted.startswith(SETTING):
-            column = fn.json_extract(Row.settings, setting_path(wanted.removeprefix(SETTING)))
+            column = Sql("json_extract(settings, ?)", (setting_path(wanted.removeprefix(SETTING)),))
         else:
             field = field_of(wanted)
-            column = getattr(Row, field.stored[0])
+            column = Sql(field.stored[0])
             descending ^= field.kind is Kind.AGE
-        order.append(column.desc(nulls="LAST") if descending else column.asc(nulls="LAST"))
+        order.append(Sql(f"{column.text} {'DESC' if descending else 'ASC'} NULLS LAST", column.values))
     return order
 
 
 def _look(
-    database: SqliteDatabase,
+    database: sqlite3.Connection,
     roots: Sequence[str],
     work: Callable[[Index], Result],
     quick: bool,
@@ -281,28 +289,37 @@ def _look(
     folders, index = Folders(database, roots, quick), Index(database, roots)
     if rebuild:
         folders.expire()
-    before = _data_version(database)
+    before = pragma(database, "data_version")
     differences = folders.differences()
     if not differences:
-        with database.atomic("DEFERRED"):
-            if _data_version(database) == before or not folders.differences():
+        with transaction(database, "DEFERRED"):
+            if pragma(database, "data_version") == before or not folders.differences():
                 return work(index)
     folders.apply(differences)
-    with database.atomic("IMMEDIATE"):
+    with transaction(database, "IMMEDIATE"):
         folders.apply(folders.differences())  # mostly none: what other processes did in the meantime
         return work(index)
 
 
-def _stored(columns: Sequence[str] | None) -> list[Expression]:
-    return [getattr(Row, name) for name in columns or ()]
+def _as_rows(cursor: sqlite3.Cursor) -> Iterator[IndexRow]:
+    names = [column[0] for column in cursor.description]
+    for values in cursor:
+        row = dict(zip(names, values, strict=True))
+        if row.get("seed") is not None:
+            row["seed"] += SEED_SHIFT
+        yield row
 
 
-def _begins(column: Expression, beginning: str) -> Expression:
+def _ordered(*order: Sql) -> Sql:
+    text = ", ".join(part.text for part in order)
+    return Sql(f"ORDER BY {text}", tuple(value for part in order for value in part.values))
+
+
+def _of_id(run_id: str) -> Filter:
+    return Filter(Sql("id = ?", (run_id,)))
+
+
+def _begins(column: str, beginning: str) -> Sql:
     """Return the condition that a text begins so, for which SQLite uses an index."""
     first = text(beginning) or ""
-    return (column >= first) & (column < first + chr(0x10FFFF))
-
-
-def _data_version(database: SqliteDatabase) -> int:
-    """Return a number that changes when another connection writes to the index; begins to read it."""
-    return int(database.pragma("data_version"))
+    return Sql(f"({column} >= ? AND {column} < ?)", (first, first + chr(0x10FFFF)))

@@ -23,7 +23,7 @@ from runner.recording.labels import KEEP, LABELS_FILE, are_readable
 from runner.runs.catalogue.columns import IndexRow, moment
 from runner.runs.catalogue.filters import ANY_RUN, Filter
 from runner.runs.catalogue.index import Index
-from runner.runs.catalogue.rows import Row, row_of
+from runner.runs.catalogue.rows import Sql, row_of
 from runner.runs.catalogue.usage import REMOVED, Contents, belongs, contents_of, strays
 from runner.runs.listing import listed_run
 from runner.runs.locking import locked
@@ -188,7 +188,8 @@ def unwanted(index: Index, criteria: Criteria, now: float) -> tuple[list[IndexRo
     """Return the rows that meet the criteria, and how many more do but are protected, by reason."""
     chosen = criteria.filter
     if criteria.older_than is not None:
-        chosen = chosen.also(Row.created < int((now - criteria.older_than) * 1000))
+        latest = int((now - criteria.older_than) * 1000)
+        chosen = chosen.also(Sql("created < ?", (latest,)))
     rows = index.select(chosen, columns=_COLUMNS)
     spared = set()
     if criteria.keep_last is not None:

@@ -12,18 +12,16 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from peewee import BigIntegerField, BooleanField, CompositeKey, Field, FloatField, Model, TextField
-
 from runner.errors import RecordingError
 from runner.recording.metrics import METRICS
 from runner.recording.run_file import EvaluationMetrics
 from runner.runs.branches import origin_in
-from runner.runs.catalogue.columns import COLUMNS, Kind
+from runner.runs.catalogue.columns import COLUMNS
 from runner.runs.listing import listed_run
 from runner.runs.run import Run
 
 SEEDS: Final = 2**64
-_LARGEST: Final = 2**63 - 1
+
 _MODES: Final = {"joint team": "cooperative", "per_agent individual": "competitive"}
 _DEPTH: Final = 20
 _LOGGED: Final = 64
@@ -32,78 +30,35 @@ _NAME: Final = 200
 _TEXT: Final = 4000
 """The most characters of a text, and the most values of a configuration."""
 
-SqlRow = tuple[Any, ...]
-"""The values of a row that SQLite returns."""
-Expression = Any
-"""A column, a condition or a query of peewee, which has no types."""
+SEED_SHIFT: Final = 2**63
+"""Subtracted from a seed, from 0 to 2^64 - 1, so that SQLite's signed integers hold it in order."""
+_TYPES: Final = {str: "TEXT", int: "INTEGER", float: "REAL"}
+STORED: Final = {
+    "root": "TEXT NOT NULL",  # the recordings folder, absolute
+    "entry": "TEXT NOT NULL",  # the run's folder in it
+    "fingerprint": "TEXT NOT NULL",  # changes with every change of its files
+    "mark": "TEXT NOT NULL",  # changes when a file in it is created, replaced or removed
+    # whether they had not just changed; if they had, they may change again with the same time
+    "stable": "INTEGER NOT NULL",
+    "problem": "TEXT",
+    "tags": "TEXT",  # a tag a line
+    **{column.name: _TYPES[column.type] for column in COLUMNS.values() if column.type},
+    "origin": "TEXT",  # what it was branched from: a JSON object
+    # The long texts come last, so that SQLite reads the other columns without them.
+    "words": "TEXT",  # id, name, configuration's name, tags, note: a line each
+    "settings": "TEXT",  # the configuration: a JSON object of dotted paths
+}
+"""The columns of the table `runs` with their types: a run's folder as it was last read.
+
+A damaged run has a `problem`, other folders have no `id`.
+"""
 
 
-class SeedField(Field):
-    """A seed, from 0 to 2^64 - 1, shifted to SQLite's signed integers so that their order stays."""
+class Sql(NamedTuple):
+    """A condition or an order in SQL, with the values of its parameters."""
 
-    field_type = "BIGINT"
-
-    def db_value(self, value: int | None) -> int | None:
-        """Return the stored value of a seed."""
-        return None if value is None else value - 2**63
-
-    def python_value(self, value: int | None) -> int | None:
-        """Return the seed of a stored value."""
-        return None if value is None else value + 2**63
-
-
-class Row(Model):
-    """A run's folder as it was last read; a damaged run has a `problem`, other folders have no `id`."""
-
-    root = TextField()
-    """The recordings folder, absolute."""
-    entry = TextField()
-    """The run's folder in it."""
-    fingerprint = TextField()
-    """Changes with every change of its files."""
-    mark = TextField()
-    """Changes when a file in it is created, replaced or removed."""
-    stable = BooleanField()
-    """Whether they had not just changed; if they had, they may change again with the same time."""
-    problem = TextField(null=True)
-
-    tags = TextField(null=True)
-    """A tag a line."""
-    # From COLUMNS, as are all others; these are used by name.
-    id: TextField
-    name: TextField
-    seed: SeedField
-    status: TextField
-    created: BigIntegerField
-    digest: TextField
-    parent: TextField
-    words: TextField
-    settings: TextField
-
-    class Meta:
-        """The options of the table."""
-
-        table_name = "runs"
-        primary_key = CompositeKey("root", "entry")
-        without_rowid = True
-        indexes = (
-            (("root", "entry", "fingerprint", "mark", "stable", "status"), False),
-            (("id",), False),
-            (("digest",), False),
-            (("parent",), False),
-            (("root", "created", "id", "name", "seed"), False),
-        )
-
-
-_FIELDS: Final = {str: TextField, int: BigIntegerField, float: FloatField}
-for _column in COLUMNS.values():
-    if _column.type:
-        _field = SeedField if _column.kind is Kind.WHOLE else _FIELDS[_column.type]
-        Row._meta.add_field(_column.name, _field(null=True))
-Row._meta.add_field("origin", TextField(null=True))  # what it was branched from: a JSON object
-# The long texts come last, so that SQLite reads the other columns without them.
-Row._meta.add_field("words", TextField(null=True))  # id, name, configuration's name, tags, note: a line each
-Row._meta.add_field("settings", TextField(null=True))  # the configuration: a JSON object of dotted paths
+    text: str
+    values: tuple[object, ...] = ()
 
 
 def row_of(run: Run, size: int | None) -> dict[str, object]:
