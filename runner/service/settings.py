@@ -38,7 +38,7 @@ class Limits:
     upload_bytes: int = 1 << 40
     """Size of an upload."""
     uploads: int = 1000
-    """Uploads that are being received or verified, and results that are remembered."""
+    """Uploads that are being received or verified."""
     uploads_each: int = 100
     """Uploads of one client that are being received or verified."""
     spare_bytes: int = 256 << 20

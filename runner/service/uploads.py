@@ -5,7 +5,7 @@
 
 An upload is received, in pieces and in order. When it has all of its bytes it is verified, by a child
 process; then it is stored, which is one renaming, or refused. A server that was killed continues from these
-folders.
+folders. One that is stored remains until its sender knows; after that its run answers. Idle ones are dropped.
 """
 
 from __future__ import annotations
@@ -47,9 +47,7 @@ FOLDER: Final = ".uploads"
 STATE_FILE: Final = "upload.json"
 BODY_FILE: Final = "body"
 IDLE_SECONDS: Final = 7 * 86_400
-"""An upload that receives nothing for so long is forgotten."""
-OVER_SECONDS: Final = 86_400
-"""How long the result of an upload is remembered."""
+"""An upload whose sender says nothing for so long is dropped."""
 VERIFY_SECONDS: Final = 120.0
 VERIFY_BYTES_A_SECOND: Final = 2 << 20
 """The time limit of a verification grows with the size of the upload."""
@@ -112,7 +110,7 @@ class Uploads:
                 self._uploads[upload.owner, upload.id] = replace(upload, offset=offset)
             except (OSError, ValueError):
                 shutil.rmtree(folder, ignore_errors=True)
-        self._forget()
+        self._drop_idle()
         for upload in self.all():
             if upload.source.digest is not None:
                 self._proceed(upload)
@@ -130,13 +128,13 @@ class Uploads:
         """Return an upload of this owner."""
         if upload := self._uploads.get((owner, upload_id)):
             return upload
-        raise RunNotFound("no such upload: it was deleted, is long over, or belongs to another token.")
+        raise RunNotFound("no such upload: it was deleted, is stored, or belongs to another token.")
 
     def put(self, owner: str, upload_id: str, source: UploadSource) -> Upload:
         """Begin an upload, or continue it with what its sender knows by now; return it.
 
-        It begins again if its run was removed, or the file has become shorter. When its run or content is
-        here already, it is stored at once.
+        It begins again if the file has become shorter. When its run or content is here already, it is stored
+        at once, and nothing of it is kept.
 
         Raises:
             UploadConflict, RunNotFound: another digest was announced, or a run has no such checkpoint.
@@ -144,7 +142,8 @@ class Uploads:
             Busy: it could not be verified, for a reason of the server's own.
         """
         with self._lock:
-            fresh = Upload(id=upload_id, owner=owner, source=source, created=now())
+            announced = source.model_dump(include={"run_id", "name", "size"})
+            fresh = Upload(id=upload_id, owner=owner, source=source, created=now(), **announced)
             upload = self._uploads.get((owner, upload_id), fresh)
             if upload.source.digest not in (None, source.digest):
                 raise UploadConflict("found another digest than the one announced; begin another upload.")
@@ -154,23 +153,21 @@ class Uploads:
                 self._uploads[owner, upload_id] = replace(upload, problem="")  # it is verified next time
                 raise Busy(upload.problem)
             run = self._run_with(source, upload.run_id if upload.is_over else "")
-            if upload.is_over and run is not None:
-                return upload
-            if upload.is_over or (source.size is not None and source.size < upload.offset):
+            is_shorter = source.size is not None and source.size < upload.offset
+            if upload is not fresh and (run is not None or upload.is_over or is_shorter):
                 self.delete(owner, upload_id)
+            if run is not None:
+                size = source.size or 0
+                there = replace(fresh, state="stored", offset=size, run_id=run.run_id, already=True)
+                return upload if upload.is_over else there
+            if (owner, upload_id) not in self._uploads:
                 upload = fresh
-            if upload is fresh:
-                self._forget()
+                self._drop_idle()
                 self._require_place(owner)
             if upload.run_id != source.run_id:
                 self._previews.remove(upload.id, upload.run_id)
-            announced = source.model_dump(include={"run_id", "name", "size"})
             upload = replace(upload, source=source, **announced)
-            size = upload.size or 0
-            if run is None:
-                self._require_room(upload, size - upload.offset)
-            else:
-                upload = replace(upload, state="stored", offset=size, run_id=run.run_id, already=True)
+            self._require_room(upload, (upload.size or 0) - upload.offset)
             self._store(upload)
         return self._proceed(upload)
 
@@ -257,15 +254,13 @@ class Uploads:
         finally:  # clients see it when it is on disk
             self._uploads[upload.owner, upload.id] = upload
 
-    def _forget(self) -> None:
-        """Forget uploads that receive nothing any more, are long over, or are over and too many."""
-        over = [upload for upload in self.all() if upload.is_over]
+    def _drop_idle(self) -> None:
+        """Drop the uploads whose senders have said nothing for `IDLE_SECONDS`."""
         for upload in self.all():
             body, changed = self._body(upload), 0.0
             with contextlib.suppress(OSError):
                 changed = (body.with_name(STATE_FILE) if upload.is_over else body).stat().st_mtime
-            is_old = time.time() - changed > (OVER_SECONDS if upload.is_over else IDLE_SECONDS)
-            if upload.state != "verifying" and (is_old or upload in over[self._limits.uploads :]):
+            if upload.state != "verifying" and time.time() - changed > IDLE_SECONDS:
                 self.delete(upload.owner, upload.id)
 
     def _proceed(self, upload: Upload) -> Upload:

@@ -80,8 +80,11 @@ def test_a_run_is_sent_in_pieces_and_listed_when_it_is_verified(connect, elsewhe
     assert (stored["state"], stored["problem"]) == ("stored", "")
     (run,) = client.get("/api/v1/runs").json()["runs"]
     assert (run["run_id"], run["tags"]) == (stored["run_id"], ["sent"])
-    assert put(client, upload, data).json() == stored
-    assert client.delete(f"{UPLOADS}/{upload}").status_code == 204
+    assert client.get(UPLOADS).json()["uploads"] == []
+    (there,) = list_runs(elsewhere.recordings[0])
+    known = {"run_id": there.run_id, "content_digest": there.summary.content_digest}
+    again = put(client, upload, data, **known).json()
+    assert (again["state"], again["run_id"], again["already"]) == ("stored", there.run_id, True)
     assert client.delete(f"{UPLOADS}/{upload}").status_code == 404
     assert client.get(UPLOADS).json()["uploads"] == []
     assert client.get("/api/v1/runs").json()["total"] == 1

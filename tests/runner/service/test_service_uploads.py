@@ -66,8 +66,16 @@ def test_the_same_bytes_are_the_same_upload_and_the_same_run(uploads, lake, tmp_
     assert begin(uploads, BEN, data).offset == 0, "another's upload is not handed out"
     done = over(uploads, uploads.append(ANNA, first.id, 7, data[7:]))
     assert (done.state, done.already) == ("stored", False)
-    known = begin(uploads, ANNA, data)
-    assert known == done
+    digests = {"run_id": lake.run_id, "content_digest": lake.summary["content_digest"]}
+    assert begin(uploads, ANNA, data, **digests) == done
+    assert [upload.owner for upload in uploads.all()] == [BEN], "its sender knows"
+    known = begin(uploads, ANNA, data, **digests)
+    assert (known.state, known.run_id, known.already, known.offset) == (
+        "stored",
+        lake.run_id,
+        True,
+        len(data),
+    )
     others = send(uploads, data, BEN)
     assert (others.state, others.already) == ("stored", True)
     known = grow(uploads, "carl", run_id=lake.run_id, content_digest=lake.summary["content_digest"])
