@@ -1,9 +1,9 @@
-"""Which parameters mattered: shares of variance of parameters and of their pairs (functional ANOVA).
+"""Which parameters mattered: shares of the objective's variance (functional ANOVA).
 
 F. Hutter, H. Hoos and K. Leyton-Brown, "An efficient approach for assessing hyperparameter importance",
-ICML 2014: random forests predict the objective at every point of a grid, and the variance over the grid is
-divided into that of each parameter alone (main effects) and of each pair beyond that (interactions). Shares
-are not normalized: the rest is due to three and more parameters.
+ICML 2014. A completed grid is decomposed exactly, into the share of each parameter alone and of each pair
+beyond that; otherwise Optuna's random forests estimate the share of each parameter alone. Shares are not
+normalized: the rest is due to several parameters together.
 """
 
 from __future__ import annotations
@@ -13,26 +13,29 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, SupportsFloat, cast
+from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.sweep.model import Range
+from runner.sweep.model import Parameter, Range
+from runner.sweep.search import require_optuna
 from runner.util.extras import require
 
+if TYPE_CHECKING:
+    from optuna.distributions import BaseDistribution
+
 FORESTS: Final = 30
-TREES: Final = 32
+TREES: Final = 5
+MAX_DEPTH: Final = 5
+"""Of the trees: without it 500 trials take a minute, and no share changes by more than 0.02."""
 RESAMPLES: Final = 200
-MAX_POINTS: Final = 20_000
-"""Points of the grid that forests predict; the grid is coarser for many parameters."""
-MAX_LEVELS: Final = 12
 MIN_TRIALS: Final = 4
 
 
 @dataclass(frozen=True)
 class Effect:
-    """The effect of one parameter, or of two together beyond what each does alone, on the objective."""
+    """The effect on the objective of one parameter, or, in a grid, of two beyond what each does alone."""
 
     parameters: tuple[str, ...]
     share: float
@@ -43,32 +46,40 @@ class Effect:
 
 
 def effects_of(
-    parameters: Mapping[str, Range | list[object]],
-    trials: Sequence[Mapping[str, object]],
-    values: Sequence[float],
+    parameters: Mapping[str, Parameter], trials: Sequence[Mapping[str, object]], values: Sequence[float]
 ) -> list[Effect]:
-    """Return main effects and interactions, the largest first; empty for too few trials.
+    """Return the main effects, found by forests of resampled trials, the largest first.
 
+    Empty for too few trials, or if no value differs.
     The parameters are the values tried, by path; the values are the objective of each trial, finite.
     """
-    ensemble = require("sklearn.ensemble", extra="sweep", purpose="the importance of a sweep's parameters")
-    names = list(parameters)
-    if len(trials) < MIN_TRIALS or len(set(values)) < 2 or 2 ** len(names) > MAX_POINTS:
+    purpose = "the importance of a sweep's parameters"
+    optuna = require_optuna()
+    require("sklearn.ensemble", extra="sweep", purpose=purpose)
+    if len(trials) < MIN_TRIALS:
         return []
-    levels = {name: _levels(parameter, len(names)) for name, parameter in parameters.items()}
-    grid = list(itertools.product(*levels.values()))
-    coded = _coded(parameters, [dict(zip(names, point, strict=True)) for point in grid])
-    tried, objective = _coded(parameters, trials), np.asarray(values, np.float64)
-    shape = tuple(len(own) for own in levels.values())
+    names = list(parameters)
+    space = {name: _distribution(parameter) for name, parameter in parameters.items()}
+    tried = [
+        optuna.trial.create_trial(
+            params={name: _coded(parameters[name], trial[name]) for name in names},
+            distributions=space,
+            value=value,
+        )
+        for trial, value in zip(trials, values, strict=True)
+    ]
     rng = np.random.default_rng(0)
     all_shares: list[dict[tuple[int, ...], float]] = []
     for forest in range(FORESTS):
-        drawn = rng.integers(0, len(trials), len(trials))
-        trees = ensemble.RandomForestRegressor(TREES, random_state=forest)
-        predicted = trees.fit(tried[drawn], objective[drawn]).predict(coded)
-        shares = shares_of_variance(predicted.reshape(shape))
-        if shares:
-            all_shares.append(shares)
+        resampled = rng.integers(0, len(trials), len(trials)).tolist()
+        if len({values[trial] for trial in resampled}) > 1:
+            study = optuna.create_study()
+            study.add_trials([tried[trial] for trial in resampled])
+            evaluator = optuna.importance.FanovaImportanceEvaluator(
+                n_trees=TREES, max_depth=MAX_DEPTH, seed=forest
+            )
+            shares = evaluator.evaluate(study, names)
+            all_shares.append({(axis,): shares[name] for axis, name in enumerate(names)})
     return _effects(names, all_shares)
 
 
@@ -127,30 +138,18 @@ def _effects(names: Sequence[str], all_shares: Sequence[Mapping[tuple[int, ...],
     return sorted(effects, key=lambda effect: -effect.share)
 
 
-def _levels(parameter: Range | list[object], parameters: int) -> list[object]:
-    """Return the values of a parameter in the grid, evenly spaced; all of them if they are few."""
-    limit = max(2, min(MAX_LEVELS, int(MAX_POINTS ** (1 / parameters) + 1e-9)))
-    if not isinstance(parameter, Range):
-        chosen = np.unique(np.linspace(0, len(parameter) - 1, min(limit, len(parameter))).round().astype(int))
-        return [parameter[i] for i in chosen]
-    low, high = float(parameter.low), float(parameter.last)
-    if parameter.log:
-        return list(np.geomspace(low, high, limit).tolist())
-    count = min(limit, parameter.steps + 1) if parameter.step is not None or parameter.is_integer else limit
-    return list(np.linspace(low, high, count).tolist())
+def _distribution(parameter: Parameter) -> BaseDistribution:
+    """Return where the coded values of a parameter lie, in the logarithm for one that is drawn from it."""
+    from optuna.distributions import CategoricalDistribution, FloatDistribution
+
+    if isinstance(parameter, Range):
+        return FloatDistribution(_coded(parameter, parameter.low), _coded(parameter, parameter.last))
+    return CategoricalDistribution(list(dict.fromkeys(_coded(parameter, choice) for choice in parameter)))
 
 
-def _coded(
-    parameters: Mapping[str, Range | list[object]], points: Sequence[Mapping[str, object]]
-) -> NDArray[np.float64]:
-    """Return points as columns of numbers: one for a range, or one for each choice."""
-    columns = []
-    for name, parameter in parameters.items():
-        if isinstance(parameter, Range):
-            numbers = [float(cast("SupportsFloat", point[name])) for point in points]
-            columns.append([math.log(number) for number in numbers] if parameter.log else numbers)
-        else:
-            texts = [json.dumps(point[name], sort_keys=True) for point in points]
-            choices = dict.fromkeys(json.dumps(each, sort_keys=True) for each in parameter)
-            columns += [[float(text == choice) for text in texts] for choice in choices]
-    return np.array(columns, np.float64).T
+def _coded(parameter: Parameter, value: object) -> float | str:
+    """Return a value for Optuna's fANOVA, which takes no logarithms itself: a number, or a choice as JSON."""
+    if isinstance(parameter, Range):
+        number = float(cast("float", value))
+        return math.log(number) if parameter.log else number
+    return json.dumps(value, sort_keys=True)

@@ -76,7 +76,7 @@ class Results:
 
     @cached_property
     def effects(self) -> list[Effect]:
-        """Shares of the variance that parameters and pairs of them explain, the largest first.
+        """Shares of the variance that parameters explain, and pairs in a completed grid, the largest first.
 
         Computed when first read: it takes longer than everything else here.
         """
@@ -196,7 +196,7 @@ def ranking_sections(results: Results, shown: int | None = DEFAULT_SHOWN) -> lis
 
 
 def effects_sections(results: Results) -> list[Section]:
-    """Return main effects and interactions as a table; nothing if there are too few trials.
+    """Return the effects of parameters as a table; nothing if there are too few trials.
 
     Small interactions are left out.
     """
@@ -223,9 +223,10 @@ def effects_sections(results: Results) -> list[Section]:
             "trials"
         )
     note = f"Shares of the objective's variance (functional ANOVA) {source}. Shares are not normalized"
-    if len(results.sweep.file.parameters) > 2:
+    largest, several = (2, "three and more") if results.is_whole_grid else (1, "several")
+    if len(results.sweep.file.parameters) > largest:
         rest = max(0.0, 1.0 - sum(effect.share for effect in effects))
-        note += f": about {100 * rest:.0f} % are left to three and more parameters"
+        note += f": about {100 * rest:.0f} % are left to {several} parameters together"
     notes = [f"{note}."]
     if hidden := len(effects) - len(shown):
         notes.append(f"{hidden} pairs of less than {100 * MIN_SHARE:.0f} % are left out.")

@@ -150,7 +150,7 @@ def show(
 
     The value of a trial is the median over its seeds, shown with the interquartile mean (IQM) and its 95 %
     bootstrap interval, for four seeds and more. What mattered is the share of the objective's variance that
-    each parameter, and each pair, explains (functional ANOVA). --all lists every trial, not only the best.
+    each parameter explains (functional ANOVA), and each pair in a completed grid. --all lists every trial.
 
     Examples:
       dualtaxi sweep show hyperparameters

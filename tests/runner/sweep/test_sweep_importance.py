@@ -31,7 +31,7 @@ def test_values_that_do_not_vary_have_no_shares():
     assert shares_of_variance(np.full((2, 3), 7.0)) == {}
 
 
-def test_main_effects_and_interactions_are_found_from_trials():
+def test_main_effects_are_found_from_trials():
     parameters = {"x": Range(low=0.0, high=1.0), "on": [True, False], "idle": ["a", "b", "c"]}
     rng = np.random.default_rng(0)
     trials = [
@@ -40,12 +40,25 @@ def test_main_effects_and_interactions_are_found_from_trials():
     ]
     values = [trial["x"] * (1.0 if trial["on"] else -1.0) for trial in trials]
     effects = {effect.parameters: effect for effect in effects_of(parameters, trials, values)}
-    # over the square: variance 1/3, of which E[x]^2 = 1/4 is due to `on`, the rest, 1/12, to both together
+    assert set(effects) == {("x",), ("on",), ("idle",)}
+    # over the square: variance 1/3, of which E[x]^2 = 1/4 is due to `on`, the rest to both together
     assert effects["on",].share == pytest.approx(0.75, abs=0.06)
-    assert effects["x", "on"].share == pytest.approx(0.25, abs=0.06)
     assert max(effects["x",].share, effects["idle",].share) < 0.03
     for effect in effects.values():
         assert 0 <= effect.low <= effect.share <= effect.high <= 1
+    assert effects_of(parameters, trials, values) == list(effects.values())
+
+
+def test_a_range_drawn_in_the_logarithm_is_weighed_in_it():
+    parameters = {"rate": Range(low=1e-6, high=1.0, log=True), "idle": Range(low=1, high=9)}
+    rng = np.random.default_rng(1)
+    trials = [{"rate": 10.0 ** -rng.uniform(0, 6), "idle": int(rng.integers(1, 10))} for _ in range(80)]
+    values = [
+        float(trial["rate"] > 1e-3) for trial in trials
+    ]  # half of the magnitudes, nearly all of the line
+    effect, *_ = effects_of(parameters, trials, values)
+    assert effect.parameters == ("rate",)
+    assert effect.share > 0.95
 
 
 def test_too_few_or_equal_trials_have_no_effects():
