@@ -26,16 +26,15 @@ def forgiving(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class WithoutEffect:
-    """Whatever else a script expects of its tracker: it does nothing, and warns once when it is called.
+    """Stands for what a script expects of its tracker and a recording has no place for; it is false.
 
     Its attributes, items and what it returns are itself, so that any use of it goes on.
     """
 
-    def __init__(self, name: str, warn_once: Callable[[str], None]) -> None:
-        self._name, self._warn_once = name, warn_once
+    def __init__(self, name: str) -> None:
+        self._name = name
 
     def __call__(self, *_: object, **__: object) -> WithoutEffect:  # noqa: D102
-        self._warn_once(f"{self._name} does nothing: a recording needs no such call, or has no place for it.")
         return self
 
     def __getattr__(self, name: str) -> WithoutEffect:
@@ -56,6 +55,9 @@ class WithoutEffect:
     def __iter__(self) -> Iterator[object]:
         return iter(())
 
+    def __bool__(self) -> bool:
+        return False
+
     def __instancecheck__(self, instance: object) -> bool:
         return False
 
@@ -71,7 +73,7 @@ def warn_once(message: str) -> None:
 
 
 def without_effect(owner: str, name: str) -> WithoutEffect:
-    """Return what stands for an attribute of another tracker's object that this one's does not have.
+    """Return what stands for an attribute that another tracker's object has, with one warning of each name.
 
     Raises:
         AttributeError: Python looks for something of its own, such as `__deepcopy__`, or for what an object
@@ -79,4 +81,5 @@ def without_effect(owner: str, name: str) -> WithoutEffect:
     """
     if name.startswith("_") or name == "script":
         raise AttributeError(f"{owner} has no attribute {name!r}")
-    return WithoutEffect(f"{owner}.{name}", warn_once)
+    warn_once(f"{owner}.{name} does nothing: a recording needs no such call, or has no place for it.")
+    return WithoutEffect(f"{owner}.{name}")

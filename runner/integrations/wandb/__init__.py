@@ -29,8 +29,7 @@ from runner.integrations.script import ScriptRun
 from runner.integrations.shapes import WithoutEffect, forgiving, warn_once, without_effect
 from runner.integrations.tensorboard import as_number, forward
 from runner.integrations.wandb.settings import Config, Summary
-from runner.integrations.wandb.table import Table
-from runner.loops.media import Histogram, Image, Video
+from runner.loops.media import Histogram, Image
 from runner.loops.options import settings_in
 from runner.loops.recorded import ending_of
 from runner.runs.listing import list_runs
@@ -38,10 +37,18 @@ from runner.util.jsonable import as_json
 from runner.util.values import RUN_NAME_PATTERN, flatten
 
 _IGNORED: Final = frozenset(
-    {
-        *("allow_val_change", "anonymous", "config_exclude_keys", "config_include_keys", "dir", "entity"),
-        *("force", "magic", "save_code", "settings"),
-    }
+    [
+        "allow_val_change",
+        "anonymous",
+        "config_exclude_keys",
+        "config_include_keys",
+        "dir",
+        "entity",
+        "force",
+        "magic",
+        "save_code",
+        "settings",
+    ]
 )
 """Arguments of `init` that change nothing in a recording."""
 
@@ -52,22 +59,10 @@ _IGNORED: Final = frozenset(
 class Tracked:
     """A run, as `wandb.init` returns it; a context manager."""
 
-    url = sweep_id = entity = None
-    resumed = offline = False
+    resumed = False
 
-    def __init__(
-        self,
-        script: ScriptRun,
-        project: str,
-        group: str,
-        job_type: str,
-        tags: Sequence[str],
-        is_disabled: bool,
-        own_id: str | None,
-    ) -> None:
-        self.script, self._id = script, own_id
-        self.project, self.group, self.job_type, self.tags = project, group, job_type, tuple(tags)
-        self.disabled = is_disabled
+    def __init__(self, script: ScriptRun, own_id: str | None, is_disabled: bool) -> None:
+        self.script, self._id, self._is_disabled = script, own_id, is_disabled
         self.config, self.summary = Config(script, self.configure), Summary()
         script.log_last = self._log_summary
         self.expects_writer = False
@@ -102,7 +97,7 @@ class Tracked:
     def log(
         self, data: Mapping[str, object], step: object = None, commit: bool | None = None, **_: object
     ) -> None:
-        """Log numbers, texts, pictures, films, histograms and arrays by name; nested names are joined by `/`.
+        """Log numbers, texts, pictures, histograms and arrays by name; nested names are joined by `/`.
 
         Args:
             data: the values by name.
@@ -111,7 +106,7 @@ class Tracked:
         """
         if not isinstance(data, Mapping):
             raise ConfigError(f"log: found {type(data).__name__}, expected a mapping of names to values")
-        if self.disabled:
+        if self._is_disabled:
             return
         at = self.script.step_of(step)
         self.step = self.step if at is None else max(self.step, at)
@@ -123,22 +118,17 @@ class Tracked:
 
     @forgiving
     def _log(self, name: str, value: Any, step: int | None) -> None:
-        if isinstance(value, list | tuple) and any(isinstance(each, Image | Video) for each in value):
+        if isinstance(value, list | tuple) and any(isinstance(each, Image) for each in value):
             value = dict(enumerate(value))
         if isinstance(value, Mapping):
             for key, inner in value.items():
                 self._log(f"{name}/{key}", inner, step)
-        elif isinstance(value, Image | Video):
+        elif isinstance(value, Image):
             self.script.picture(name, value.content, step)
             if value.caption:
                 self.script.log(f"{name}/caption", str(value.caption), step)
         elif isinstance(value, Histogram):
             self.script.snapshot(name, value.content, step)
-        elif isinstance(value, Table):
-            self.script.log(name, value.text(), step)
-        elif isinstance(value, str):
-            self.script.log(name, value, step)
-            self.summary.seen(name, value)
         elif value is None or isinstance(value, WithoutEffect):
             self.script.warn_once(
                 f"log: {value} is not recorded, first found for {name!r}.", about=str(value)
@@ -146,21 +136,20 @@ class Tracked:
         elif np.ndim(value) and np.size(value) != 1:
             self.script.snapshot(name, value, step)
         else:
-            self._log_number(name, value, step)
+            try:
+                value = value if isinstance(value, str) else as_number(name, value)
+            except ConfigError:
+                self.script.warn_once(
+                    f"log: found {type(value).__name__} for {name!r}, which is recorded as text. This "
+                    "warning is given once."
+                )
+                self.script.log(name, str(as_json(value)), step)
+                return
+            self.script.log(name, value, step)
+            self.summary.seen(name, value)
 
-    def _log_number(self, name: str, value: object, step: int | None) -> None:
-        try:
-            number = as_number(name, value)
-        except ConfigError:
-            text = str(as_json(value))
-            self.script.warn_once(
-                f"log: found {type(value).__name__} for {name!r}, which is recorded as text. This warning is "
-                "given once."
-            )
-            self.script.log(name, text, step)
-            return
-        self.script.log(name, number, step)
-        self.summary.seen(name, number)
+    def define_metric(self, *_: object, **__: object) -> None:
+        """Do nothing: every name that does not decrease is an axis of the plots."""
 
     @forgiving
     def configure(self, config: object, is_default: bool = False) -> None:
@@ -180,7 +169,7 @@ class Tracked:
         ]
         if as_text:
             self.script.warn_once(f"config: {', '.join(as_text)} are recorded as text.")
-        if not self.script.is_waiting and settings and not self.disabled:
+        if not self.script.is_waiting and settings and not self._is_disabled:
             self.script.warn_once(
                 "config: found settings after the recording began, which are logged as a text, `config`: set "
                 "them before the environment is reset."
@@ -203,7 +192,7 @@ class Tracked:
             run = None
 
     def _log_summary(self) -> None:
-        if not self.disabled:
+        if not self._is_disabled:
             for name, value in self.summary.own.items():
                 self._log(f"summary/{name}", value, None)
 
@@ -289,7 +278,7 @@ def init(
     )
     if is_disabled:
         script.discard()
-    run = Tracked(script, project or "", group or "", job_type or "", tags, is_disabled, id)
+    run = Tracked(script, id, is_disabled)
     run.configure(config)
     if (sync_tensorboard or tensorboard) and not is_disabled:
         script.has_writer, run.expects_writer = forward(), True
@@ -299,6 +288,10 @@ def init(
 def log(data: Mapping[str, object], step: object = None, commit: bool | None = None, **more: Any) -> None:
     """Log values into the open run."""
     _open_run("log").log(data, step, commit, **more)
+
+
+def define_metric(*_: object, **__: object) -> None:
+    """Do nothing: every name that does not decrease is an axis of the plots."""
 
 
 def finish(exit_code: int | None = None, quiet: bool | None = None) -> None:
