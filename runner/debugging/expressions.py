@@ -31,6 +31,7 @@ Array = NDArray[Any]
 """Numbers as float64, conditions as bool."""
 Columns = Mapping[Any, Array]
 """The values of each quantity, [moments]; those of a row [moments, values]."""
+Evaluate = Callable[[Columns], Array]
 
 _ARITHMETIC: Final[dict[type[ast.operator], np.ufunc]] = {
     ast.Add: np.add,
@@ -59,6 +60,19 @@ _REFUSED: Final[dict[type[ast.operator], str]] = {
 }
 _HINTS: Final = {"=": "equality is ==", "&": "write `and`", "|": "write `or`", "!": "write `not`, or !="}
 """What to write in place of a sign that is no syntax."""
+_CALLED: Final[dict[type[ast.expr], str]] = {
+    ast.Lambda: "lambda",
+    ast.IfExp: "if ... else",
+    ast.NamedExpr: ":=",
+    ast.Starred: "*",
+    ast.JoinedStr: "an f-string",
+    ast.List: "a list",
+    ast.Tuple: "several values",
+    ast.Set: "a set",
+    ast.Dict: "a dictionary",
+    ast.Slice: "a slice",
+}
+"""What people call a kind of node."""
 _EXPECTED: Final = "expected comparisons, and, or, not, + - * / // %, max(), min() and abs()"
 
 
@@ -68,7 +82,7 @@ class Term:
 
     kind: Literal["number", "condition", "row", "action"]
     """A row is several numbers, of which max() and min() are taken; an action is only equal, or not."""
-    evaluate: Callable[[Columns], Array]
+    evaluate: Evaluate
     names: Sequence[str] = ()
     """The names of its values, if they are actions."""
     is_whole: bool = False
@@ -114,13 +128,11 @@ class Parser:
 
     def error(self, node: ast.expr, message: str) -> RunnerError:
         """Return the error that marks a node in the expression."""
-        start, end = self._span(node)
-        return self._error(start, end, message)
+        return self._error(*self._span(node), message)
 
     def text_of(self, node: ast.expr) -> str:
         """Return a node's own text."""
-        start, end = self._span(node)
-        return self.text[start:end]
+        return self.text[slice(*self._span(node))]
 
     # --- the tree ---------------------------------------------------------------------------------------
 
@@ -164,8 +176,8 @@ class Parser:
             raise self.error(node, f"found {kind}, expected a condition, such as a comparison with > or ==.")
         return term
 
-    def _number(self, node: ast.expr) -> Term:
-        """Return a number; a condition counts as 0 or 1."""
+    def _number(self, node: ast.expr) -> Evaluate:
+        """Return what evaluates a number; a condition counts as 0 or 1."""
         term = self._term(node)
         if term.kind == "row":
             raise self.error(
@@ -175,7 +187,7 @@ class Parser:
             raise self.error(
                 node, "found an action, expected a number; an action is compared, with == or !=, to its name."
             )
-        return term
+        return lambda columns: np.asarray(term.evaluate(columns), np.float64)
 
     def _term(self, node: ast.expr) -> Term:  # noqa: PLR0911 - one line a kind
         match node:
@@ -194,7 +206,8 @@ class Parser:
             case ast.Name() | ast.Attribute() | ast.Subscript():
                 term = self._resolve(self, node)
                 return self._seen(term, node) if term.kind != "row" else term
-        raise self.error(node, f"found {_called(node)}, {_EXPECTED}.")
+        called = _CALLED.get(type(node), "Python that is not allowed here")
+        raise self.error(node, f"found {called}, {_EXPECTED}.")
 
     def _seen(self, term: Term, node: ast.expr) -> Term:
         text = self.text_of(node)
@@ -203,9 +216,8 @@ class Parser:
         return term
 
     def _combined(self, node: ast.BoolOp) -> Term:
-        parts = [self._condition(value).evaluate for value in node.values]
         combine = np.logical_and if isinstance(node.op, ast.And) else np.logical_or
-        return Term("condition", lambda columns: functools.reduce(combine, [part(columns) for part in parts]))
+        return _reduced("condition", combine, [self._condition(value).evaluate for value in node.values])
 
     def _unary(self, node: ast.UnaryOp) -> Term:
         if isinstance(node.op, ast.Not):
@@ -214,28 +226,27 @@ class Parser:
         if isinstance(node.op, ast.Invert):
             raise self.error(node, f"found ~ (write `not`), {_EXPECTED}.")
         sign = -1.0 if isinstance(node.op, ast.USub) else 1.0
-        value = self._number(node.operand).evaluate
+        value = self._number(node.operand)
         return Term("number", lambda columns: sign * value(columns))
 
     def _binary(self, node: ast.BinOp) -> Term:
         operation = _ARITHMETIC.get(type(node.op))
         if operation is None:
             raise self.error(node, f"found the operator {_REFUSED[type(node.op)]}, {_EXPECTED}.")
-        left, right = self._number(node.left).evaluate, self._number(node.right).evaluate
-        return Term("number", lambda columns: operation(left(columns) * 1.0, right(columns) * 1.0))
+        return _reduced("number", operation, [self._number(node.left), self._number(node.right)])
 
     def _comparison(self, node: ast.Compare) -> Term:
         nodes = [node.left, *node.comparators]
         terms = [None if _is_text(each) else self._term(each) for each in nodes]
-        actions = [term if term is not None and term.kind == "action" else None for term in terms]
+        names = [() if term is None else term.names for term in terms]
         values = []
         for k, (each, term) in enumerate(zip(nodes, terms, strict=True)):
-            near = next((other for other in actions[max(k - 1, 0) : k + 2] if other is not None), None)
-            if near is None:
-                values.append(self._number(each).evaluate)
-            elif term is None or actions[k] is None:
-                values.append(_fixed(self.number_of(each, near.names, "action")).evaluate)
-            elif term.names != near.names:
+            near = next(filter(None, names[max(k - 1, 0) : k + 2]), ())
+            if not near:
+                values.append(self._number(each))
+            elif term is None or not term.names:
+                values.append(_fixed(self.number_of(each, near, "action")).evaluate)
+            elif term.names != near:
                 raise self.error(node, "found a joint action and one agent's, which are not comparable.")
             else:
                 values.append(term.evaluate)
@@ -243,7 +254,7 @@ class Parser:
         for k, operator in enumerate(node.ops):
             if type(operator) not in _COMPARISONS:
                 raise self.error(node, "found `in` or `is`, expected one of < <= > >= == !=.")
-            if any(actions[k : k + 2]) and not isinstance(operator, ast.Eq | ast.NotEq):
+            if any(names[k : k + 2]) and not isinstance(operator, ast.Eq | ast.NotEq):
                 raise self.error(node, "found an order of actions, expected == or !=.")
             compare.append(_COMPARISONS[type(operator)])
 
@@ -265,8 +276,8 @@ class Parser:
         if name == "abs":
             if len(node.args) > 1:
                 raise self.error(node, "found several values, expected abs() of one.")
-            size = self._number(node.args[0]).evaluate
-            return Term("number", lambda columns: np.abs(size(columns) * 1.0))
+            size = self._number(node.args[0])
+            return Term("number", lambda columns: np.abs(size(columns)))
         choose = np.maximum if name == "max" else np.minimum
         if len(node.args) == 1:
             row = self._term(node.args[0])
@@ -274,8 +285,7 @@ class Parser:
                 raise self.error(node.args[0], f"found one value, expected {name}(q[STATE]), or several.")
             own = row.evaluate
             return self._seen(Term("number", lambda columns: choose.reduce(own(columns), axis=1)), node)
-        parts = [self._number(each).evaluate for each in node.args]
-        return Term("number", lambda columns: functools.reduce(choose, [part(columns) for part in parts]))
+        return _reduced("number", choose, list(map(self._number, node.args)))
 
     def _constant(self, node: ast.Constant) -> Term:
         value = node.value
@@ -324,6 +334,11 @@ class Parser:
         )
 
 
+def _reduced(kind: Literal["number", "condition"], operation: np.ufunc, parts: Sequence[Evaluate]) -> Term:
+    """Return the term whose value is an operation on those of its parts, from left to right."""
+    return Term(kind, lambda columns: functools.reduce(operation, [part(columns) for part in parts]))
+
+
 def _fixed(value: float) -> Term:
     number = np.array(value, np.float64)
     return Term("number", lambda _: number)
@@ -336,20 +351,3 @@ def _is_text(node: ast.expr) -> bool:
 def _plain(name: str) -> str:
     """Return a name of a state or action in one spelling."""
     return spoken(" + ".join(part.strip() for part in name.split("+")))
-
-
-def _called(node: ast.expr) -> str:
-    """Return what people call a kind of node."""
-    names: dict[type[ast.expr], str] = {
-        ast.Lambda: "lambda",
-        ast.IfExp: "if ... else",
-        ast.NamedExpr: ":=",
-        ast.Starred: "*",
-        ast.JoinedStr: "an f-string",
-        ast.List: "a list",
-        ast.Tuple: "several values",
-        ast.Set: "a set",
-        ast.Dict: "a dictionary",
-        ast.Slice: "a slice",
-    }
-    return names.get(type(node), "Python that is not allowed here")

@@ -7,19 +7,19 @@ identity of its job, and never measured again.
 
 from __future__ import annotations
 
-import json
-import math
+import contextlib
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Self
+from typing import Final, Self
 
 import numpy as np
 from blake3 import blake3
 from numpy.typing import NDArray
+from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import identity_of
@@ -157,7 +157,7 @@ class Mixtures:
     ) -> None:
         self.mixing, self.seeds, self._recordings = mixing, tuple(seeds), recordings
         self._path, self._report = folder / VALUES, report
-        self._kept = dict(_kept(self._path))
+        self._kept = {known.job: known for known in _kept(self._path)}
         self.in_file = sum(earlier.seed in self.seeds for earlier in self._kept.values())
         """Runs in the file that have one of the seeds, of whatever mixtures."""
         self._found: dict[tuple[int, int], Readings] = {}
@@ -257,8 +257,8 @@ class Mixtures:
         lines = []
         for seed, read in measured.readings.items():
             self._found[task.mixture, seed] = read
-            line = {"job": self._identity(config, seed), "seed": seed, "seconds": measured.seconds}
-            lines.append(json.dumps(line | {"readings": read}) + "\n")
+            known = _Known(self._identity(config, seed), dict(read), measured.seconds, seed)
+            lines.append(_LINES.dump_json(known).decode() + "\n")
         with storage_errors(self._path), self._path.open("a", encoding="utf-8") as file:
             file.writelines(lines)
 
@@ -272,43 +272,25 @@ class Mixtures:
         return RunnerError(f"the mixture with these settings of B: {names}: {reason}")
 
 
-class _Known(NamedTuple):
+@dataclass(frozen=True)
+class _Known:
     """A run in the file of values."""
 
-    readings: Readings
-    seconds: float
-    seed: object
+    job: str
+    readings: dict[str, FiniteFloat | None]
+    seconds: FiniteFloat
+    seed: object = None
 
 
-def _kept(path: Path) -> Iterator[tuple[str, _Known]]:
-    """Yield by the identity of a job what a file has of it, without damaged lines."""
+_LINES: Final = TypeAdapter(_Known)
+
+
+def _kept(path: Path) -> Iterator[_Known]:
+    """Yield what a file has of each run, without damaged lines."""
     try:
         with path.open("rb") as file:
             while file.tell() < MAX_BYTES and (line := file.readline(MAX_LINE)):
-                try:
-                    values = json.loads(line)
-                    earlier = _Known(
-                        _checked(values["readings"]), _finite(values["seconds"]), values.get("seed")
-                    )
-                    yield str(values["job"]), earlier
-                except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
-                    continue
+                with contextlib.suppress(ValidationError):
+                    yield _LINES.validate_json(line)
     except OSError:
         return
-
-
-def _checked(values: object) -> Readings:
-    """Return readings from a file.
-
-    Raises:
-        TypeError: they are none.
-    """
-    if not isinstance(values, dict):
-        raise TypeError(values)
-    return {str(name): None if value is None else _finite(value) for name, value in values.items()}
-
-
-def _finite(value: Any) -> float:
-    if not math.isfinite(number := float(value)):
-        raise ValueError(value)
-    return number

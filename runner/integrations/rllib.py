@@ -19,6 +19,7 @@ import numpy as np
 
 from runner.errors import EnvironmentNotUsable, RunnerError, truncated_message
 from runner.integrations.libraries import as_setting, check_callback, require_tested
+from runner.integrations.shapes import as_run_name
 from runner.loops.description import Described
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, game_maker_of, vector_maker_of
@@ -179,7 +180,7 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
             recording.recordings,
             {
                 **recording.options,
-                "name": recording.name or re.sub(r"[^A-Za-z0-9_.+/-]", "-", name)[:100],
+                "name": recording.name or as_run_name(name),
                 "seed": config.seed if recording.seed is None else recording.seed,
                 "config": {
                     "algorithm": type(algorithm).__name__,

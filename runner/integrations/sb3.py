@@ -108,12 +108,9 @@ class Recording(BaseCallback):  # type: ignore[misc]
     def _end(self, error: BaseException | None = None) -> None:
         """End the run, unless `runner.record` began it."""
         while self._evaluations:
-            own = self._evaluations.pop()
-            own.restore_methods()
-            own.recorded._loop.close(*ending_of(error))
+            self._evaluations.pop().end(*ending_of(error))
         if self._is_own and self._envs is not None:
-            self._envs.restore_methods()
-            self.recorded._loop.close(*ending_of(error))
+            self._envs.end(*ending_of(error))
 
     def begin(self, model: BaseAlgorithm, is_continued: bool) -> None:
         """Record the environments of a model from now on; called by its `learn`.
@@ -140,8 +137,7 @@ class Recording(BaseCallback):  # type: ignore[misc]
         if earlier is not None:
             if earlier is self._envs and self._stays_open:
                 return
-            earlier.restore_methods()  # an error ended the `learn` before
-            earlier.recorded._loop.close("interrupted")
+            earlier.end("interrupted")  # an error ended the `learn` before
         observations = _observations_in_progress(model, base) if is_continued else None
         options: dict[str, Any] = {"recordings": self._recordings, **self._options}
         options.setdefault("seed", model.seed)
@@ -202,8 +198,7 @@ class Recording(BaseCallback):  # type: ignore[misc]
         if isinstance(base, RecordedVecEnv) or (earlier and earlier in (self._envs, *self._evaluations)):
             return
         if earlier is not None:
-            earlier.restore_methods()
-            earlier.recorded._loop.close("interrupted")
+            earlier.end("interrupted")
         try:
             own = RecordedVecEnv(base, {"join": self.run, "phase": "eval", "shard": "evaluation"})
         except (ConfigError, EnvironmentNotUsable) as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from functools import wraps
 from typing import Any
@@ -9,6 +10,11 @@ from typing import Any
 from runner.loops.values import warn_user
 
 _warned: set[str] = set()
+
+
+def as_run_name(text: str) -> str | None:
+    """Return a text as a run can have it for its name; None if nothing is left of it."""
+    return re.sub(r"[^A-Za-z0-9_.+/-]", "-", text)[:100].lstrip(".-+/") or None
 
 
 def forgiving(method: Callable[..., Any]) -> Callable[..., Any]:

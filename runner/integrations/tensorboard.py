@@ -26,12 +26,11 @@ import numpy as np
 from runner.errors import ConfigError
 from runner.integrations.hooks import hook_environments, open_runs
 from runner.integrations.script import ScriptRun
-from runner.integrations.shapes import WithoutEffect, forgiving, without_effect
+from runner.integrations.shapes import WithoutEffect, as_run_name, forgiving, without_effect
 from runner.loops.media import film_of, grid_of, histogram_of, picture_of
 from runner.loops.recorded import ending_of
 from runner.loops.values import as_array
 from runner.runs.run import Run
-from runner.util.values import RUN_NAME_PATTERN
 
 _HYPERPARAMETERS: Final = re.compile(r"\|param\|value\|\n\|-\|-\|\n", re.ASCII)
 """How the tables begin in which CleanRL's scripts write their settings."""
@@ -264,8 +263,7 @@ def run_name(log_dir: str) -> str | None:
     """Return the name of a run that is logged into a folder, such as `CartPole-v1__ppo__1__1700000000`."""
     parts = Path(log_dir).parts
     inside = parts[parts.index("runs") + 1 :] if "runs" in parts[:-1] else parts[-1:]
-    name = re.sub(r"[^A-Za-z0-9_.+/-]", "-", "/".join(inside))[:100].lstrip(".-+/")
-    return name if re.fullmatch(RUN_NAME_PATTERN, name) else None
+    return as_run_name("/".join(inside))
 
 
 def as_number(name: str, value: object) -> object:

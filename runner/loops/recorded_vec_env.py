@@ -59,15 +59,16 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         return getattr(self.recorded if hasattr(Recorded, name) else self.base, name)
 
     def replace_methods(self) -> None:
-        """Record what is done with the `VecEnv` itself, until `restore_methods` is called."""
+        """Record what is done with the `VecEnv` itself, until `end` is called."""
         for name in _METHODS:
             setattr(self.base, name, getattr(self, name))
 
-    def restore_methods(self) -> None:
-        """Leave the `VecEnv` as it was."""
+    def end(self, status: str, error: str = "") -> None:
+        """Leave the `VecEnv` as it was, and close the recording."""
         for name in _METHODS:
             vars(self.base).pop(name, None)
         self._vector.release()
+        self.recorded._loop.close(status, error)
 
     @staticmethod
     def replacing(base: VecEnv) -> RecordedVecEnv | None:

@@ -11,8 +11,8 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
@@ -69,7 +69,7 @@ def effects_of(
         for trial, value in zip(trials, values, strict=True)
     ]
     rng = np.random.default_rng(0)
-    all_shares: list[dict[tuple[int, ...], float]] = []
+    all_shares: list[dict[tuple[str, ...], float]] = []
     for forest in range(FORESTS):
         resampled = rng.integers(0, len(trials), len(trials)).tolist()
         if len({values[trial] for trial in resampled}) > 1:
@@ -79,8 +79,8 @@ def effects_of(
                 n_trees=TREES, max_depth=MAX_DEPTH, seed=forest
             )
             shares = evaluator.evaluate(study, names)
-            all_shares.append({(axis,): shares[name] for axis, name in enumerate(names)})
-    return _effects(names, all_shares)
+            all_shares.append({(name,): share for name, share in shares.items()})
+    return _effects(all_shares)
 
 
 def effects_of_grid(
@@ -92,17 +92,16 @@ def effects_of_grid(
     The interval is over resampled seeds.
     """
     shape = tuple(each.steps + 1 if isinstance(each, Range) else len(each) for each in parameters.values())
-    exact = shares_of_variance(np.array([np.median(own) for own in seed_values]).reshape(shape))
-    rng = np.random.default_rng(0)
-    resampled = []
-    for _ in range(RESAMPLES):
-        medians = [np.median(rng.choice(own, len(own))) for own in map(np.asarray, seed_values)]
-        resampled.append(shares_of_variance(np.array(medians).reshape(shape)))
-    effects = _effects(list(parameters), [shares for shares in resampled if shares]) if exact else []
-    names = list(parameters)
-    shares = {tuple(names[axis] for axis in axes): share for axes, share in exact.items()}
-    effects = [replace(effect, share=shares[effect.parameters]) for effect in effects]
-    return sorted(effects, key=lambda effect: -effect.share)
+    names, rng = list(parameters), np.random.default_rng(0)
+
+    def shares_of(points: Iterable[NDArray[np.float64]]) -> dict[tuple[str, ...], float]:
+        shares = shares_of_variance(np.array(list(map(np.median, points))).reshape(shape))
+        return {tuple(names[axis] for axis in axes): share for axes, share in shares.items()}
+
+    points = list(map(np.asarray, seed_values))
+    resampled = [shares_of(rng.choice(own, len(own)) for own in points) for _ in range(RESAMPLES)]
+    exact = shares_of(points)
+    return _effects([shares for shares in resampled if shares], exact) if exact else []
 
 
 def shares_of_variance(values: NDArray[np.float64]) -> dict[tuple[int, ...], float]:
@@ -126,15 +125,15 @@ def shares_of_variance(values: NDArray[np.float64]) -> dict[tuple[int, ...], flo
     return shares
 
 
-def _effects(names: Sequence[str], all_shares: Sequence[Mapping[tuple[int, ...], float]]) -> list[Effect]:
-    """Return the median and the interval of each share, the largest first."""
-    if not all_shares:
-        return []
+def _effects(
+    resampled: Sequence[Mapping[tuple[str, ...], float]], exact: Mapping[tuple[str, ...], float] | None = None
+) -> list[Effect]:
+    """Return each exact share, or the median of those resampled, with its interval, the largest first."""
     effects = []
-    for axes in all_shares[0]:
-        shares = [each[axes] for each in all_shares]
+    for parameters in resampled[0] if resampled else ():
+        shares = [each[parameters] for each in resampled]
         low, middle, high = np.quantile(shares, [0.025, 0.5, 0.975]).tolist()
-        effects.append(Effect(tuple(names[axis] for axis in axes), middle, low, high))
+        effects.append(Effect(parameters, exact[parameters] if exact else middle, low, high))
     return sorted(effects, key=lambda effect: -effect.share)
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from runner.errors import ConfigError, RunnerError
 from runner.integrations.hooks import hook_environments
 from runner.integrations.script import ScriptRun
-from runner.integrations.shapes import WithoutEffect, forgiving, warn_once, without_effect
+from runner.integrations.shapes import WithoutEffect, as_run_name, forgiving, warn_once, without_effect
 from runner.integrations.tensorboard import as_number, forward
 from runner.integrations.wandb.settings import Config, Summary
 from runner.loops.media import Histogram, Image
@@ -34,7 +34,7 @@ from runner.loops.options import settings_in
 from runner.loops.recorded import ending_of
 from runner.runs.listing import list_runs
 from runner.util.jsonable import as_json
-from runner.util.values import RUN_NAME_PATTERN, flatten
+from runner.util.values import flatten
 
 _IGNORED: Final = frozenset(
     [
@@ -82,7 +82,7 @@ class Tracked:
 
     @name.setter
     def name(self, name: str) -> None:
-        self.script.name = _name(name)
+        self.script.name = as_run_name(str(name))
         if not self.script.is_waiting:
             self.script.warn_once(f"name: run {self.id} is being recorded; rename it by `dualtaxi label`.")
 
@@ -269,7 +269,7 @@ def init(
     is_disabled = (mode or os.environ.get("WANDB_MODE")) == "disabled"
     script = ScriptRun(
         recordings,
-        _name(name or project),
+        as_run_name(str(name or project or "")),
         tags=(*tags, *own_tags),
         note=note,
         has_environment=monitor_gym is not False,
@@ -318,12 +318,6 @@ def _predecessor(tag: str, recordings: str | os.PathLike[str] | None) -> str:
         "follows it, and names it in its note."
     )
     return f"Follows run {last.run_id}.\n"
-
-
-def _name(name: str | None) -> str | None:
-    """Return a name as a run can have it."""
-    text = re.sub(r"[^A-Za-z0-9_.+/-]", "-", str(name or ""))[:100].lstrip(".-+/")
-    return text if re.fullmatch(RUN_NAME_PATTERN, text) else None
 
 
 def _tag(text: str) -> str:

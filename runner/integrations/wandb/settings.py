@@ -17,8 +17,7 @@ class Config(MutableMapping[str, Any]):
     _configure: Callable[..., None]
 
     def __init__(self, script: ScriptRun, configure: Callable[..., None]) -> None:
-        object.__setattr__(self, "_script", script)
-        object.__setattr__(self, "_configure", configure)
+        vars(self).update(_script=script, _configure=configure)
 
     def update(self, *settings: Any, **more: object) -> None:
         """Take the settings of a mapping, dataclass or namespace."""
