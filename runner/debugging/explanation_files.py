@@ -120,13 +120,16 @@ def read_explanation(name: str, recordings: Path) -> Explanation:
     numbers += [each.share.value for each in explanation.settings if each.share is not None]
     numbers.append(explanation.seconds)
     counts = {len(one.values) for one in explanation.mixtures}
-    if len(explanation.mixtures) < 2 or counts != {len(explanation.seeds)} or not explanation.seeds:
-        raise RunnerError(f"{path}: no longer describes an explanation (a mixture lacks values).")
-    if not all(math.isfinite(value) and abs(value) < MAX_VALUE for value in numbers):
-        raise RunnerError(f"{path}: no longer describes an explanation (a value is not finite).")
     known_settings = {each.name for each in explanation.settings}
     named = [each.settings for each in explanation.mixtures]
     named += [each.settings for each in explanation.interactions]
-    if not all(known_settings.issuperset(names) for names in named):
-        raise RunnerError(f"{path}: no longer describes an explanation (a setting is missing).")
+    reason = ""
+    if len(explanation.mixtures) < 2 or counts != {len(explanation.seeds)} or not explanation.seeds:
+        reason = "a mixture lacks values"
+    elif not all(math.isfinite(value) and abs(value) < MAX_VALUE for value in numbers):
+        reason = "a value is not finite"
+    elif not all(known_settings.issuperset(names) for names in named):
+        reason = "a setting is missing"
+    if reason:
+        raise RunnerError(f"{path}: no longer describes an explanation ({reason}).")
     return explanation

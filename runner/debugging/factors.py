@@ -81,6 +81,11 @@ class Mixing:
         """Return the settings that have the values of B in a mixture."""
         return [factor for i, factor in enumerate(self.factors) if mixture >> i & 1]
 
+    def in_words(self, mixture: int) -> str:
+        """Return what a mixture is, for errors."""
+        names = ", ".join(factor.name for factor in self.chosen(mixture)) or "none"
+        return f"the mixture with these settings of B: {names}"
+
 
 def mix(a: ExperimentConfig, b: ExperimentConfig, at: int | None = None, exact: bool = False) -> Mixing:
     """Return the settings in which two experiments differ, grouped so that they can be mixed.

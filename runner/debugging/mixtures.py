@@ -200,10 +200,9 @@ class Mixtures:
         for mixture in mixtures:
             row = [read.get(metric) for read in self.readings(mixture)]
             if None in row:
-                names = ", ".join(factor.name for factor in self.mixing.chosen(mixture)) or "none"
                 raise RunnerError(
-                    f"metric: {metric!r} has no finite value in the mixture with these settings of B: "
-                    f"{names}. Choose a metric that every mixture has, such as success_percent."
+                    f"metric: {metric!r} has no finite value in {self.mixing.in_words(mixture)}. Choose a "
+                    "metric that every mixture has, such as success_percent."
                 )
             rows.append(row)
         return np.array(rows, np.float64)
@@ -227,7 +226,8 @@ class Mixtures:
                     waiting.append(task)
                     continue
                 if result is None or result.error:
-                    raise self._failed(task, "its worker died twice" if result is None else result.error)
+                    reason = "its worker died twice" if result is None else result.error
+                    raise RunnerError(f"{self.mixing.in_words(task.mixture)}: {reason}")
                 left -= len(result.readings)
                 self.trained += len(result.readings)
                 self._seconds[task.mixture] = result.seconds
@@ -266,10 +266,6 @@ class Mixtures:
         """Return what determines the readings of a run: its job, and the code of its environment."""
         environment = _environment_digest(load_once(config.env.id, config.env.kwargs, config.rewards))
         return f"{identity_of(config.to_mapping(), seed)}-{environment}-{__version__}"
-
-    def _failed(self, task: Measurement, reason: str) -> RunnerError:
-        names = ", ".join(factor.name for factor in self.mixing.chosen(task.mixture)) or "none"
-        return RunnerError(f"the mixture with these settings of B: {names}: {reason}")
 
 
 @dataclass(frozen=True)

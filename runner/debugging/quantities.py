@@ -112,16 +112,15 @@ class JobVocabulary:
 
     def _learner(self, parser: Parser, node: ast.expr, name: str, agent: str | None) -> int:
         several = len(self._learners) > 1
+        expected = " or ".join(f"{name}.{each}" for each in self._learners)
         if agent is not None:
             if name not in ("q", "greedy", "visits", "reward"):
                 raise parser.error(node, f"found {name} of an agent, expected {name} alone.")
             if agent not in self._learners:
-                expected = " or ".join(f"{name}.{each}" for each in self._learners)
                 hint = nearest(agent, self._learners)
                 raise parser.error(node, f"found {name}.{agent}, expected {expected}.{hint}")
             return self._learners.index(agent)
         if several and name in ("q", "reward"):
-            expected = " or ".join(f"{name}.{each}" for each in self._learners)
             raise parser.error(node, f"found {name} of {len(self._learners)} agents, expected {expected}.")
         return JOINT if several else 0
 

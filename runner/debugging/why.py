@@ -52,6 +52,10 @@ MAX_KINDS: Final = 100
 """Kinds of rewards, the rest of which are counted together."""
 
 
+_OF_STEP: Final = ["state", "action", "next_state", "episode", "t", "explored"]
+"""Fields of a training step's record."""
+
+
 def why(
     run: Run,
     *,
@@ -231,8 +235,7 @@ def _steps(recording: Recording, largest: NDArray[np.void], learner: int) -> Ite
         records[step] = next(recording.blocks(schema.TRAIN_STEP, step, step + 1))[0].copy()
     for share in largest:
         record = records[int(share["step"])]
-        state, action = int(record["state"]), int(record["action"])
-        episode, t = int(record["episode"]), int(record["t"])
+        state, action, next_state, episode, t, explored = record[_OF_STEP].tolist()
         yield StepPart(
             weight=float(share["weight"]),
             contribution=float(share["contribution"]),
@@ -243,10 +246,10 @@ def _steps(recording: Recording, largest: NDArray[np.void], learner: int) -> Ite
             state_in_words=str(states[state]),
             action=action,
             action_in_words=str(actions[action]),
-            next_state=int(record["next_state"]),
+            next_state=next_state,
             reward=float(record["rewards"][learner]),
             events=events_in_words(mdp, int(events_of(mdp, record.reshape(1))[0])),
-            explored=exploration_in_words(int(record["explored"]), recording.agents),
+            explored=exploration_in_words(explored, recording.agents),
             distance=float(share["distance"]),
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import textwrap
@@ -37,7 +38,7 @@ _MAX_NOTE_LENGTH: Final = 175
 """Characters of a note that fit on a line of a sheet."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Axis:
     """A parameter of a sweep, and the values that its trials have."""
 
@@ -45,33 +46,27 @@ class Axis:
     choices: tuple[str, ...]
     """The values of a list as text; empty for a range."""
     log: bool
-    values: tuple[float, ...]
+    values: Values
     """The value of each trial, or the number of its choice; NaN where its algorithm does not use it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Picture:
     """Trials that have results, and their parameters."""
 
     trials: tuple[Ranked, ...]
     """The best first."""
     axes: tuple[Axis, ...]
+    values: Values
+    """The median of each trial."""
+    ranges: Values
+    """[trials, 2]: the lowest and the highest seed of each trial."""
     objective: str
     lower_is_better: bool
     log: bool
     """Whether the objective is drawn on a logarithmic scale."""
     left_out: int
     """Number of trials without a value that can be drawn."""
-
-    @property
-    def values(self) -> tuple[float, ...]:
-        """The median of each trial."""
-        return tuple(float(trial.median or 0.0) for trial in self.trials)
-
-    @property
-    def ranges(self) -> tuple[tuple[float, float], ...]:
-        """The lowest and the highest seed of each trial."""
-        return tuple((float(trial.low or 0.0), float(trial.high or 0.0)) for trial in self.trials)
 
     @property
     def footnote(self) -> str:
@@ -90,18 +85,14 @@ def picture_of(results: Results) -> Picture:
     Raises:
         RunnerError: no trial has a result yet.
     """
-    drawn = tuple(
-        trial
-        for trial in results.ranking
-        if all(
-            value is not None and math.isfinite(value) and abs(value) < NEVER
-            for value in (trial.median, trial.low, trial.high)
-        )
-    )
+    figures = np.array([(trial.median, trial.low, trial.high) for trial in results.ranking], np.float64)
+    figures = figures.reshape(-1, 3)
+    is_drawn = np.all(np.abs(figures) < NEVER, axis=1)  # None is NaN, and not drawn
+    drawn = tuple(itertools.compress(results.ranking, is_drawn.tolist()))
     if not drawn:
         raise RunnerError(_nothing_to_draw(results))
     parameters, objective = results.sweep.file.parameters, results.sweep.objective
-    values = [value for trial in drawn for value in (trial.low, trial.high) if value is not None]
+    values, ranges = figures[is_drawn, 0], figures[is_drawn, 1:]
     at = f"first at {objective.level:g}, episodes" if objective.at == "first_over" else objective.at
     return Picture(
         trials=drawn,
@@ -110,9 +101,11 @@ def picture_of(results: Results) -> Picture:
             for path, parameter in parameters.items()
             if any(path in trial.values for trial in drawn)
         ),
+        values=values,
+        ranges=ranges,
         objective=f"{objective.metric}, {at}",
         lower_is_better=objective.direction == "minimize",
-        log=min(values) > 0 and max(values) > 30 * min(values),
+        log=bool(0 < 30 * ranges.min() < ranges.max()),
         left_out=len(results.ranking) - len(drawn),
     )
 
@@ -151,15 +144,12 @@ def _nothing_to_draw(results: Results) -> str:
 
 def _axis(path: str, parameter: Range | list[object], trials: Sequence[Ranked]) -> Axis:
     if isinstance(parameter, Range):
-        return Axis(
-            path, (), parameter.log, tuple(float(trial.values.get(path, math.nan)) for trial in trials)
-        )
-    choices = [json.dumps(choice) for choice in parameter]
-    numbers = tuple(
-        float(choices.index(json.dumps(trial.values[path]))) if path in trial.values else math.nan
-        for trial in trials
-    )
-    return Axis(path, tuple(map(value_text, parameter)), False, numbers)
+        return Axis(path, (), parameter.log, np.array([trial.values.get(path, np.nan) for trial in trials]))
+    choices = list(map(json.dumps, parameter))
+    numbers = [
+        choices.index(json.dumps(trial.values[path])) if path in trial.values else np.nan for trial in trials
+    ]
+    return Axis(path, tuple(map(value_text, parameter)), False, np.array(numbers))
 
 
 def sweep_sheet(title: str, picture: Picture, groups: Sequence[Group], panel: Panel) -> Canvas:
@@ -205,8 +195,7 @@ def parameter_chart(picture: Picture, axis: Axis) -> Chart:
     Pruned trials are hollow.
     """
     is_used = ~np.isnan(axis.values)
-    values, x = np.array(picture.values)[is_used], np.array(axis.values)[is_used]
-    ranges = np.array(picture.ranges)[is_used]
+    values, ranges, x = picture.values[is_used], picture.ranges[is_used], axis.values[is_used]
     labels = [textwrap.shorten(choice, 24) for choice in axis.choices]
     slanted = sum(map(len, labels)) > 28
     bottom, height = (144.0, 210.0) if slanted else (146.0, 187.0)
@@ -232,26 +221,24 @@ def parameter_chart(picture: Picture, axis: Axis) -> Chart:
 
 def parallel_chart(picture: Picture) -> Chart:
     """Return parallel coordinates: each trial a line over all parameters to its objective."""
-    columns = [_unit(np.array(axis.values), axis.log, axis.choices) for axis in picture.axes]
-    columns.append(_unit(np.array(picture.values), picture.log, ()))
-    lines, places = np.array(columns).T, np.arange(len(columns), dtype=np.float64)
-    x = Scale(-0.1, len(columns) - 0.75, 10.0, 580.0)
+    axes = [*picture.axes, Axis(picture.objective, (), picture.log, picture.values)]
+    lines = np.array([_unit(axis.values, axis.log, axis.choices) for axis in axes]).T
+    places = np.arange(len(axes), dtype=np.float64)
+    x = Scale(-0.1, len(axes) - 0.75, 10.0, 580.0)
     chart = Chart(x, Scale(-0.05, 1.05, 186.0, 24.0), 590.0, 216.0, "The trials in parallel coordinates")
     for number, opacity in reversed(list(enumerate(np.linspace(0.9, 0.35, len(lines)).tolist()))):
         _trial_line(chart, lines[number], _TRIAL, 0.9, opacity)
     _trial_line(chart, lines[0], _BEST, 2.2, 1.0)
     title = "Each trial is a line, the best one thick; strong lines are better than faint ones"
     chart.text(10.0, 14.0, title, size=9.5, bold=True)
-    names = [*(axis.path for axis in picture.axes), picture.objective]
-    for place, name in zip(chart.x(places).tolist(), names, strict=True):
+    for place, axis in zip(chart.x(places).tolist(), axes, strict=True):
         chart.shape([(place, 24), (place, 186)], stroke=palette.INK, width=0.7)
-        for row, part in enumerate(textwrap.wrap(name.replace(".", ". "), 24)[:2]):
+        for row, part in enumerate(textwrap.wrap(axis.path.replace(".", ". "), 24)[:2]):
             text = part.replace(". ", ".")
             side = "start" if place < 60 else "end" if place > 500 else "middle"
             chart.text({"start": 10.0, "end": 585.0}.get(side, place), 198.0 + 10 * row, text, side)
-    for number, axis in enumerate(picture.axes):
-        _label_column(chart, number, axis.values, axis.log, axis.choices)
-    _label_column(chart, len(picture.axes), picture.values, picture.log, ())
+    for column, axis in enumerate(axes):
+        _label_column(chart, column, axis)
     return chart
 
 
@@ -262,18 +249,19 @@ def _trial_line(chart: Chart, heights: Values, colour: str, width: float, opacit
     chart.line(places, heights[is_used], colour, width=width, opacity=opacity)
 
 
-def _label_column(
-    chart: Chart, column: int, values: Sequence[float], log: bool, choices: tuple[str, ...]
-) -> None:
+def _label_column(chart: Chart, column: int, axis: Axis) -> None:
     """Write the choices, or the lowest and the highest value, next to an axis of parallel coordinates."""
-    if choices:
-        heights = _unit(np.arange(len(choices), dtype=np.float64), False, choices)
-        labels = list(zip(heights, (textwrap.shorten(choice, 18) for choice in choices), strict=True))
+    if axis.choices:
+        ends, texts = (
+            np.arange(len(axis.choices), dtype=np.float64),
+            [textwrap.shorten(choice, 18) for choice in axis.choices],
+        )
     else:
-        ends = np.array([np.nanmin(values), np.nanmax(values)])
-        labels = list(zip(_unit(ends, log, ()), (f"{end:,.4g}" for end in ends), strict=True))
-    for height, text in dict(labels).items():
-        chart.text(chart.x.at(column) + 5, chart.y.at(float(height)) + 2.8, text, size=SMALL, halo=True)
+        ends = np.array([np.nanmin(axis.values), np.nanmax(axis.values)])
+        texts = [f"{end:,.4g}" for end in ends]
+    heights = _unit(ends, axis.log, axis.choices).tolist()
+    for height, text in dict(zip(heights, texts, strict=True)).items():
+        chart.text(chart.x.at(column) + 5, chart.y.at(height) + 2.8, text, size=SMALL, halo=True)
 
 
 def _unit(values: Values, log: bool, choices: tuple[str, ...]) -> Values:
