@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
+import contextlib
+import tempfile
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.drawing.raster import Pixels, require_packages
 from runner.errors import RunnerError
-from runner.util.arrays import Array
 from runner.util.extras import require
+
+if TYPE_CHECKING:
+    from av import VideoFrame
 
 LAST_SECONDS: Final = 2.5
 """Duration of the last frame of a GIF, which starts again by itself."""
 _MAX_SIDE: Final = 16_000
 """The most pixels on a side that all formats allow."""
-_COLOURS: Final = 256
-_FAR: Final = 24
-"""A colour is far from another if they are this far apart, of 255."""
-_MORE: Final = 0.01
-"""The share of a frame that may be far from the palette, in addition to what it was when it was chosen."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,7 @@ FORMATS: Final = {
     ),
 }
 """By the ending of the file."""
-LOSSLESS: Final = Format("matroska", "libx264rgb", "rgb24", {"preset": "ultrafast", "qp": "0"})
+LOSSLESS: Final = Format("mov", "qtrle", "rgb24", {})
 """For films that are read again."""
 
 
@@ -106,7 +104,6 @@ class Encoder:
             ) from error
         self._container = av.open(path, "w", format=form.container, options=dict(form.container_options))
         self._stream: Any = None
-        self._palette = _Palette() if form.pixels == "pal8" else None
 
     def __enter__(self) -> Self:
         return self
@@ -127,10 +124,12 @@ class Encoder:
         height, width, _ = pixels.shape
         if height % 2 or width % 2:
             pixels = np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), constant_values=255)
+        self.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24"))
+
+    def encode(self, frame: VideoFrame) -> None:
+        """Add a frame."""
         if self._stream is None:
-            self._open(pixels.shape[1], pixels.shape[0])
-        coloured: Any = pixels if self._palette is None else self._palette.indexed(pixels)
-        frame = av.VideoFrame.from_ndarray(coloured, format="pal8" if self._palette else "rgb24")
+            self._open(frame.width, frame.height)
         frame.pts, frame.time_base = self.frames, 1 / self._rate
         self.frames += 1
         self._container.mux(self._stream.encode(frame))
@@ -148,49 +147,41 @@ class Encoder:
         self._stream.options = dict(self._form.options)
 
 
-class _Palette:
-    """The colours of a GIF: the most common ones of a frame, until too much of a later one is far from them.
+@contextlib.contextmanager
+def encoder(path: Path, fps: float) -> Iterator[Encoder]:
+    """Yield an encoder into a file, in the format that its ending chooses.
 
-    Frames that share a palette need little space, as only what changes is stored. Colours are compared by
-    their upper five bits.
+    A GIF is encoded without loss first, as its colours are chosen for all frames together.
     """
+    form = format_of(path)
+    if form.codec != "gif":
+        with Encoder(path, form, fps) as film:
+            yield film
+        return
+    with tempfile.TemporaryDirectory(prefix="dualtaxi-film-") as folder:
+        with Encoder(Path(folder, "film"), LOSSLESS, fps) as film:
+            yield film
+        with Encoder(path, form, fps) as gif:
+            for frame in _with_palette(film.path):
+                gif.encode(frame)
 
-    def __init__(self) -> None:
-        self._colours = np.zeros((_COLOURS, 4), np.uint8)
-        """Alpha, red, green, blue."""
-        self._nearest = np.zeros(1 << 15, np.uint8)
-        """The colour nearest to each that five bits of red, green and blue make."""
-        self._is_far = np.ones(1 << 15, np.bool_)
-        self._accepted = 0.0
-        """The share of a frame that may be far from the palette."""
 
-    def indexed(self, pixels: Pixels) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Return the number of each pixel's colour, [height, width], and the colours, [256, 4]."""
-        parts = pixels.astype(np.uint16) >> 3
-        codes = parts[..., 0] << 10 | parts[..., 1] << 5 | parts[..., 2]
-        if self._is_far[codes].mean() > self._accepted:
-            self._choose(codes.ravel(), pixels.reshape(-1, 3))
-        return self._nearest[codes], self._colours
+def _with_palette(film: Path) -> Iterator[VideoFrame]:
+    """Yield the frames of a film in the 256 colours that suit it best; it is read twice."""
+    import av
 
-    def _choose(self, codes: Array, pixels: NDArray[np.uint8]) -> None:
-        """Set the palette to the most common colours of a frame, each the mean of those of one code."""
-        counts = np.bincount(codes, minlength=1 << 15)
-        common = np.argsort(-counts, kind="stable")[:_COLOURS]
-        common = common[counts[common] > 0]
-        sums = [np.bincount(codes, channel, 1 << 15)[common] for channel in pixels.T]
-        chosen = (np.stack(sums, axis=1) / counts[common, np.newaxis]).round().astype(np.float32)
-        self._colours = np.full((_COLOURS, 4), 255, np.uint8)
-        self._colours[: len(chosen), 1:] = chosen
-        middles = (
-            np.stack(np.unravel_index(np.arange(1 << 15), (32, 32, 32)), axis=1).astype(np.float32) * 8 + 4
-        )
-        squares = (chosen**2).sum(
-            axis=1
-        ) - 2 * middles @ chosen.T  # without those of `middles`, equal in a row
-        self._nearest = squares.argmin(axis=1).astype(np.uint8)
-        self._nearest[common] = np.arange(len(common))
-        self._is_far = np.abs(chosen[self._nearest] - middles).max(axis=1) > _FAR
-        self._accepted = float(self._is_far[codes].mean()) + _MORE
+    graph = av.filter.Graph()
+    counted, shown = (graph.add("movie", filename=str(film)) for _ in range(2))
+    palette = graph.add("palettegen")
+    coloured = graph.add("paletteuse", dither="none", diff_mode="rectangle")
+    counted.link_to(palette)
+    shown.link_to(coloured)
+    palette.link_to(coloured, 0, 1)
+    coloured.link_to(graph.add("buffersink"))
+    graph.configure()
+    with contextlib.suppress(av.EOFError):
+        while True:
+            yield graph.vpull()
 
 
 def frames_of(path: Path) -> Generator[Pixels, None, None]:

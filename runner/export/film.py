@@ -19,7 +19,7 @@ import numpy as np
 from runner.drawing import palette
 from runner.drawing.raster import Pixels, font, shortened, wrapped
 from runner.environments.naming import spoken
-from runner.export.encoder import LOSSLESS, Encoder, format_of, frames_of
+from runner.export.encoder import LOSSLESS, Encoder, encoder, frames_of
 from runner.export.pictures import Picture, Pictures
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def write_film(
     `progress` is called with the number of frames that are done.
     """
     notes: list[str] = []
-    with contextlib.closing(shot.pictures), Encoder(path, format_of(path), fps) as film:
+    with contextlib.closing(shot.pictures), encoder(path, fps) as film:
         for frame in captioned(shot, width, notes):
             film.add(frame)
             progress(film.frames)
@@ -91,7 +91,6 @@ def write_grid(
     The arguments are those of `write_film`, of episodes row by row; `progress` counts the frames of single
     episodes, a `width` of None is at most `MAX_WIDTH`, and no episode has more than `max_frames`.
     """
-    form = format_of(path)
     notes: list[str] = []
     with tempfile.TemporaryDirectory(prefix="dualtaxi-film-") as folder, contextlib.ExitStack() as stack:
         films: list[Encoder] = []
@@ -108,7 +107,7 @@ def write_grid(
         rows = -(-len(films) // columns)
         canvas = np.full((rows * height, columns * each_width, 3), 255, np.uint8)
         decoded = [stack.enter_context(contextlib.closing(frames_of(one.path))) for one in films]
-        film = stack.enter_context(Encoder(path, form, fps))
+        film = stack.enter_context(encoder(path, fps))
         for _ in range(max(one.frames for one in films)):
             for place, frames in enumerate(decoded):
                 top, left = place // columns * height, place % columns * each_width
