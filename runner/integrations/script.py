@@ -92,7 +92,8 @@ class ScriptRun:
         self.settings: Json = dict(settings or {})
         self.name, self.takes_writers = name, takes_writers
         self.closed = False
-        self.has_writer = False
+        self.has_writer: bool | None = None
+        """Whether a `SummaryWriter` writes into the run; None where none is expected."""
         self.log_last: Callable[[], None] = lambda: None
         """Logs what is known at the end only; called before the run is closed."""
         self._recordings, self._has_environment = recordings, has_environment
@@ -256,11 +257,6 @@ class ScriptRun:
     def is_waiting(self) -> bool:
         """Whether no recording was begun yet."""
         return self._loop is None and not self.closed and not self._is_foreign
-
-    @property
-    def has_steps(self) -> bool:
-        """Whether values go into a recording of steps, or wait for one."""
-        return self._has_environment if self._loop is None else self._values is None
 
     @property
     def has_environment(self) -> bool:

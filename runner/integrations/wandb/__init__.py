@@ -65,8 +65,6 @@ class Tracked:
         self.script, self._id, self._is_disabled = script, own_id, is_disabled
         self.config, self.summary = Config(script, self.configure), Summary()
         script.log_last = self._log_summary
-        self.expects_writer = False
-        """Whether the script's `SummaryWriter` is to write into the run."""
         self.step = 0
         """The number of calls of `log` that were committed."""
 
@@ -182,7 +180,7 @@ class Tracked:
 
     def _end(self, status: str, error: str) -> None:
         global run  # noqa: PLW0603 - wandb.run is part of the shape
-        if self.expects_writer and not self.script.has_writer:
+        if self.script.has_writer is False:
             self.script.warn_once(
                 "sync_tensorboard: found no SummaryWriter of PyTorch or tensorboardX when init was called, "
                 "expected it to be imported before."
@@ -281,7 +279,7 @@ def init(
     run = Tracked(script, id, is_disabled)
     run.configure(config)
     if (sync_tensorboard or tensorboard) and not is_disabled:
-        script.has_writer, run.expects_writer = forward(), True
+        script.has_writer = forward()
     return run
 
 
