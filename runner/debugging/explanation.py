@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from html import escape
 from typing import Final, Literal
 
 import numpy as np
 
 from runner.analysis.compare.statistics import Estimate, bootstrap_ratio
-from runner.analysis.sections import Grid, Section, markdown
-from runner.errors import MissingExtra
+from runner.analysis.sections import Grid, Section, html
 from runner.export.plots.curves import Plot
 from runner.export.plots.mixtures import Column, bars_chart, mixtures_chart
-from runner.export.reports.rendering import partials
 from runner.util.humanize import counted, duration
 from runner.util.values import Json
 
@@ -139,15 +136,10 @@ class Explanation:
         return asdict(self)
 
     def _repr_html_(self) -> str:
-        """Return pictures and text for a notebook; text alone if Jinja2 is not installed."""
+        """Return pictures and text for a notebook."""
         first, *others = sections(self)
-        try:
-            parts = [partials().section("explain", first.title, first)]
-            parts += [f'<figure style="max-width: 46em">{plot.svg}</figure>' for plot in plots(self)]
-            parts += [partials().section(f"explain-{i}", one.title, one) for i, one in enumerate(others)]
-        except MissingExtra:
-            return f"<pre>{escape(chr(10).join(markdown([first, *others])))}</pre>"
-        return "".join(map(str, parts))
+        figures = [f'<figure style="max-width: 46em">{plot.svg}</figure>' for plot in plots(self)]
+        return "".join([html([first]), *figures, html(others)])
 
 
 # --- as text ----------------------------------------------------------------------------------------------
