@@ -24,15 +24,7 @@ def shapley_values(values: Values) -> Values:
     L. S. Shapley, "A value for n-person games", 1953. The shares of all settings, [k, columns], add up to the
     difference between the last mixture and the first, of values [2^k, columns].
     """
-    count = len(values).bit_length() - 1
-    masks = np.arange(len(values))
-    sizes = np.bitwise_count(masks)
-    shares = np.empty((count, values.shape[1]))
-    for i in range(count):
-        without = masks[masks >> i & 1 == 0]
-        weights = _weights(count)[sizes[without]]
-        shares[i] = weights @ (values[without | 1 << i] - values[without])
-    return shares
+    return np.array([_effect(values, (i,)) for i in range(len(values).bit_length() - 1)])
 
 
 def shapley_interactions(values: Values) -> dict[tuple[int, int], Values]:
@@ -42,16 +34,20 @@ def shapley_interactions(values: Values) -> dict[tuple[int, int], Values]:
     interaction among players in cooperative games", 1999, [columns] of values [2^k, columns]. It is 0 for
     settings whose effects add up.
     """
+    pairs = itertools.combinations(range(len(values).bit_length() - 1), 2)
+    return {pair: _effect(values, pair) for pair in pairs}
+
+
+def _effect(values: Values, settings: Sequence[int]) -> Values:
+    """Return what settings do together beyond what fewer of them do, averaged over the others, [columns]."""
     count = len(values).bit_length() - 1
-    masks = np.arange(len(values))
-    sizes = np.bitwise_count(masks)
-    interactions = {}
-    for i, j in itertools.combinations(range(count), 2):
-        without = masks[(masks >> i | masks >> j) & 1 == 0]
-        both = values[without | 1 << i | 1 << j] + values[without]
-        beyond = both - values[without | 1 << i] - values[without | 1 << j]
-        interactions[i, j] = _weights(count - 1)[sizes[without]] @ beyond
-    return interactions
+    beyond = values.reshape(*[2] * count, -1)  # bit i of a mixture is axis count - 1 - i
+    for i in settings:
+        beyond = np.diff(beyond, axis=count - 1 - i)
+    beyond = beyond.reshape(-1, values.shape[1])
+    sizes = np.bitwise_count(np.arange(len(beyond)))
+    averaged: Values = _weights(count + 1 - len(settings))[sizes] @ beyond
+    return averaged
 
 
 def _weights(count: int) -> Values:
