@@ -15,7 +15,18 @@ from runner.recording.reader import open_recording
 from runner.runs.importing import import_recording
 from runner.runs.listing import list_runs
 from runner.runs.run import RUN_FILE
+from tests.reliability.reading import TINY
 from tests.runner.altering import altered
+from tests.runner.recording.making import make_run
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Return a recordings folder with two runs as small as can be."""
+    folder = tmp_path_factory.mktemp("recorded")
+    for name in ("first", "second"):
+        make_run(folder, TINY, name=name)
+    return folder
 
 
 def nested(depth):
@@ -72,13 +83,15 @@ def shown(recordings, *words):
 
 def test_no_value_in_a_run_file_breaks_a_command_or_a_page(recordings, client):
     first, second = reversed(list_runs(recordings))
-    for what, facts in mutations(first.facts):
+    pages = [f"/runs/{first.run_id}{tab}" for tab in ("", "/config", "/evaluations")]
+    pages += [f"/api/v1/runs/{first.run_id}", f"/compare?run={first.run_id}&run={second.run_id}", None]
+    for k, (what, facts) in enumerate(mutations(first.facts)):  # each key has seven, each view sees two of them
         (first.folder / RUN_FILE).write_text(json.dumps(facts))
-        pages = [f"/runs/{first.run_id}{tab}" for tab in ("", "/config", "/evaluations")]
-        pages += [f"/api/v1/runs/{first.run_id}", f"/compare?run={first.run_id}&run={second.run_id}"]
-        for page in pages:
-            assert client.get(page).status_code < 500, (what, page)
-        assert shown(recordings, "show", first.run_id).exit_code == 0, what
+        for page in (pages[k % 6], pages[(k + 3) % 6]):
+            if page is None:
+                assert shown(recordings, "show", first.run_id).exit_code == 0, what
+            else:
+                assert client.get(page).status_code < 500, (what, page)
 
 
 def test_no_value_in_a_run_file_hides_the_run_or_prevents_its_removal(recordings, tmp_path):
