@@ -31,20 +31,30 @@ def lake(tmp_path_factory):
     return make_run(tmp_path_factory.mktemp("lake"), LAKE)
 
 
-@pytest.fixture(scope="module")
-def browser():
+@pytest.fixture(scope="session")
+def chromium():
     """Return Chromium, whose log holds its requests and errors."""
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service
 
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    program = shutil.which("chromium") or shutil.which("chromium-browser")
     driver = shutil.which("chromedriver")
-    if (chromium is None or driver is None) and "DUALTAXI_CI" not in os.environ:
+    if (program is None or driver is None) and "DUALTAXI_CI" not in os.environ:
         pytest.skip("needs Debian's chromium and chromium-driver")
     options = webdriver.ChromeOptions()
-    options.binary_location = chromium
+    options.binary_location = program
     for argument in ARGUMENTS:
         options.add_argument(argument)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    with webdriver.Chrome(options=options, service=Service(driver)) as browser:
-        yield browser
+    with webdriver.Chrome(options=options, service=Service(driver)) as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def browser(chromium):
+    """Return Chromium as if just started: no page open, no cookies, empty logs."""
+    chromium.get("about:blank")  # the last page still asks the server of another module, which has ended
+    chromium.execute_cdp_cmd("Network.clearBrowserCookies", {})
+    for log in ("browser", "performance"):
+        chromium.get_log(log)
+    return chromium
