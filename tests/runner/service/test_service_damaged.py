@@ -85,7 +85,9 @@ def test_no_value_in_a_run_file_breaks_a_command_or_a_page(recordings, client):
     first, second = reversed(list_runs(recordings))
     pages = [f"/runs/{first.run_id}{tab}" for tab in ("", "/config", "/evaluations")]
     pages += [f"/api/v1/runs/{first.run_id}", f"/compare?run={first.run_id}&run={second.run_id}", None]
-    for k, (what, facts) in enumerate(mutations(first.facts)):  # each key has seven, each view sees two of them
+    for k, (what, facts) in enumerate(
+        mutations(first.facts)
+    ):  # each key has seven, each view sees two of them
         (first.folder / RUN_FILE).write_text(json.dumps(facts))
         for page in (pages[k % 6], pages[(k + 3) % 6]):
             if page is None:
