@@ -10,24 +10,17 @@ Bytes that were sent before a connection broke are not sent again; the same run 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from runner.client.connection import Connection, Report
-from runner.client.jobs import JobEvent, RemoteJob, watch
-from runner.client.pull import pull
-from runner.client.uploads import UploadStatus, push
-
-if TYPE_CHECKING:
-    from runner.runs.importing import Imported
-    from runner.runs.run import Run
+from runner.client import jobs, pull, uploads
+from runner.client.connection import Connection
+from runner.client.jobs import RemoteJob
 
 
 class Client(Connection):
     """A connection to a server, with everything that can be requested of it."""
 
-    # --- jobs -----------------------------------------------------------------------------------------
+    watch = jobs.watch
+    pull = pull.pull
+    push = uploads.push
 
     def submit(self, text: str, source: str = "job.yaml", workers: int | None = None) -> RemoteJob:
         """Submit the text of a configuration or a sweep; `source` is the file's name, for messages.
@@ -50,10 +43,6 @@ class Client(Connection):
         page = self.request_object("GET", "/jobs", params={"limit": limit, "offset": offset})
         return [RemoteJob.from_json(job) for job in page["jobs"]]
 
-    def watch(self, number: int) -> Iterator[JobEvent]:
-        """Yield the events of a job until it is over; see `runner.client.jobs.watch`."""
-        return watch(self, number)
-
     def cancel(self, number: int) -> RemoteJob:
         """Cancel a job; what it has recorded stays. Errors as for `request`."""
         return RemoteJob.from_json(self.request_object("POST", f"/jobs/{number}/cancel"))
@@ -62,13 +51,3 @@ class Client(Connection):
         """Resume a failed or cancelled job; errors as for `request`."""
         options = {"params": {"accept_changes": accept_changes}}
         return RemoteJob.from_json(self.request_object("POST", f"/jobs/{number}/resume", **options))
-
-    # --- runs -----------------------------------------------------------------------------------------
-
-    def pull(self, name: str, recordings: Path, report: Report = lambda *_: None) -> Imported:
-        """Download a run into a recordings folder; see `runner.client.pull.pull`."""
-        return pull(self, name, recordings, report)
-
-    def push(self, run: Run, report: Report = lambda *_: None, begun: str = "") -> UploadStatus:
-        """Upload a run with its checkpoints; see `runner.client.uploads.push`."""
-        return push(self, run, report, begun)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
+
+from pydantic import TypeAdapter
 
 from runner.client.connection import FIRST_PAUSE, ServerUnavailable
 from runner.errors import RunnerError
@@ -18,9 +20,6 @@ if TYPE_CHECKING:
 
 OVER: Final = ("finished", "failed", "cancelled")
 """The states of a job in which nothing more happens unless a user resumes it."""
-
-EventKind = Literal["state", "run", "log", "progress"]
-"""The types of events, as they are named in a stream of events and in the server's database."""
 
 
 @dataclass(frozen=True)
@@ -100,13 +99,13 @@ class SweepProgress:
 
 JobProgress = RunProgress | SweepProgress
 EventData = StateEvent | RunEvent | LogEvent | JobProgress
-_KINDS: Final[Mapping[type[EventData], EventKind]] = {
-    StateEvent: "state",
-    RunEvent: "run",
-    LogEvent: "log",
-    RunProgress: "progress",
-    SweepProgress: "progress",
+_TYPES: Final[Mapping[str, Any]] = {
+    "state": StateEvent,
+    "run": RunEvent,
+    "log": LogEvent,
+    "progress": JobProgress,
 }
+"""The types of events, as they are named in a stream of events and in the server's database."""
 
 
 @dataclass(frozen=True)
@@ -118,9 +117,9 @@ class JobEvent:
     """Where to continue from; empty for progress."""
 
     @property
-    def kind(self) -> EventKind:
+    def kind(self) -> str:
         """The name of its type."""
-        return _KINDS[type(self.data)]
+        return next(kind for kind, types in _TYPES.items() if isinstance(self.data, types))
 
     def as_json(self) -> dict[str, object]:
         """Return its data as a JSON object, without what is unknown; `from_json` is the reverse."""
@@ -137,16 +136,8 @@ class JobEvent:
             RunnerError: it is none.
         """
         try:
-            data_type: type[EventData] = SweepProgress if "done" in values else RunProgress
-            if kind != "progress":
-                data_type = next(each for each, name in _KINDS.items() if name == kind)
-            arguments = {
-                field.name: values[field.name] for field in fields(data_type) if field.name in values
-            }
-            if arguments.get("best") is not None:
-                arguments["best"] = BestTrial(**arguments["best"])
-            return cls(data_type(**arguments), event_id)
-        except (StopIteration, TypeError) as error:
+            return cls(TypeAdapter(_TYPES[kind]).validate_python(values), event_id)
+        except (KeyError, ValueError) as error:
             raise RunnerError(f"found an event {kind[:20]!r} of a job that is not as expected.") from error
 
 
@@ -180,10 +171,9 @@ class RemoteJob:
         Raises:
             RunnerError: there is none in it.
         """
-        keys = ("number", "kind", "name", "state", "runs", "workers", "error", "progress")
         try:
-            begun = {int(run["seed"]): str(run["run_id"]) for run in response["begun"]}
-            return cls(**{key: response[key] for key in keys}, begun=begun)
+            begun = {run["seed"]: run["run_id"] for run in response["begun"]}
+            return TypeAdapter(cls).validate_python({**response, "begun": begun})
         except (KeyError, TypeError, ValueError) as error:
             raise RunnerError(
                 "found an unexpected response, expected a job; is it a dualtaxi server?"

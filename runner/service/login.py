@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from http import HTTPStatus
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
 from runner.errors import RunnerError
-from runner.export.reports.rendering import View
 from runner.service.errors import Unauthorized
 from runner.service.pages.rendering import Form, message_of, page
 from runner.service.problems import status_of
@@ -19,21 +17,12 @@ from runner.service.tokens import COOKIE, SESSION_SECONDS, Sessions, Tokens
 router = APIRouter(include_in_schema=False)
 
 
-@dataclass(frozen=True)
-class LoginView(View):
-    """The form for a token."""
-
-    TEMPLATE: ClassVar = "login.html"
-    next: str
-    problem: str = ""
-
-
 @router.get("/login")
 def ask(request: Request, next: Annotated[str, Query(max_length=4000)] = "/") -> Response:  # noqa: A002
     """Ask for a token, where one is needed."""
     if not request.app.state.settings.needs_token:
         return RedirectResponse(_local(next), HTTPStatus.SEE_OTHER)
-    return page(request, LoginView(next))
+    return page(request, "login.html", {"next": next, "problem": ""})
 
 
 @router.post("/login")
@@ -48,7 +37,8 @@ def login(request: Request, sent: Form) -> Response:
             raise Unauthorized("token: found one that is unknown, or was revoked.")
         session = sessions.begin(token)
     except RunnerError as error:
-        return page(request, LoginView(target, message_of(error, request)), status_of(error))
+        values = {"next": target, "problem": message_of(error, request)}
+        return page(request, "login.html", values, status_of(error))
     response = RedirectResponse(_local(target), HTTPStatus.SEE_OTHER)
     response.set_cookie(COOKIE, session, max_age=SESSION_SECONDS, **_cookie_options(request))
     return response

@@ -62,13 +62,8 @@ def partials() -> Any:
 
 def render(view: View) -> str:
     """Return the page of a report."""
-    return fill(templates(), view)
-
-
-def fill(environment: Environment, view: View, **shared: object) -> str:
-    """Return the HTML of a view, with values that all views of an environment share."""
     values = {field.name: getattr(view, field.name) for field in fields(view)}
-    return environment.get_template(view.TEMPLATE).render(values, **shared)
+    return templates().get_template(view.TEMPLATE).render(values)
 
 
 @functools.cache

@@ -75,7 +75,7 @@ async def diff(
     first: Annotated[bool, Query(description="Only settings, and the first step that differs.")] = False,
 ) -> Response:
     """Return what `dualtaxi diff --json` prints."""
-    left, right = await found_runs(catalogue, [a, b])
+    left, right = await run_in_threadpool(found_runs, catalogue, [a, b])
     return await compute.json(computed.difference, left, right, ignore or [], first, target or [])
 
 
@@ -93,7 +93,7 @@ async def curves(
     smooth: Smooth = 0,
 ) -> Response:
     """Return every metric over an axis, runs that differ in nothing but the seed as one curve with a band."""
-    paths = [each.recording for each in await found_runs(catalogue, run)]
+    paths = [each.recording for each in await run_in_threadpool(found_runs, catalogue, run)]
     options = (axis, metric or [], start, stop, points, lines, smooth)
     return await compute.json(computed.curves, paths, *options)
 
@@ -125,21 +125,17 @@ async def compare(
     ] = None,
 ) -> Response:
     """Return what `dualtaxi compare --json` prints; a run's name stands for all runs of that name."""
-    paths = [one.recording for one in await found_runs(catalogue, run, several=True)]
+    paths = [one.recording for one in await run_in_threadpool(found_runs, catalogue, run, several=True)]
     options = (by, metric or [], moment, target, axis, normalise)
     return await compute.json(computed.comparison, paths, *options)
 
 
-async def found_runs(catalogue: Catalogue, names: list[str], several: bool = False) -> list[Run]:
+def found_runs(catalogue: Catalogue, names: list[str], several: bool = False) -> list[Run]:
     """Return the runs of some names, their recordings restored if they are archived.
 
     With `several`, a name means all runs of that name, each once.
     """
-
-    def find() -> list[Run]:
-        if several:
-            by_folder = {run.folder: run for name in names for run in catalogue.find_all(name)}
-            return [recorded_run(run) for run in by_folder.values()]
-        return [recorded_run(catalogue.find(name)) for name in names]
-
-    return await run_in_threadpool(find)
+    if several:
+        by_folder = {run.folder: run for name in names for run in catalogue.find_all(name)}
+        return [recorded_run(run) for run in by_folder.values()]
+    return [recorded_run(catalogue.find(name)) for name in names]

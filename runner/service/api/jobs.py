@@ -17,7 +17,7 @@ from pydantic import BaseModel, Field
 from runner.client.jobs import JobEvent, JobProgress
 from runner.service.dependencies import JobsOf
 from runner.service.errors import JobNotFound, Refused
-from runner.service.jobs.checking import DEFAULT_SOURCE
+from runner.service.jobs.checking import DEFAULT_SOURCE, CheckedJob
 from runner.service.jobs.queue import JobQueue, QueueStatus
 from runner.service.jobs.store import Job, Kind, State
 from runner.service.problems import error_docs, media_docs
@@ -149,10 +149,9 @@ async def submit(
     openapi_extra=_YAML,
     summary="Check a configuration or a sweep.",
 )
-async def check(jobs: JobsOf, text: Text, source: Source = DEFAULT_SOURCE) -> CheckResponse:
+async def check(jobs: JobsOf, text: Text, source: Source = DEFAULT_SOURCE) -> CheckedJob:
     """Check the text without queueing it."""
-    checked = await jobs.checker.check(text, source)
-    return CheckResponse(kind=checked.kind, name=checked.name, runs=checked.runs, bytes=checked.bytes)
+    return await jobs.checker.check(text, source)
 
 
 @router.get("/jobs", response_model=JobsPage, summary="List the jobs, the newest first.")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from http import HTTPStatus
-from pathlib import Path
 
 from fastapi import APIRouter, Request, Response
 from starlette.concurrency import run_in_threadpool
@@ -57,17 +56,12 @@ async def queue_explanation(jobs: JobQueue, question: ExplainQuestion) -> Job:
 
 async def queue_branch(run: Run, jobs: JobQueue, question: BranchQuestion) -> Job:
     """Check a branch of training, and queue it."""
-    _require_own(run, jobs.recordings)
-    return await _queue(jobs, await jobs.checker.call(f"run {run.run_id}", check_branch, run, question))
-
-
-def _require_own(run: Run, recordings: Path) -> None:
-    """Refuse a run that jobs do not find, as they work in one folder."""
-    if run.folder.resolve().parent != recordings.resolve():
+    if run.folder.resolve().parent != jobs.recordings.resolve():  # where jobs would not find it
         raise Refused(
             HTTPStatus.CONFLICT,
             f"run {run.run_id} is in a folder that this service only reads; branch it where it was recorded.",
         )
+    return await _queue(jobs, await jobs.checker.call(f"run {run.run_id}", check_branch, run, question))
 
 
 async def _queue(jobs: JobQueue, checked: CheckedJob, workers: int | None = None) -> Job:

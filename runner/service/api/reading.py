@@ -38,7 +38,6 @@ SVG: Final = "image/svg+xml"
 DEFAULT_RECORDS: Final = 1000
 """Records in a response by default."""
 
-Count = Query(ge=0, lt=2**62)
 Start = Annotated[int, Query(ge=0, lt=2**62, description="The first, from 0.")]
 Stop = Annotated[
     int | None,

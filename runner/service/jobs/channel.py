@@ -16,6 +16,7 @@ from runner.client.jobs import JobProgress, LogEvent, RunEvent
 from runner.errors import RunnerError
 from runner.runs.listing import run_at
 from runner.runs.run import Run
+from runner.service.jobs.store import Job
 
 REPORT_SECONDS: Final = 0.25
 OTHER_OWNER_SECONDS: Final = 60.0
@@ -26,18 +27,12 @@ OTHER_OWNER_SECONDS: Final = 60.0
 class JobSpec:
     """What a worker process needs to know of a job."""
 
-    number: int
-    kind: str
-    name: str
+    job: Job
     values: dict[str, object]
     """The configuration or sweep, every value present."""
     run_ids: dict[int, str]
     """The run ids reserved for a configuration, by seed."""
     recordings: Path
-    accept_changes: bool
-    """Whether to resume runs that were started by other code."""
-    retry: bool
-    """Whether to repeat failed runs of a sweep."""
     workers: int | None
     """How many processes may train at once; None for as many as a cluster has."""
     ray: str | None

@@ -29,12 +29,12 @@ def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
     """Run what is left of a sweep."""
     sweep = from_values(spec.values)
     with _locked_sweep(spec, channel.stop):
-        exists = spec.name in sweeps_in(spec.recordings)
-        state.begin(sweep, spec.recordings, resume=exists, accept_changes=spec.accept_changes)
-        if spec.retry:
-            state.forget_failures(spec.name, spec.recordings)
-        wait_for_owners(state.runs_of(spec.name, spec.recordings).values(), channel.stop)
-        before = len(state.runs_of(spec.name, spec.recordings))
+        exists = spec.job.name in sweeps_in(spec.recordings)
+        state.begin(sweep, spec.recordings, resume=exists, accept_changes=spec.job.accept_changes)
+        if spec.job.retry:
+            state.forget_failures(spec.job.name, spec.recordings)
+        wait_for_owners(state.runs_of(spec.job.name, spec.recordings).values(), channel.stop)
+        before = len(state.runs_of(spec.job.name, spec.recordings))
         plan = plan_of(sweep)
         require_disk(plan, before, spec.recordings)
         reporter = _SweepReporter(channel)
@@ -47,7 +47,7 @@ def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
                 stop=channel.stop,
                 report=reporter.report,
                 limit=limit_of(sweep.file.limits, plan, spec.recordings, before),
-                accept_changes=spec.accept_changes,
+                accept_changes=spec.job.accept_changes,
             )
         reporter.send(status)
     if status.stopped == INTERRUPTED and channel.stop():
@@ -66,7 +66,7 @@ def _locked_sweep(spec: JobSpec, stop: Callable[[], bool]) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         while True:
             try:
-                stack.enter_context(state.locked(spec.name, spec.recordings))
+                stack.enter_context(state.locked(spec.job.name, spec.recordings))
                 break
             except state.SweepBusy:
                 if time.monotonic() > deadline or stop():

@@ -48,7 +48,7 @@ def work(pipe: Connection, spec: JobSpec) -> None:
     signal.signal(signal.SIGTERM, channel.request_stop)
     try:
         with announced(lambda: channel.send((LogEvent(MESSAGE),))):
-            run = {"sweep": run_sweep_job, "explain": run_explain_job}.get(spec.kind, run_config_job)
+            run = {"sweep": run_sweep_job, "explain": run_explain_job}.get(spec.job.kind, run_config_job)
             outcome = run(spec, channel)
     except RunnerError as error:
         message = "\n".join([str(error), *getattr(error, "__notes__", [])])
@@ -74,11 +74,11 @@ def run_seed(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed:
     if run is not None:
         wait_for_owners([run], channel.stop)
         reporter = Reporter(channel, run.run_id, config, seed)
-        run = resume(run, spec.accept_changes, reporter.report, channel.stop)
+        run = resume(run, spec.job.accept_changes, reporter.report, channel.stop)
     else:
         job = Job(config, seed)
-        parent = _parent_of(job, spec.recordings) if spec.kind == "branch" else None
-        run = create_run(spec.recordings, config, seed, spec.name, spec.run_ids[seed], parent)
+        parent = _parent_of(job, spec.recordings) if spec.job.kind == "branch" else None
+        run = create_run(spec.recordings, config, seed, spec.job.name, spec.run_ids[seed], parent)
         reporter = Reporter(channel, run.run_id, config, seed)
         if parent is None:
             run = run_job(job, run, reporter.report, channel.stop)

@@ -155,14 +155,10 @@ class WorkerPool:
         """Start the worker process of a job."""
         values = self._store.values(job.number)
         spec = JobSpec(
-            number=job.number,
-            kind=job.kind,
-            name=job.name,
+            job=job,
             values=values,
             run_ids=self._reserved_runs(job, values),
             recordings=self._store.recordings,
-            accept_changes=job.accept_changes,
-            retry=job.retry,
             workers=self._needed(job) if self._ray is None else None,
             ray=self._ray,
         )

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from http import HTTPStatus
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
@@ -18,26 +17,16 @@ from runner.runs.run import Run
 from runner.service.api.questions import queue_branch
 from runner.service.dependencies import JobsOf, RecordedRun
 from runner.service.jobs.checking import BranchQuestion
-from runner.service.pages.frame import RunView, head_of
-from runner.service.pages.rendering import Form, message_of, number_in, page
+from runner.service.pages.frame import run_page
+from runner.service.pages.rendering import Form, message_of, number_in
 
 router = APIRouter(prefix="/runs/{run}/branch", include_in_schema=False)
-
-
-@dataclass(frozen=True)
-class _BranchView(RunView):
-    TEMPLATE: ClassVar = "run_branch.html"
-    form: Mapping[str, str]
-    """The fields as they were sent."""
-    actions: dict[str, list[str]]
-    """The names of each agent's own actions."""
-    problem: str = ""
 
 
 @router.get("")
 def form(request: Request, run: RecordedRun, at: Annotated[str, Query(max_length=60)] = "") -> Response:
     """Show the form for a step."""
-    return page(request, _view(run, {"at": at}))
+    return _page(request, run, {"at": at})
 
 
 @router.post("")
@@ -47,8 +36,7 @@ async def branch(request: Request, run: RecordedRun, sent: Form, jobs: JobsOf) -
     try:
         job = await queue_branch(run, jobs, _question(given))
     except RunnerError as error:
-        view = await run_in_threadpool(_view, run, given, message_of(error, request))
-        return await run_in_threadpool(page, request, view, HTTPStatus.UNPROCESSABLE_ENTITY)
+        return await run_in_threadpool(_page, request, run, given, message_of(error, request))
     return RedirectResponse(f"/queue/{job.number}", HTTPStatus.SEE_OTHER)
 
 
@@ -67,9 +55,12 @@ def _question(given: Mapping[str, str]) -> BranchQuestion:
     )
 
 
-def _view(run: Run, fields: Mapping[str, str], problem: str = "") -> _BranchView:
+def _page(request: Request, run: Run, fields: Mapping[str, str], problem: str = "") -> Response:
+    """Return the form with the fields as they were sent, and the names of each agent's own actions."""
     with open_recording(run.recording) as recording:
         recording.require_job("a branch of training", "`dualtaxi branch` plays an episode of a loop on.")
         mdp = recording.mdp
     actions = dict(zip(mdp.agents, numbered_actions(mdp), strict=True))
-    return _BranchView(head_of(run), "replay", fields, actions, problem)
+    values = {"form": fields, "actions": actions, "problem": problem}
+    status = HTTPStatus.UNPROCESSABLE_ENTITY if problem else HTTPStatus.OK
+    return run_page(request, run, "replay", "run_branch.html", values, status)

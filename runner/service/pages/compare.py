@@ -5,20 +5,18 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Final
+from typing import Annotated, Final
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.axes import EPISODES
 from runner.analysis.diff.sections import made_sections
 from runner.analysis.groups import flat_config
-from runner.analysis.sections import Section
 from runner.analysis.step_reference import StepRef
 from runner.errors import RunnerError
 from runner.export.plots.comparisons import letter
-from runner.export.reports.rendering import View
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
@@ -30,7 +28,7 @@ from runner.service.dependencies import CatalogueOf, ComputationOf
 from runner.service.fragments import ShownDifference
 from runner.service.pages.frame import RunHead, has_tables, head_of, last_evaluation, result_of
 from runner.service.pages.rendering import page
-from runner.service.pages.replay import Panel, panel_of
+from runner.service.pages.replay import panel_of
 from runner.util import humanize
 from runner.util.humanize import counted
 
@@ -47,7 +45,6 @@ MAX_LATEST: Final = 4
 """Runs whose latest episodes a page replays."""
 MAX_RUNS: Final = 60
 """Runs that a page compares."""
-Names = Annotated[list[str] | None, Query(max_length=100)]
 Scores = Annotated[str, Query(max_length=MAX_SCORES)]
 Rows = list[tuple[str, list[str]]]
 """Rows of a table: a name, and the value of each run."""
@@ -90,154 +87,101 @@ class Compared:
         return [{"id": run.head.id, "label": run.label} for run in self.runs]
 
 
-@dataclass(frozen=True)
-class CompareView(View):
-    """A page of a comparison."""
+def chosen_runs(
+    catalogue: CatalogueOf, run: Annotated[list[str] | None, Query(max_length=100)] = None
+) -> list[Run]:
+    """Return the runs to compare.
 
-    compared: Compared
-
-
-@dataclass(frozen=True)
-class _OverviewView(CompareView):
-    TEMPLATE: ClassVar = "compare_overview.html"
-    differing: Rows
-    results: Rows
-    same: bool
-    """Whether the content of all runs is the same."""
-    running: list[ComparedRun]
-    """The runs whose latest episodes replay by themselves."""
-    scores: str
-    """A table of scores as CSV; empty without one."""
-    tasks: str
-    """Address of the comparison over environments; empty where there is one environment."""
+    Raises:
+        RunnerError: there are fewer than two of them, or too many.
+    """
+    names = list(dict.fromkeys(run or []))
+    if not 2 <= len(names) <= MAX_RUNS:
+        raise RunnerError(
+            f"found {counted(len(names), 'run')}, expected 2 to {MAX_RUNS}: select them in the table of runs."
+        )
+    return found_runs(catalogue, names)
 
 
-@dataclass(frozen=True)
-class _DivergenceView(CompareView):
-    TEMPLATE: ClassVar = "compare_divergence.html"
-    found: ShownDifference
+ChosenRuns = Annotated[list[Run], Depends(chosen_runs)]
 
 
-@dataclass(frozen=True)
-class _TablesView(CompareView):
-    TEMPLATE: ClassVar = "compare_tables.html"
-    body: str
+def two_runs(runs: ChosenRuns) -> list[Run]:
+    """Return the two runs to compare step by step."""
+    if len(runs) != 2:
+        raise RunnerError(
+            f"found {counted(len(runs), 'run')}, expected two: only two are compared step by step."
+        )
+    return runs
 
 
-@dataclass(frozen=True)
-class _CodeView(CompareView):
-    TEMPLATE: ClassVar = "compare_code.html"
-    lead: str
-    code: Section
-    provenance: Section
-
-
-@dataclass(frozen=True)
-class _ReplaysView(CompareView):
-    TEMPLATE: ClassVar = "compare_replay.html"
-    shown: list[Panel]
-    episode: str
-    prefix: str
-    """The reference of the episode, without its step."""
-    t: int
-    before: str
-    after: str
-    base: str
+TwoRuns = Annotated[list[Run], Depends(two_runs)]
 
 
 @router.get("")
-async def overview(
-    request: Request, catalogue: CatalogueOf, run: Names = None, scores: Scores = ""
-) -> Response:
+def overview(request: Request, runs: ChosenRuns, scores: Scores = "") -> Response:
     """Show the differences of runs, and their curves in common plots."""
-    runs = await _chosen(catalogue, run)
-
-    def show() -> Response:
-        settings = [{**({"seed": str(each.seed)} if each.has_seed else {}), **_flat(each)} for each in runs]
-        rows = [
-            (key, [each.get(key, humanize.UNKNOWN) for each in settings])
-            for key in dict.fromkeys(key for each in settings for key in each)
-        ]
-        digests = {each.summary.content_digest for each in runs}
-        compared = _compared(runs, "")
-        view = _OverviewView(
-            compared,
-            differing=[(key, values) for key, values in rows if len(set(values)) > 1],
-            results=_results(runs),
-            same=len(digests) == 1 and None not in digests,
-            running=[each for each in compared.runs if each.head.status == "running"][:MAX_LATEST],
-            scores=scores,
-            tasks=_tasks_address(runs, scores),
-        )
-        return page(request, view)
-
-    return await run_in_threadpool(show)
-
-
-def _tasks_address(runs: list[Run], scores: str) -> str:
-    environments = {json.dumps(run.file.config.get("env"), sort_keys=True) for run in runs}
-    query: dict[str, object] = {"run": [run.run_id for run in runs]} | ({"scores": scores} if scores else {})
-    return link("/compare/tasks", query) if len(environments) > 1 else ""
+    settings = [{**({"seed": str(each.seed)} if each.has_seed else {}), **_flat(each)} for each in runs]
+    rows = [
+        (key, [each.get(key, humanize.UNKNOWN) for each in settings])
+        for key in dict.fromkeys(key for each in settings for key in each)
+    ]
+    digests = {each.summary.content_digest for each in runs}
+    environments = {json.dumps(each.file.config.get("env"), sort_keys=True) for each in runs}
+    tasks_address = link("/compare/tasks", {"run": [each.run_id for each in runs], "scores": scores})
+    compared = _compared(runs, "")
+    values = {
+        "compared": compared,
+        "differing": [(key, values) for key, values in rows if len(set(values)) > 1],
+        "results": _results(runs),
+        "same": len(digests) == 1 and None not in digests,
+        # The latest episodes of these replay by themselves.
+        "running": [each for each in compared.runs if each.head.status == "running"][:MAX_LATEST],
+        "scores": scores,
+        "tasks": tasks_address if len(environments) > 1 else "",
+    }
+    return page(request, "compare_overview.html", values)
 
 
 @router.get("/tasks")
 async def tasks(
-    catalogue: CatalogueOf,
-    compute: ComputationOf,
-    run: Names = None,
-    scores: Scores = "",
-    axis: AxisName = EPISODES.name,
+    runs: ChosenRuns, compute: ComputationOf, scores: Scores = "", axis: AxisName = EPISODES.name
 ) -> Response:
     """Return the comparison over environments by normalised scores, as a part of the page."""
-    paths = [each.recording for each in await _chosen(catalogue, run)]
+    paths = [each.recording for each in runs]
     return HTMLResponse(await compute(fragments.tasks, paths, axis, scores))
 
 
 @router.get("/divergence")
-async def divergence(
-    request: Request, catalogue: CatalogueOf, compute: ComputationOf, run: Names = None
-) -> Response:
+async def divergence(request: Request, runs: TwoRuns, compute: ComputationOf) -> Response:
     """Show the first step at which two runs differ, and the cause."""
-    runs = _two(await _chosen(catalogue, run))
     difference = await compute.shown(ShownDifference, fragments.difference, *runs)
-    compared = _compared(runs, "/divergence")
-    view = _DivergenceView(compared, difference)
-    return await run_in_threadpool(page, request, view)
+    values = {"compared": _compared(runs, "/divergence"), "found": difference}
+    return await run_in_threadpool(page, request, "compare_divergence.html", values)
 
 
 @router.get("/tables")
-async def tables(
-    request: Request, catalogue: CatalogueOf, compute: ComputationOf, run: Names = None
-) -> Response:
+async def tables(request: Request, runs: TwoRuns, compute: ComputationOf) -> Response:
     """Show the difference of the Q-tables of two runs."""
-    runs = _two(await _chosen(catalogue, run))
     body = (await compute.shown(ShownDifference, fragments.difference, *runs)).tables
-    return await run_in_threadpool(page, request, _TablesView(_compared(runs, "/tables"), body))
+    values = {"compared": _compared(runs, "/tables"), "body": body}
+    return await run_in_threadpool(page, request, "compare_tables.html", values)
 
 
 @router.get("/code")
-async def code(request: Request, catalogue: CatalogueOf, run: Names = None) -> Response:
+def code(request: Request, runs: TwoRuns) -> Response:
     """Show how the code of two runs differs, and how else they were made."""
-    runs = _two(await _chosen(catalogue, run))
-
-    def show() -> Response:
-        with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
-            made, files, changes = made_sections(a, b)
-        return page(request, _CodeView(_compared(runs, "/code"), made, files, changes))
-
-    return await run_in_threadpool(show)
+    with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
+        lead, files, provenance = made_sections(a, b)
+    values = {"compared": _compared(runs, "/code"), "lead": lead, "code": files, "provenance": provenance}
+    return page(request, "compare_code.html", values)
 
 
 @router.get("/replay")
 async def replay(
-    request: Request,
-    catalogue: CatalogueOf,
-    compute: ComputationOf,
-    run: Names = None,
-    at: Annotated[str, Query(max_length=60)] = "",
+    request: Request, runs: TwoRuns, compute: ComputationOf, at: Annotated[str, Query(max_length=60)] = ""
 ) -> Response:
     """Show an episode of two runs, in step; by default the one in which they diverge."""
-    runs = _two(await _chosen(catalogue, run))
     if at:
         step = StepRef.parse(at)
     else:
@@ -257,41 +201,19 @@ async def replay(
             with open_recording(one.recording) as recording:
                 phase = "train" if place.after is None else "eval"
                 shown.append(panel_of(recording, phase, source, one.label, one.number))
-        view = _ReplaysView(
-            head,
-            shown=shown,
-            episode=step.episode_name,
-            prefix=step.episode_text,
-            t=step.t,
-            before=neighbour(-1),
-            after=neighbour(1),
-            base=link("/compare/replay", {"run": names}),
-        )
-        return page(request, view)
+        values = {
+            "compared": head,
+            "shown": shown,
+            "episode": step.episode_name,
+            "prefix": step.episode_text,
+            "t": step.t,
+            "before": neighbour(-1),
+            "after": neighbour(1),
+            "base": link("/compare/replay", {"run": names}),
+        }
+        return page(request, "compare_replay.html", values)
 
     return await run_in_threadpool(show)
-
-
-async def _chosen(catalogue: CatalogueOf, names: list[str] | None) -> list[Run]:
-    """Return the runs to compare.
-
-    Raises:
-        RunnerError: there are fewer than two of them, or too many.
-    """
-    names = list(dict.fromkeys(names or []))
-    if not 2 <= len(names) <= MAX_RUNS:
-        raise RunnerError(
-            f"found {counted(len(names), 'run')}, expected 2 to {MAX_RUNS}: select them in the table of runs."
-        )
-    return await found_runs(catalogue, names)
-
-
-def _two(runs: list[Run]) -> list[Run]:
-    if len(runs) != 2:
-        raise RunnerError(
-            f"found {counted(len(runs), 'run')}, expected two: only two are compared step by step."
-        )
-    return runs
 
 
 def _compared(runs: list[Run], here: str) -> Compared:

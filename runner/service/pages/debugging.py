@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from http import HTTPStatus
-from typing import Annotated, ClassVar, Final
+from typing import Annotated, Final
 
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
@@ -18,9 +17,9 @@ from runner.service.api.debugging import At
 from runner.service.api.replay import STEPS
 from runner.service.dependencies import ComputationOf, OpenRecording, RecordedRun
 from runner.service.fragments import ShownBranches, ShownWhen
-from runner.service.pages.frame import RunView, head_of
-from runner.service.pages.rendering import message_of, page
-from runner.service.pages.replay import BEFORE, Stage, T, stage_of
+from runner.service.pages.frame import run_page
+from runner.service.pages.rendering import message_of
+from runner.service.pages.replay import BEFORE, T, stage_of
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 
@@ -31,17 +30,6 @@ WHY_STEPS: Final = 30
 StepField = Annotated[str, Query(max_length=40)]
 Name = Annotated[str, Query(max_length=1000)]
 Action = Annotated[str, Field(max_length=200)]
-
-
-@dataclass(frozen=True)
-class _WhenView(RunView):
-    TEMPLATE: ClassVar = "run_when.html"
-    expression: str
-    every: bool
-    first: str
-    last: str
-    found: ShownWhen | None = None
-    problem: str = ""
 
 
 @router.get("/when")
@@ -55,27 +43,17 @@ async def when(
     last: Annotated[StepField, Query(alias="to")] = "",
 ) -> Response:
     """Show the form, and the steps after which its expression holds."""
-    form = (head_of(run), "when", expression, every, first, last)
-    if not expression.strip():
-        return page(request, _WhenView(*form))
-    options = (expression, every, first or None, last or None, INTERVALS)
-    try:
-        result = await compute.shown(ShownWhen, fragments.when, run.recording, *options)
-    except RunnerError as error:
-        return page(request, _WhenView(*form, None, message_of(error, request)), HTTPStatus.BAD_REQUEST)
-    return page(request, _WhenView(*form, result))
-
-
-@dataclass(frozen=True)
-class _WhyView(RunView):
-    TEMPLATE: ClassVar = "run_why.html"
-    learners: tuple[str, ...]
-    state: str
-    action: str
-    agent: str
-    at: str
-    body: str
-    problem: str
+    found, problem = None, ""
+    if expression.strip():
+        options = (expression, every, first or None, last or None, INTERVALS)
+        try:
+            found = await compute.shown(ShownWhen, fragments.when, run.recording, *options)
+        except RunnerError as error:
+            problem = message_of(error, request)
+    form = {"expression": expression, "every": every, "first": first, "last": last}
+    values = {**form, "found": found, "problem": problem}
+    status = HTTPStatus.BAD_REQUEST if problem else HTTPStatus.OK
+    return run_page(request, run, "when", "run_when.html", values, status)
 
 
 @router.get("/why")
@@ -97,21 +75,10 @@ async def why(
             body = await compute(fragments.why, run.recording, *given, WHY_STEPS, alone=True)
         except RunnerError as error:
             problem = message_of(error, request)
-    view = _WhyView(head_of(run), "why", recording.agents, state, action, agent, at, body.decode(), problem)
-    return page(request, view, HTTPStatus.BAD_REQUEST if problem else HTTPStatus.OK)
-
-
-@dataclass(frozen=True)
-class _WhatIfView(RunView):
-    TEMPLATE: ClassVar = "run_what_if.html"
-    at: str
-    title: str
-    found: ShownBranches
-    stage: Stage
-    source: str
-    """Address of the branch's data."""
-    recorded: str
-    """Address of the recorded episode at the step."""
+    form = {"state": state, "action": action, "agent": agent, "at": at}
+    values = {**form, "learners": recording.agents, "body": body.decode(), "problem": problem}
+    status = HTTPStatus.BAD_REQUEST if problem else HTTPStatus.OK
+    return run_page(request, run, "why", "run_why.html", values, status)
 
 
 @router.get("/what-if/{at}")
@@ -131,16 +98,14 @@ async def what_if(
     branches = await compute.shown(ShownBranches, fragments.what_if_page, run, step, action, start, STEPS)
 
     def show() -> Response:
-        view = _WhatIfView(
-            run=head_of(run),
-            here="replay",
-            at=str(step),
-            title=f"What if? {step.episode_name}, step {step.t:,}",
-            found=branches,
-            stage=stage_of(branches.part, shown_t),
-            source=f"/api/v1/runs/{run.run_id}/what-if/{step}/{branches.action}",
-            recorded=f"/runs/{run.run_id}/replay/{step.episode_path}?t={step.t}",
-        )
-        return page(request, view)
+        values = {
+            "at": str(step),
+            "title": f"What if? {step.episode_name}, step {step.t:,}",
+            "found": branches,
+            "stage": stage_of(branches.part, shown_t),
+            "source": f"/api/v1/runs/{run.run_id}/what-if/{step}/{branches.action}",
+            "recorded": f"/runs/{run.run_id}/replay/{step.episode_path}?t={step.t}",
+        }
+        return run_page(request, run, "replay", "run_what_if.html", values)
 
     return await run_in_threadpool(show)

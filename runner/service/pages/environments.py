@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import ClassVar, Final
+from dataclasses import replace
+from typing import Final
 
 from fastapi import APIRouter, Depends, Request, Response
 
@@ -13,29 +13,14 @@ from runner.export.episodes import EpisodePlace, place_of
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.dependencies import EPISODES, RecordedRun
-from runner.service.pages.frame import RunView, head_of
-from runner.service.pages.rendering import page
-from runner.service.pages.replay import Panel, T, panel_of
+from runner.service.pages.frame import run_page
+from runner.service.pages.replay import T, panel_of
 from runner.util.humanize import capitalised
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
 
 MAX_PANELS: Final = 8
 """Environments of a vector that a page shows side by side."""
-
-
-@dataclass(frozen=True)
-class _EnvironmentsView(RunView):
-    TEMPLATE: ClassVar = "run_environments.html"
-    title: str
-    alone: str
-    """Address of the replay of the episode alone."""
-    shown: list[Panel]
-    length: int
-    """Steps of the episode."""
-    t: int
-    left_out: int
-    """Environments that are not shown."""
 
 
 def _add_route(path: str, episode: Callable[..., StepRef]) -> None:
@@ -47,15 +32,16 @@ def _add_route(path: str, episode: Callable[..., StepRef]) -> None:
         t: T = 0,
     ) -> Response:
         """Show all environments of a vector during an episode of one of them."""
-        return page(request, _environments(run, replace(at, t=t)))
+        values = _environments(run, replace(at, t=t))
+        return run_page(request, run, "replay", "run_environments.html", values)
 
 
 for _path, _episode in EPISODES.items():
     _add_route(_path, _episode)
 
 
-def _environments(run: Run, at: StepRef) -> _EnvironmentsView:
-    """Return the page of an episode and those of the other environments at its first step."""
+def _environments(run: Run, at: StepRef) -> dict[str, object]:
+    """Return the values of the page of an episode and those of the other environments at its first step."""
     base = f"/runs/{run.run_id}/replay"
     with open_recording(run.recording) as recording:
         place = place_of(recording, at.which)
@@ -76,16 +62,14 @@ def _environments(run: Run, at: StepRef) -> _EnvironmentsView:
                 address=f"{base}/{path}",
             )
             panels.append(panel)
-        return _EnvironmentsView(
-            run=head_of(run),
-            here="replay",
-            title=capitalised(place.title),
-            alone=f"{base}/{at.episode_path}",
-            shown=panels,
-            length=len(span),
-            t=min(at.t, len(span)),
-            left_out=max(0, recording.environments - len(panels)),
-        )
+        return {
+            "title": capitalised(place.title),
+            "alone": f"{base}/{at.episode_path}",  # the replay of the episode alone
+            "shown": panels,
+            "length": len(span),
+            "t": min(at.t, len(span)),
+            "left_out": max(0, recording.environments - len(panels)),
+        }
 
 
 def _episodes_at(recording: Recording, place: EpisodePlace, span: range) -> list[tuple[int, int]]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 
@@ -16,8 +15,7 @@ from runner.environments.naming import event_in_words
 from runner.recording.reader import Recording
 from runner.service.addresses import Paging, link
 from runner.service.dependencies import OpenRecording, RecordedRun
-from runner.service.pages.frame import RunView, head_of
-from runner.service.pages.rendering import page
+from runner.service.pages.frame import run_page
 from runner.util.humanize import number_column
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
@@ -25,17 +23,6 @@ router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 ROWS: Final = 100
 _HIDDEN: Final = ("episode", "success", "terminated", "truncated", "last_step")
 """Columns that the page does not show as they are."""
-
-
-@dataclass(frozen=True)
-class _EpisodesView(RunView):
-    TEMPLATE: ClassVar = "run_episodes.html"
-    phase: str
-    total: int
-    paging: Paging
-    grid: Grid
-    links: list[str]
-    """Address of the replay of each row."""
 
 
 @router.get("/episodes")
@@ -64,8 +51,9 @@ def episodes(
     headings = ["episode" if phase == "train" else "trial", "end", *headings]
     links = [f"/runs/{run.run_id}/replay/{path}" for path in paths]
     paging = Paging(number, total, ROWS, link(f"/runs/{run.run_id}/episodes", {"phase": phase}))
-    view = _EpisodesView(head_of(run), "episodes", phase, total, paging, Grid(tuple(headings), rows), links)
-    return page(request, view)
+    grid = Grid(tuple(headings), rows)
+    shown = {"phase": phase, "total": total, "paging": paging, "grid": grid, "links": links}
+    return run_page(request, run, "episodes", "run_episodes.html", shown)
 
 
 def _heading(column: str, agents: int) -> str:

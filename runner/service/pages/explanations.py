@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from http import HTTPStatus
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
-from runner.analysis.sections import Section
 from runner.analysis.step_reference import StepRef
 from runner.debugging.explain import DEFAULT_SEEDS
 from runner.debugging.explanation import Explanation, plots, sections
 from runner.errors import RunnerError
-from runner.export.plots.curves import Plot
-from runner.export.reports.rendering import Link, View
+from runner.export.reports.rendering import Link
 from runner.service.api.comparing import Part, found_explanation
 from runner.service.api.questions import queue_explanation
 from runner.service.dependencies import JobsOf, SettingsOf
@@ -28,28 +24,10 @@ router = APIRouter(include_in_schema=False)
 Name = Annotated[str, Query(max_length=200)]
 
 
-@dataclass(frozen=True)
-class _ExplanationView(View):
-    TEMPLATE: ClassVar = "explanation.html"
-    title: str
-    lead: list[str]
-    links: Sequence[Link]
-    plots: Sequence[Plot]
-    results: Sequence[Section]
-
-
-@dataclass(frozen=True)
-class _ExplainView(View):
-    TEMPLATE: ClassVar = "explain.html"
-    form: Mapping[str, str]
-    """The fields as they were sent."""
-    problem: str = ""
-
-
 @router.get("/explain")
 def form(request: Request, a: Name = "", b: Name = "") -> Response:
     """Show the form."""
-    return page(request, _ExplainView({"a": a, "b": b}))
+    return page(request, "explain.html", {"form": {"a": a, "b": b}, "problem": ""})
 
 
 @router.post("/explain")
@@ -67,8 +45,8 @@ async def explain(request: Request, sent: Form, jobs: JobsOf) -> Response:
         )
         job = await queue_explanation(jobs, question)
     except RunnerError as error:
-        view = _ExplainView(given, message_of(error, request))
-        return await run_in_threadpool(page, request, view, HTTPStatus.UNPROCESSABLE_ENTITY)
+        values = {"form": given, "problem": message_of(error, request)}
+        return await run_in_threadpool(page, request, "explain.html", values, HTTPStatus.UNPROCESSABLE_ENTITY)
     return RedirectResponse(f"/queue/{job.number}", HTTPStatus.SEE_OTHER)
 
 
@@ -77,9 +55,8 @@ def explanation(request: Request, pair: Part, metric: Part, settings: SettingsOf
     """Show an explanation."""
     result = found_explanation(pair, metric, settings)
     first, *others = sections(result)
-    return page(
-        request, _ExplanationView(first.title, first.sentences, _links(result), plots(result), others)
-    )
+    values = {"title": first.title, "lead": first.sentences, "links": _links(result)}
+    return page(request, "explanation.html", {**values, "plots": plots(result), "results": others})
 
 
 def _links(found: Explanation) -> list[Link]:

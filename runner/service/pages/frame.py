@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass
+from http import HTTPStatus
 from typing import Final
+
+from fastapi import Request, Response
 
 from runner.analysis.evaluations import loop_summary
 from runner.analysis.qtable import recorded_tables
 from runner.errors import RecordingError
-from runner.export.reports.rendering import View
 from runner.recording import schema
 from runner.recording.composition import composition_of
 from runner.recording.description import has_environment
@@ -17,6 +20,7 @@ from runner.recording.metrics import EvaluationMetric
 from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics, Summary
 from runner.runs.run import Run
+from runner.service.pages.rendering import page
 from runner.util import humanize
 
 TABS: Final = (
@@ -50,13 +54,16 @@ class RunHead:
     tabs: tuple[tuple[str, str], ...]
 
 
-@dataclass(frozen=True)
-class RunView(View):
-    """A page of a run."""
-
-    run: RunHead
-    here: str
-    """Path of its tab."""
+def run_page(
+    request: Request,
+    run: Run,
+    here: str,
+    template: str,
+    values: Mapping[str, object],
+    status: HTTPStatus = HTTPStatus.OK,
+) -> Response:
+    """Return a page of a run; `here` is the path of its tab."""
+    return page(request, template, {"run": head_of(run), "here": here, **values}, status)
 
 
 def head_of(run: Run) -> RunHead:

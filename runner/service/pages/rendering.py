@@ -1,4 +1,4 @@
-"""Pages and the forms that they send: templates filled with typed views, also for errors."""
+"""Pages and the forms that they send: filled templates, also for errors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from http import HTTPStatus
 from importlib.resources import files
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, Final
 from urllib.parse import parse_qsl
 
 import jinja2
@@ -18,7 +18,7 @@ from markupsafe import Markup
 
 from runner.errors import RunnerError
 from runner.export.reports.rendering import TEMPLATES as REPORT_TEMPLATES
-from runner.export.reports.rendering import View, code, environment_of, fill
+from runner.export.reports.rendering import code, environment_of
 from runner.service import problems
 from runner.service.addresses import link
 from runner.service.pages import static
@@ -45,22 +45,17 @@ class Viewer:
     can_write: bool
 
 
-@dataclass(frozen=True)
-class _ProblemView(View):
-    TEMPLATE: ClassVar = "problem.html"
-    title: str
-    message: str
-
-
-def page(request: Request, view: View, status: HTTPStatus = HTTPStatus.OK) -> Response:
-    """Return the page of a view as the response to a request."""
-    body = render(request.url.path, view, viewer_of(request))
+def page(
+    request: Request, template: str, values: Mapping[str, object], status: HTTPStatus = HTTPStatus.OK
+) -> Response:
+    """Return a template filled with values as the response to a request."""
+    body = render(request.url.path, viewer_of(request), template, values)
     return Response(body, status, media_type="text/html")
 
 
-def render(path: str, view: View, viewer: Viewer) -> bytes:
+def render(path: str, viewer: Viewer, template: str, values: Mapping[str, object]) -> bytes:
     """Return the HTML of a page at a path."""
-    return fill(templates(), view, path=path, viewer=viewer).encode()
+    return templates().get_template(template).render(values, path=path, viewer=viewer).encode()
 
 
 def viewer_of(request: Request) -> Viewer:
@@ -154,7 +149,8 @@ def _error_page(request: Request, response: Response) -> Response:
         return response
     status = HTTPStatus(response.status_code)
     message = json.loads(bytes(response.body))["error"]["message"]
-    error_page = page(request, _ProblemView(status.phrase.capitalize(), message), status)
+    values = {"title": status.phrase.capitalize(), "message": message}
+    error_page = page(request, "problem.html", values, status)
     headers = {key: value for key, value in response.headers.items() if not key.startswith("content-")}
     error_page.headers.update(headers)
     return error_page

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from itertools import islice
-from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import RedirectResponse
@@ -19,7 +19,7 @@ from runner.analysis.step_reference import StepRef, reference_to
 from runner.drawing import svg
 from runner.errors import RunnerError
 from runner.export.encoded import picture_note
-from runner.export.reports.rendering import Link, View
+from runner.export.reports.rendering import Link
 from runner.recording.reader import Recording, open_recording
 from runner.runs.branches import BranchOrigin, Origin, origin_in
 from runner.runs.run import Run
@@ -28,7 +28,7 @@ from runner.service.addresses import link
 from runner.service.api.replay import STEPS, prepare_pictures
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import EPISODES, CatalogueOf, ComputationOf, PicturesOf, RecordedRun
-from runner.service.pages.frame import RunView, head_of
+from runner.service.pages.frame import run_page
 from runner.service.pages.rendering import message_of, page
 from runner.util.values import JsonView
 
@@ -95,39 +95,6 @@ class Evaluation(NamedTuple):
     trials: int
 
 
-@dataclass(frozen=True)
-class _ReplayView(RunView):
-    TEMPLATE: ClassVar = "run_replay.html"
-    which: tuple[int, ...]
-    """(episode,) of training, or (training episodes before, trial) of an evaluation."""
-    stage: Stage | None
-    problem: str
-    episodes: int
-    """Training episodes of the run."""
-    evaluations: list[Evaluation]
-    before: str
-    after: str
-    """Addresses of the episodes before and after this one; may be empty."""
-    source: str
-    """Address of the episode's data."""
-    reference: str
-    """Reference of the episode, without its step."""
-    episode_path: str
-    """Path of the episode below the replays."""
-    environments: int
-    """How many environments take turns."""
-    what_if: str
-    """Address of the actions at a step, without its `:T`; empty for loops."""
-    branches: list[Link]
-    """This run next to its parent, and to its branches."""
-
-
-@dataclass(frozen=True)
-class _LatestView(View):
-    TEMPLATE: ClassVar = "latest.html"
-    panel: Panel
-
-
 @router.get("")
 async def chosen_replay(
     run: RecordedRun,
@@ -170,7 +137,7 @@ async def latest(
             panel = panel_of(
                 recording, "train", f"/api/v1{address}", label, None, address=address, episode=path
             )
-        return page(request, _LatestView(panel))
+        return page(request, "latest.html", {"panel": panel})
 
     return await run_in_threadpool(show)
 
@@ -199,9 +166,10 @@ def _add_route(path: str, episode: Callable[..., StepRef]) -> None:
             with open_recording(run.recording) as recording:
                 branches = _branches(recording, run, catalogue)
             if isinstance(part, RunnerError):
-                view = _view(run, at, branches, None, message_of(part, request))
-                return page(request, view, HTTPStatus.NOT_FOUND)
-            return page(request, _view(run, at, branches, stage_of(json.loads(part), t)))
+                values = _values(run, at, branches, None, message_of(part, request))
+                return run_page(request, run, "replay", "run_replay.html", values, HTTPStatus.NOT_FOUND)
+            values = _values(run, at, branches, stage_of(json.loads(part), t))
+            return run_page(request, run, "replay", "run_replay.html", values)
 
         return await run_in_threadpool(show)
 
@@ -226,7 +194,9 @@ def _branches(recording: Recording, run: Run, catalogue: Catalogue) -> list[Link
     ]
 
 
-def _view(run: Run, at: StepRef, branches: list[Link], stage: Stage | None, problem: str = "") -> _ReplayView:
+def _values(
+    run: Run, at: StepRef, branches: list[Link], stage: Stage | None, problem: str = ""
+) -> dict[str, object]:
     with open_recording(run.recording) as recording:
         episodes = recording.count(recording.topic("/train/episode"))
         environments, is_job = recording.environments, recording.is_job
@@ -240,23 +210,21 @@ def _view(run: Run, at: StepRef, branches: list[Link], stage: Stage | None, prob
         path = replace(at, episode=other).episode_path
         return f"/runs/{run.run_id}/replay/{path}" if 0 <= other < max(count, at.episode) else ""
 
-    return _ReplayView(
-        run=head_of(run),
-        here="replay",
-        which=at.which,
-        stage=stage,
-        problem=problem,
-        episodes=episodes,
-        evaluations=evaluations,
-        before=neighbour(at.episode - 1),
-        after=neighbour(at.episode + 1),
-        source=f"/api/v1/runs/{run.run_id}/replay/{at.episode_path}",
-        reference=at.episode_text,
-        episode_path=at.episode_path,
-        environments=environments,
-        what_if=f"/runs/{run.run_id}/what-if/{at.episode_text}" if is_job else "",
-        branches=branches,
-    )
+    return {
+        "which": at.which,
+        "stage": stage,
+        "problem": problem,
+        "episodes": episodes,
+        "evaluations": evaluations,
+        "before": neighbour(at.episode - 1),
+        "after": neighbour(at.episode + 1),
+        "source": f"/api/v1/runs/{run.run_id}/replay/{at.episode_path}",
+        "reference": at.episode_text,
+        "episode_path": at.episode_path,
+        "environments": environments,
+        "what_if": f"/runs/{run.run_id}/what-if/{at.episode_text}" if is_job else "",
+        "branches": branches,
+    }
 
 
 def stage_of(part: JsonView, t: int) -> Stage:

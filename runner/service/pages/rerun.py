@@ -9,24 +9,22 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
-from dataclasses import dataclass
 from http import HTTPStatus
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, ClassVar, Final
+from typing import Annotated, Final
 
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import FileResponse
 from filelock import FileLock
 
 from runner.analysis.step_reference import StepRef
-from runner.export.reports.rendering import View
 from runner.export.rerun import viewer as native_viewer
 from runner.service import fragments
 from runner.service.addresses import link
 from runner.service.dependencies import ComputationOf, RecordedRun
 from runner.service.guard import POLICY
-from runner.service.pages.frame import RunView, has_tables, head_of
+from runner.service.pages.frame import has_tables, run_page
 from runner.service.pages.rendering import page
 from runner.util.extras import missing
 from runner.util.files import cache_folder, replacing, storage_errors
@@ -44,26 +42,6 @@ _FOREVER: Final = "public, max-age=31536000, immutable"
 _SECONDS: Final = 60
 
 
-@dataclass(frozen=True)
-class _RerunView(RunView):
-    TEMPLATE: ClassVar = "run_rerun.html"
-    content: str
-    back: str
-    """Address of the same step in the replay; empty without a step."""
-    frame: str
-
-
-@dataclass(frozen=True)
-class _FrameView(View):
-    TEMPLATE: ClassVar = "rerun_frame.html"
-    title: str
-    files: str
-    """Folder of the viewer's files."""
-    recording: str
-    step: int
-    """Step of the viewer's timeline."""
-
-
 @router.get("/runs/{run}/rerun")
 def viewer(request: Request, run: RecordedRun, at: Annotated[str, Query(max_length=60)] = "") -> Response:
     """Show the Rerun viewer, opened at a step."""
@@ -71,7 +49,8 @@ def viewer(request: Request, run: RecordedRun, at: Annotated[str, Query(max_leng
     content = f"{step.episode_name}, step {step.t}." if step else OVERVIEW
     back = step.replay_address(run.run_id) if step else ""
     frame = link(f"/runs/{run.run_id}/rerun/frame", {"at": at})
-    return page(request, _RerunView(head_of(run), "rerun", content, back, frame))
+    values = {"content": content, "back": back, "frame": frame}
+    return run_page(request, run, "rerun", "run_rerun.html", values)
 
 
 @router.get("/runs/{run}/rerun/frame")
@@ -86,13 +65,13 @@ async def frame(
         query = {"episodes": step.episode} if step.after is None else {"evaluations": step.after}
         if not has_tables(run):
             query |= {"trials": place["trials"], "frames": "true"}
-    view = _FrameView(
-        title=f"{run.name}, {run.run_id}",
-        files=f"/static/rerun/{version()}",
-        recording=link(f"/api/v1/runs/{run.run_id}/replay.rrd", query),
-        step=place["time"],
-    )
-    response = page(request, view)
+    values = {
+        "title": f"{run.name}, {run.run_id}",
+        "files": f"/static/rerun/{version()}",
+        "recording": link(f"/api/v1/runs/{run.run_id}/replay.rrd", query),
+        "step": place["time"],
+    }
+    response = page(request, "rerun_frame.html", values)
     response.headers["content-security-policy"] = FRAME_POLICY
     return response
 

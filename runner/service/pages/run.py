@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from http import HTTPStatus
 from itertools import islice
-from typing import Annotated, ClassVar, Final, Literal
+from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
@@ -17,16 +17,13 @@ from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.axes import EPISODES
 from runner.analysis.evaluations import evaluation_record, evaluation_records, evaluations_section
-from runner.analysis.sections import Section
 from runner.client.jobs import RunProgress
 from runner.errors import RecordingError, RunnerError
-from runner.export.reports.rendering import View
 from runner.recording.description import has_environment
 from runner.recording.labels import MAX_NOTE
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics, RecentTraining
-from runner.runs.branches import BranchNode
 from runner.runs.run import Run
 from runner.runs.shards import shards_in_words
 from runner.service import fragments
@@ -42,7 +39,7 @@ from runner.service.dependencies import (
     SettingsOf,
 )
 from runner.service.jobs.queue import JobQueue
-from runner.service.pages.frame import RunView, environment_of, has_tables, head_of, loop_results, result_of
+from runner.service.pages.frame import environment_of, has_tables, loop_results, result_of, run_page
 from runner.service.pages.rendering import Form, message_of, page
 from runner.service.settings import Settings
 from runner.util import humanize
@@ -73,48 +70,10 @@ class Status:
     """Whether its loop can be requested to stop."""
 
 
-@dataclass(frozen=True)
-class _OverviewView(RunView):
-    TEMPLATE: ClassVar = "run_overview.html"
-    status: Status
-    problem: str
-    """Why labels were refused."""
-    max_note: int = MAX_NOTE
-
-
-@dataclass(frozen=True)
-class _StatusView(View):
-    TEMPLATE: ClassVar = "run_status.html"
-    status: Status
-
-
-@dataclass(frozen=True)
-class _BranchesView(View):
-    TEMPLATE: ClassVar = "run_branches.html"
-    run: str
-    branches: BranchNode
-    """The tree that the run belongs to; the run alone if it is no branch and has none."""
-
-
-@dataclass(frozen=True)
-class _EvaluationsView(RunView):
-    TEMPLATE: ClassVar = "run_evaluations.html"
-    section: Section | None
-    links: list[str]
-    """Address of the first trial of each evaluation."""
-    total: int
-
-
-@dataclass(frozen=True)
-class _LearnedView(RunView):
-    TEMPLATE: ClassVar = "run_learned.html"
-    maps: str
-
-
 @router.get("")
 def overview(request: Request, run: FoundRun, jobs: JobsOf, settings: SettingsOf) -> Response:
     """Show the status of a run and its metrics; what may take longer is loaded by the page."""
-    return page(request, _overview(run, jobs, settings))
+    return _overview(request, run, jobs, settings)
 
 
 @router.post("/labels")
@@ -132,8 +91,7 @@ def label(
     try:
         relabelled(run, changed, catalogue)
     except RunnerError as error:
-        view = _overview(run, jobs, settings, problem=message_of(error, request))
-        return page(request, view, HTTPStatus.BAD_REQUEST)
+        return _overview(request, run, jobs, settings, problem=message_of(error, request))
     return RedirectResponse(f"/runs/{run.run_id}#labels-title", HTTPStatus.SEE_OTHER)
 
 
@@ -143,8 +101,7 @@ def stop(request: Request, run: FoundRun, jobs: JobsOf, settings: SettingsOf) ->
     try:
         run.request_stop()
     except RunnerError as error:
-        view = _overview(run, jobs, settings, problem=message_of(error, request))
-        return page(request, view, HTTPStatus.BAD_REQUEST)
+        return _overview(request, run, jobs, settings, problem=message_of(error, request))
     return RedirectResponse(f"/runs/{run.run_id}", HTTPStatus.SEE_OTHER)
 
 
@@ -163,14 +120,14 @@ def status(
     now = _status(run, jobs, settings)
     if run.status != status or not now.is_live:
         return Response(status_code=HTTPStatus.NO_CONTENT)
-    return page(request, _StatusView(now))
+    return page(request, "run_status.html", {"status": now})
 
 
 @router.get("/branches")
 def branches(request: Request, run: FoundRun, catalogue: CatalogueOf) -> Response:
     """Return the tree of branches that a run belongs to, as a part of its page; empty without any."""
     tree = catalogue.read(lambda index: index.branch_tree(run.run_id))
-    return page(request, _BranchesView(run.run_id, tree))
+    return page(request, "run_branches.html", {"run": run.run_id, "branches": tree})
 
 
 @router.get("/random-policy")
@@ -201,18 +158,22 @@ def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) ->
         records, total = every[-MAX_EVALUATIONS:], len(every)
     links = [f"/runs/{run.run_id}/replay/eval/{record.episode}/0" for record in records]
     section = evaluations_section(recording, records) if records else None
-    return page(request, _EvaluationsView(head_of(run), "evaluations", section, links, total))
+    values = {"section": section, "links": links, "total": total}
+    return run_page(request, run, "evaluations", "run_evaluations.html", values)
 
 
 @router.get("/learned")
 async def learned(request: Request, run: RecordedRun, compute: ComputationOf) -> Response:
     """Show policy and values at stages of learning."""
     maps = (await compute(fragments.maps, run.recording)).decode()
-    return await run_in_threadpool(page, request, _LearnedView(head_of(run), "learned", maps))
+    return await run_in_threadpool(run_page, request, run, "learned", "run_learned.html", {"maps": maps})
 
 
-def _overview(run: Run, jobs: JobQueue, settings: Settings, problem: str = "") -> _OverviewView:
-    return _OverviewView(head_of(run), "", _status(run, jobs, settings), problem)
+def _overview(request: Request, run: Run, jobs: JobQueue, settings: Settings, problem: str = "") -> Response:
+    """Return the first page of a run; `problem` is why a request was refused."""
+    values = {"status": _status(run, jobs, settings), "problem": problem, "max_note": MAX_NOTE}
+    status = HTTPStatus.BAD_REQUEST if problem else HTTPStatus.OK
+    return run_page(request, run, "", "run_overview.html", values, status)
 
 
 def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
-from typing import Annotated, ClassVar, Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
 from runner.errors import RunnerError
-from runner.export.reports.rendering import View
 from runner.runs.catalogue.columns import (
     FIELDS,
     HEADINGS,
@@ -87,36 +86,6 @@ class Table:
     paging: Paging
 
 
-@dataclass(frozen=True)
-class _RunsView(View):
-    TEMPLATE: ClassVar = "runs.html"
-    filter: str
-    sort: str
-    columns: Sequence[str]
-    columns_query: str
-    """The columns as the address contains them; empty for the usual ones."""
-    table: Table | None
-    problem: str
-
-    fields: Sequence[tuple[str, str, str]]
-    """Name, heading and meaning of each column that can be chosen, first those that are shown."""
-    settings: Sequence[str]
-    """Columns that are values of the configuration."""
-
-
-@dataclass(frozen=True)
-class _DiskView(View):
-    TEMPLATE: ClassVar = "disk.html"
-    total: Mapping[str, int]
-    free: int
-    freeable: list[tuple[str, str, int]]
-    """Heading, explanation and bytes."""
-    rows: list[tuple[IndexRow, dict[str, int]]]
-    """Row of the catalogue, and bytes by kind, of the largest runs."""
-    others: int
-    """Number of runs that are not shown."""
-
-
 @router.get("/")
 def home() -> Response:
     """Redirect to the runs."""
@@ -137,15 +106,16 @@ async def runs(
     viewer, status = viewer_of(request), HTTPStatus.OK
 
     def make() -> bytes:
-        return render("/runs", _view(catalogue, filter, sort, ",".join(columns or ()), page), viewer)
+        values = _values(catalogue, filter, sort, ",".join(columns or ()), page)
+        return render("/runs", viewer, "runs.html", values)
 
     try:
         key = ("runs page", catalogue.state(), request.url.query, viewer)
         body = await cache.get_or_make(key, make)
     except RunnerError as error:
         status = HTTPStatus.BAD_REQUEST
-        view = _search(filter, "", USUAL, "", None, message_of(error, request))
-        body = render("/runs", view, viewer)
+        values = _search(filter, "", USUAL, "", None, message_of(error, request))
+        body = render("/runs", viewer, "runs.html", values)
     return Response(body, status, media_type="text/html")
 
 
@@ -154,17 +124,17 @@ def disk(request: Request, catalogue: CatalogueOf, settings: SettingsOf, jobs: J
     """Show the use of the disk, and what could be freed."""
     largest, sums = usage_of(catalogue.read, Filter(None), ROWS)
     freeable = sums.freeable(settings.recordings)
-    view = _DiskView(
-        total=sums.by_kind(),
-        free=jobs.status().free_bytes,
-        freeable=[(*FREED_BY[reason], size) for reason, size in freeable.items() if size],
-        rows=[(usage.row, sizes([usage])) for usage in largest],
-        others=sums.runs - len(largest),
-    )
-    return page(request, view)
+    values = {
+        "total": sums.by_kind(),
+        "free": jobs.status().free_bytes,
+        "freeable": [(*FREED_BY[reason], size) for reason, size in freeable.items() if size],
+        "rows": [(usage.row, sizes([usage])) for usage in largest],
+        "others": sums.runs - len(largest),
+    }
+    return page(request, "disk.html", values)
 
 
-def _view(catalogue: Catalogue, text: str, sort: str, columns: str, number: int) -> _RunsView:
+def _values(catalogue: Catalogue, text: str, sort: str, columns: str, number: int) -> dict[str, object]:
     chosen, order = parse(text), order_of(sort)
     shown = columns_of(columns) if columns.strip(", ") else list(USUAL)
     is_usual = list(shown) == list(USUAL)
@@ -190,11 +160,21 @@ def _view(catalogue: Catalogue, text: str, sort: str, columns: str, number: int)
 
 def _search(
     text: str, sort: str, shown: Sequence[str], query: str, table: Table | None, problem: str = ""
-) -> _RunsView:
+) -> dict[str, object]:
+    """Return the values of the page; `query` has the columns as the address contains them."""
     names = dict.fromkeys([*(column for column in shown if column in FIELDS), *FIELDS])
     fields = [(name, HEADINGS.get(name, name).replace("_", " "), FIELDS[name].meaning) for name in names]
     settings = [column for column in shown if column.startswith(SETTING)]
-    return _RunsView(text, sort, shown, query, table, problem, fields, settings)
+    return {
+        "filter": text,
+        "sort": sort,
+        "columns": shown,
+        "columns_query": query,
+        "table": table,
+        "problem": problem,
+        "fields": fields,
+        "settings": settings,
+    }
 
 
 def _heading(column: str, query: Mapping[str, str], folded: bool) -> Heading:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import ClassVar, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from fastapi import APIRouter, Request, Response
 
@@ -15,10 +14,10 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.code import Code
 from runner.recording.messages import log_level
-from runner.recording.reader import Recording, open_recording
+from runner.recording.reader import open_recording
 from runner.service.dependencies import FoundRun, OpenRecording, RecordedRun, SettingsOf
-from runner.service.pages.frame import RunView, head_of
-from runner.service.pages.rendering import message_of, page
+from runner.service.pages.frame import run_page
+from runner.service.pages.rendering import message_of
 from runner.util import humanize
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
@@ -49,33 +48,12 @@ class CodeFile(NamedTuple):
     text: str
 
 
-@dataclass(frozen=True)
-class _CodeView(RunView):
-    TEMPLATE: ClassVar = "run_code.html"
-    facts: Mapping[str, str]
-    packages: Mapping[str, str]
-    patch: list[str]
-    patch_left_out: int
-    files: list[CodeFile]
-    files_left_out: int
-    problem: str
-
-
 class LogLine(NamedTuple):
     """A line of a run's log."""
 
     step: int
     level: str
     message: str
-
-
-@dataclass(frozen=True)
-class _ConfigView(RunView):
-    TEMPLATE: ClassVar = "run_config.html"
-    yaml: str
-    facts: Mapping[str, str]
-    provenance: Mapping[str, str]
-    log: list[LogLine]
 
 
 @router.get("/config")
@@ -93,12 +71,19 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
     try:
         with open_recording(run.recording) as recording:
             facts |= {"Job hash": recording.job, "Size": humanize.size(recording.size)}
-            provenance, log = brief_provenance(recording.provenance), _log(recording)
+            provenance = brief_provenance(recording.provenance)
+            log = [
+                LogLine(
+                    line["log_time"] // schema.STEP_NANOSECONDS,
+                    log_level(line["level"]).lower(),
+                    line["message"],
+                )
+                for line in deque(recording.decoded(schema.LOG_TOPIC), MAX_LINES)
+            ]
     except RecordingError as error:
         facts["Recording"] = settings.without_folders(str(error))
-    return page(
-        request, _ConfigView(head_of(run), "config", write_yaml(run.file.config), facts, provenance, log)
-    )
+    values = {"yaml": write_yaml(run.file.config), "facts": facts, "provenance": provenance, "log": log}
+    return run_page(request, run, "config", "run_config.html", values)
 
 
 @router.get("/code")
@@ -117,32 +102,21 @@ def code(request: Request, run: RecordedRun, recording: OpenRecording) -> Respon
         )
     ]
     is_code = ("git", "code.")
-    view = _CodeView(
-        head_of(run),
-        "code",
-        facts={
+    values = {
+        "facts": {
             CODE_FACTS.get(key, key): text
             for key, text in provenance.items()
             if key.startswith(is_code) or key == "command"
         },
-        packages={
+        "packages": {
             key.removeprefix("package."): text
             for key, text in provenance.items()
             if key.startswith("package.")
         },
-        patch=patch[:MAX_PATCH_LINES],
-        patch_left_out=max(0, len(patch) - MAX_PATCH_LINES),
-        files=files[:MAX_CODE_FILES],
-        files_left_out=max(0, len(files) - MAX_CODE_FILES),
-        problem=problem,
-    )
-    return page(request, view)
-
-
-def _log(recording: Recording) -> list[LogLine]:
-    return [
-        LogLine(
-            line["log_time"] // schema.STEP_NANOSECONDS, log_level(line["level"]).lower(), line["message"]
-        )
-        for line in deque(recording.decoded(schema.LOG_TOPIC), MAX_LINES)
-    ]
+        "patch": patch[:MAX_PATCH_LINES],
+        "patch_left_out": max(0, len(patch) - MAX_PATCH_LINES),
+        "files": files[:MAX_CODE_FILES],
+        "files_left_out": max(0, len(files) - MAX_CODE_FILES),
+        "problem": problem,
+    }
+    return run_page(request, run, "code", "run_code.html", values)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from http import HTTPStatus
-from typing import Annotated, ClassVar, Final, NamedTuple
+from types import MappingProxyType
+from typing import Annotated, Final, NamedTuple
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
@@ -16,7 +16,6 @@ from starlette.concurrency import run_in_threadpool
 from runner.config.document import write_yaml
 from runner.config.schema import json_schema, without_references
 from runner.errors import RunnerError
-from runner.export.reports.rendering import View
 from runner.service.dependencies import CatalogueOf, JobsOf
 from runner.service.errors import Refused
 from runner.service.jobs.checking import SWEEP_KEYS, CheckedJob
@@ -26,6 +25,7 @@ from runner.sweep.model import SweepFile
 from runner.util.values import Json, JsonView
 
 router = APIRouter(prefix="/submit", include_in_schema=False)
+TEMPLATE: Final = "submit.html"
 
 FIRST: Final = """\
 # A first look: one agency learns to drive both taxis, in a second or two.
@@ -86,18 +86,6 @@ class Key(NamedTuple):
     inner: list[Key]
 
 
-@dataclass(frozen=True)
-class _SubmitView(View):
-    TEMPLATE: ClassVar = "submit.html"
-    text: str
-    problems: list[Problem]
-    checked: CheckedJob | None
-    """What the text means, if it was checked and is valid."""
-    keys: list[Key]
-    sweep_keys: list[Key]
-    """Empty for a configuration."""
-
-
 @router.get("")
 def form(
     request: Request,
@@ -113,7 +101,7 @@ def form(
     text = SWEEP if sweep else FIRST
     if origin:
         text = write_yaml(catalogue.find(origin).file.config)
-    return page(request, _view(text))
+    return page(request, TEMPLATE, _values(text))
 
 
 @router.post("")
@@ -123,11 +111,12 @@ async def submit(request: Request, sent: Form, jobs: JobsOf) -> Response:
     try:
         checked = await jobs.checker.check(text)
         if sent.get("action") == "check":
-            return await run_in_threadpool(page, request, _view(text, checked=checked))
+            values = _values(text, sent, checked=checked)
+            return await run_in_threadpool(page, request, TEMPLATE, values)
         job = await run_in_threadpool(jobs.add, text, checked, number_in(sent, "workers"))
     except RunnerError as error:
-        view = _view(text, _problems(request, text, error))
-        return await run_in_threadpool(page, request, view, HTTPStatus.UNPROCESSABLE_ENTITY)
+        values = _values(text, sent, _problems(request, text, error))
+        return await run_in_threadpool(page, request, TEMPLATE, values, HTTPStatus.UNPROCESSABLE_ENTITY)
     return RedirectResponse(f"/queue/{job.number}", HTTPStatus.SEE_OTHER)
 
 
@@ -139,9 +128,22 @@ def _problems(request: Request, text: str, error: RunnerError) -> list[Problem]:
     return problems or [Problem(None, None, body.message, "")]
 
 
-def _view(text: str, problems: Sequence[Problem] = (), checked: CheckedJob | None = None) -> _SubmitView:
+def _values(
+    text: str,
+    sent: Mapping[str, str] = MappingProxyType({}),
+    problems: Sequence[Problem] = (),
+    checked: CheckedJob | None = None,
+) -> dict[str, object]:
+    """Return the values of the page; `checked` is what the text means, if it was checked and is valid."""
     is_sweep = any(line.startswith(f"{key}:") for line in text.splitlines() for key in SWEEP_KEYS)
-    return _SubmitView(text, list(problems), checked, config_keys(), sweep_keys() if is_sweep else [])
+    return {
+        "text": text,
+        "workers": sent.get("workers", ""),
+        "problems": problems,
+        "checked": checked,
+        "keys": config_keys(),
+        "sweep_keys": sweep_keys() if is_sweep else [],
+    }
 
 
 @functools.cache

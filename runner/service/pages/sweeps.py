@@ -5,10 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Final, Literal
+from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Request, Response
 from fastapi import Path as InPath
@@ -17,13 +16,12 @@ from starlette.concurrency import run_in_threadpool
 
 from runner.debugging.explanation_files import explanations_in
 from runner.errors import RunnerError, RunNotFound
-from runner.export.reports.rendering import View
 from runner.runs.catalogue.filters import parse
 from runner.service import sweep_fragments
 from runner.service.addresses import link
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf, SweepProcesses
-from runner.service.pages.jobs import ShownJob, shown_job
+from runner.service.pages.jobs import shown_job
 from runner.service.pages.rendering import message_of, page
 from runner.service.response_cache import ALWAYS
 from runner.sweep import folder_of, sweeps_in, tag_of
@@ -53,26 +51,6 @@ class ListedSweep:
     runs: int = 0
 
 
-@dataclass(frozen=True)
-class _SweepsView(View):
-    TEMPLATE: ClassVar = "sweeps.html"
-    sweeps: list[ListedSweep]
-    explanations: list[str]
-    """The names of what `dualtaxi explain` left."""
-
-
-@dataclass(frozen=True)
-class _SweepPageView(View):
-    TEMPLATE: ClassVar = "sweep_page.html"
-    name: str
-    runs: int
-    runs_address: str
-    job: ShownJob | None
-    """The newest job of the sweep."""
-    parts: Mapping[str, str | None]
-    """HTML of each part; None while it is computed."""
-
-
 @router.get("")
 def sweeps(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Response:
     """Show the sweeps."""
@@ -90,7 +68,7 @@ def sweeps(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Re
                 ListedSweep(name, "", sweep.file.strategy, parameters, sweep.objective.description, runs)
             )
     names = [name for folder in settings.recordings for name in explanations_in(folder)]
-    return page(request, _SweepsView(listed_sweeps, names))
+    return page(request, "sweeps.html", {"sweeps": listed_sweeps, "explanations": names})
 
 
 @router.get("/{name}")
@@ -112,14 +90,14 @@ async def sweep(
         parameters = [f"config.{path}" for path in read_sweep(name, state.folder).file.parameters]
         columns = ",".join(["id", "seed", "status", "success_percent", "mean_length", *parameters])
         query = {"filter": f'tag:"{tag_of(name)}"', "columns": columns}
-        view = _SweepPageView(
-            name=name,
-            runs=state.runs,
-            runs_address=link("/runs", query),
-            job=shown_job(own[-1], jobs) if own else None,
-            parts=parts,
-        )
-        return page(request, view)
+        values = {
+            "name": name,
+            "runs": state.runs,
+            "runs_address": link("/runs", query),
+            "job": shown_job(own[-1], jobs) if own else None,
+            "parts": parts,
+        }
+        return page(request, "sweep_page.html", values)
 
     return await run_in_threadpool(show)
 

@@ -111,7 +111,7 @@ WORDS = {
 """What is typed after a command; nothing for the others."""
 HOSTILE = "a\x1b]0;owned\x1b\\\x9b31m\x7f\u202eb"
 """Sets the title of a terminal, begins a red text, and turns the direction of writing."""
-JOB = RemoteJob(1, "config", "tiny", "finished", 1, "", None, {3: "k3v9m2xq"})
+JOB = RemoteJob(1, "config", "tiny", "finished", 1, 1, "", None, {3: "k3v9m2xq"})
 
 
 def always_left(content, *spaces):
