@@ -166,7 +166,7 @@ def _episodes(
 ) -> Iterator[Block]:
     agents = recording.agents[:_MAX_PARTS]
     lines = agents if len(recording.agents) > 1 else [""]
-    columns[("length", "")] = columns.get(("length", "")) or _Column("length", "", "steps", _number)
+    columns.setdefault(("length", ""), _Column("length", "", "steps", _number))
     for line in lines:
         columns.setdefault(("return", line), _Column("return", line, "summed reward", _number))
     for block in recording.blocks(TRAIN_EPISODE):

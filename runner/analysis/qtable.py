@@ -136,7 +136,13 @@ def _describe_snapshots(
         shape = _shape(recording)
         states = states_in_words(recording.mdp) if recording.tabular else range(shape[0])
         number = numbered(str(state), list(map(str, states)), "a state", 1)
-        taken = _actions_taken(recording, number, max(array.step for array in latest.values()))
+        stop = max(array.step for array in latest.values())
+        taken = None
+        if recording.count(schema.TRAIN_STEP) >= stop:  # else steps are missing
+            counts = np.zeros(shape[1], np.int64)
+            for block in recording.blocks(schema.TRAIN_STEP, 0, stop):
+                counts += np.bincount(block["action"][block["state"] == number], minlength=shape[1])
+            taken = counts.tolist()
         names = recording.action_names("train") or tuple(map(str, range(shape[1])))
         description["state"], description["state_in_words"] = number, str(states[number])
         description["visits"] = None if taken is None else sum(taken)
@@ -167,16 +173,6 @@ def _action_values(
             "changed_step": None,
             "changed_episode": None,
         }
-
-
-def _actions_taken(recording: Recording, state: int, stop: int) -> list[int] | None:
-    """Return how often each action was taken in a state before a step; None if steps are missing."""
-    if recording.count(schema.TRAIN_STEP) < stop:
-        return None
-    counts = np.zeros(recording.spaces["action"]["n"], np.int64)
-    for block in recording.blocks(schema.TRAIN_STEP, 0, stop):
-        counts += np.bincount(block["action"][block["state"] == state], minlength=len(counts))
-    return [int(count) for count in counts]
 
 
 def one_array(tables: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:

@@ -51,17 +51,13 @@ recordings_option: Final = option(
 )
 
 
-def _folders(_ctx: click.Context, _param: click.Parameter, value: tuple[Path, ...]) -> tuple[Path, ...]:
-    return value or (recordings_folder(),)
-
-
 def _folders_option(must_exist: bool) -> Declared:
     return option(
         "--recordings",
         type=click.Path(exists=must_exist, file_okay=False, path_type=Path),
         metavar="DIR",
         multiple=True,
-        callback=_folders,
+        callback=lambda _context, _option, folders: folders or (recordings_folder(),),
         help="A folder of runs; may be repeated.  [default: $DUALTAXI_RECORDINGS, or ./recordings]",
     )
 

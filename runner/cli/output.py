@@ -51,6 +51,14 @@ def print_json(value: object, indent: int | None = 1) -> None:
     echo(json.dumps(finite(value), indent=indent, allow_nan=False))
 
 
+def print_result(as_json: bool, value: object, *parts: RenderableType) -> None:
+    """Print a result as JSON, or as lines and tables."""
+    if as_json:
+        print_json(value)
+    else:
+        draw(*parts)
+
+
 def json_list(name: str, rows: Iterable[Mapping[str, object]]) -> Iterator[str]:
     """Yield the text of a JSON object with one named list in parts, so that it is never in memory as a whole.
 

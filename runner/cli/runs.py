@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from runner.archive.places import at_hand
-from runner.cli.output import draw, facts, print_json, say
+from runner.cli.output import facts, print_result, say
 from runner.cli.progress import progress_line, steps_line
 from runner.errors import RecordingError, RunnerError, RunNotFound
 from runner.runs.resolve import find_run, find_runs
@@ -217,9 +217,8 @@ def print_received(run: Run, digest: str, existing: str, as_json: bool, **more: 
     """
     if existing:
         say(f"Run {run.run_id} is there already with {existing}; nothing was written.")
-    if as_json:
-        print_json(identity(run) | {"already": bool(existing), "content_digest": digest} | more)
-        return
+    value = identity(run) | {"already": bool(existing), "content_digest": digest} | more
     file = f"{run.recording}  {size(run.recording.stat().st_size)}"
     title = f"{run.run_id}  {run.title}, {run.status}"
-    draw(facts({"run": title, "digest": digest, "file": file, "next": command_for(run, "show")}))
+    rows = {"run": title, "digest": digest, "file": file, "next": command_for(run, "show")}
+    print_result(as_json, value, facts(rows))

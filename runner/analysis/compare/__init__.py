@@ -137,7 +137,15 @@ def compare(
     statistics.require_scipy()
     results = [_metric(groups, metric, line, moment) for metric, line in metrics]
     if results and not any(metric.groups for metric in results):
-        raise RunnerError(_no_values(groups, metrics, moment, results))
+        if moment.kind != "position":
+            raise RunnerError(f"found nothing to compare: {results[0].notes[0]}.")
+        runs = [run for group in groups for run in group.runs]
+        places = {n for run in runs for name in metrics for n in points_of(run, *name, aligned=True)}
+        before = sorted(n for n in places if n < moment.number)[-1:]
+        after = sorted(n for n in places if n > moment.number)[:1]
+        nearest = " and ".join(f"{place:,g}" for place in before + after)
+        hint = f"; the nearest are those after {nearest}" if nearest else ""
+        raise RunnerError(f"moment: found no values after {moment.axis.moment(moment.number)}{hint}.")
     pairs = [pair for metric in results for pair in metric.pairs]
     if len(pairs) > 1:  # their intervals are widened to hold together
         widened = iter(statistics.simultaneous([pair.differences for pair in pairs]))
@@ -151,24 +159,6 @@ def compare(
         metrics=results,
         notes=[*notes, *_notes(groups, metrics, moment)],
     )
-
-
-def _no_values(
-    groups: Sequence[Group],
-    metrics: Sequence[tuple[str, str]],
-    moment: Moment,
-    results: Sequence[MetricResult],
-) -> str:
-    """Return why there is nothing to compare."""
-    if moment.kind != "position":
-        return f"found nothing to compare: {results[0].notes[0]}."
-    runs = [run for group in groups for run in group.runs]
-    places = {n for run in runs for name in metrics for n in points_of(run, *name, aligned=True)}
-    before = sorted(n for n in places if n < moment.number)[-1:]
-    after = sorted(n for n in places if n > moment.number)[:1]
-    nearest = " and ".join(f"{place:,g}" for place in before + after)
-    hint = f"; the nearest are those after {nearest}" if nearest else ""
-    return f"moment: found no values after {moment.axis.moment(moment.number)}{hint}."
 
 
 def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: Moment) -> Iterator[str]:
@@ -220,7 +210,17 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
     if moment.kind == "last" and (episodes := last_episodes(metric, groups)):
         title = f"{title}, {episodes}"
     sign = -1.0 if better is False else 1.0
-    thresholds = _thresholds([value for values in present.values() for _, value in values.values()], sign)
+    finite = sorted(
+        {
+            value
+            for values in present.values()
+            for _, value in values.values()
+            if abs(value) < statistics.NEVER
+        }
+    )
+    # Evenly spaced levels from the worst value to the best; few where there are few values.
+    levels = np.linspace(finite[0], finite[-1], THRESHOLDS) if len(finite) > 1 else np.array(finite)
+    thresholds = levels[:: int(sign)]
     return MetricResult(
         metric=metric,
         line=line,
@@ -232,15 +232,6 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
         thresholds=thresholds.tolist(),
         notes=notes,
     )
-
-
-def _thresholds(values: Sequence[float], sign: float) -> Values:
-    """Return evenly spaced levels from the worst value to the best; few where there are few values."""
-    finite = sorted({value for value in values if abs(value) < statistics.NEVER})
-    if not finite:
-        return np.empty(0)
-    levels = np.linspace(finite[0], finite[-1], THRESHOLDS) if len(finite) > 1 else np.array(finite)
-    return levels[:: int(sign)]
 
 
 def _group(label: str, values: Measured, thresholds: Values, sign: float) -> GroupResult:

@@ -226,44 +226,39 @@ def value_of(
 ) -> tuple[float | None, str]:
     """Return a run's value of a metric, or None and why it has none."""
     read = points_of(run, metric, line, aligned=True)
-    points = {episode: value for episode, value in read.items() if math.isfinite(value)}
+    points = {place: read[place] for place in sorted(read) if math.isfinite(read[place])}
     if not points:
         return None, f"has no {metric}{'.' + line if line else ''}"
+    places, values = list(points), list(points.values())
     if moment.kind == "position":
-        return _at(points, moment), f"has none after {moment.axis.moment(moment.number)}"
+        value, place = points.get(moment.number), moment.number
+        if moment.axis is not EPISODES and places[0] <= place <= places[-1]:
+            value = float(np.interp(place, places, values))
+        return value, f"has none after {moment.axis.moment(place)}"
     if not run.finished:
         return None, "not finished; an episode as the moment takes it as far as it got"
     if moment.kind == "area":
-        return _area(points, metric, line, groups)
+        every = [other for group in groups for other in group.runs if other.finished]
+        return _area(places, values, *shared_span(every, metric, line))
     if moment.level is not None:
         at = first_crossing(points, moment.level)
         return NEVER if at is None else float(at), ""
     best = min if higher_is_better(metric, groups) is False else max
-    last = run.recent.get(metric, {}).get(line, points[max(points)])
-    return best(points.values()) if moment.kind == "best" else last, ""
-
-
-def _at(points: Mapping[float, float], moment: Moment) -> float | None:
-    """Return the value at a position; None where the run has none."""
-    if moment.axis is EPISODES:
-        return points.get(moment.number)
-    places = sorted(points)
-    if not places[0] <= moment.number <= places[-1]:
-        return None
-    return float(np.interp(moment.number, places, [points[place] for place in places]))
+    last = run.recent.get(metric, {}).get(line, values[-1])
+    return best(values) if moment.kind == "best" else last, ""
 
 
 def _area(
-    points: Mapping[float, float], metric: str, line: str, groups: Sequence[Group]
+    places: Sequence[float], values: Sequence[float], first: float, last: float
 ) -> tuple[float | None, str]:
-    """Return the mean of a curve over the positions that every finished run with the metric covers."""
-    runs = [run for group in groups for run in group.runs if run.finished]
-    curves = [own for run in runs if (own := points_of(run, metric, line, aligned=True))]
-    first, last = max(map(min, curves)), min(map(max, curves))
+    """Return the mean of a curve over a span, or None and why it has none."""
     if first >= last:
         return None, "it has no part of training in common with the other runs"
-    places = sorted({first, *(place for place in points if first <= place <= last), last})
-    measured_at = sorted(points)
-    return mean_height(
-        places, np.interp(places, measured_at, [points[place] for place in measured_at]).tolist()
-    ), ""
+    span = sorted({first, *(place for place in places if first <= place <= last), last})
+    return mean_height(span, np.interp(span, places, values).tolist()), ""
+
+
+def shared_span(runs: Sequence[RunSeries], metric: str, line: str) -> tuple[float, float]:
+    """Return the first and the last position that every run with the metric covers."""
+    curves = [points for run in runs if (points := points_of(run, metric, line, aligned=True))]
+    return max(map(min, curves)), min(map(max, curves))

@@ -24,6 +24,7 @@ from runner.analysis.compare.moments import (
     measured,
     moment_in_words,
     seed_of,
+    shared_span,
     uneven_ends,
 )
 from runner.analysis.compare.score_table import MIN_MAX, Bounds
@@ -150,7 +151,9 @@ def compare_tasks(
     thresholds = np.linspace(float(every.min()), float(every.max()), POINTS)
     if moment.kind != "position":  # which takes runs that are not finished too
         groups = [replace(each, runs=tuple(run for run in each.runs if run.finished)) for each in groups]
-    positions = _positions(groups, metric, tasks)
+    first, last = shared_span(_runs(groups, tasks), *metric)
+    # The positions that every run in these environments covers, evenly spaced.
+    positions = np.linspace(first, last, POINTS) if first < last else np.array([float(last)])
     results = [
         _result(group.label, scores[group.label], thresholds, _curves(group, metric, bounds, positions))
         for group in groups
@@ -266,7 +269,8 @@ def _result(
     own = [values[:, np.newaxis] for values in scores.values()]
     reached = [(values >= thresholds).astype(np.float64) for values in own]
     profile = [
-        part.tolist() for part in statistics.stratified(reached, lambda drawn: _pooled(drawn).mean(axis=0))
+        part.tolist()
+        for part in statistics.stratified(reached, lambda drawn: np.concatenate(drawn).mean(axis=0))
     ]
     curve = [part.tolist() for part in statistics.stratified(curves, _iqm)]
     return AlgorithmResult(
@@ -276,7 +280,7 @@ def _result(
         iqm=_estimate(own, _iqm),
         median=_estimate(own, lambda drawn: np.median([task.mean(axis=0) for task in drawn], axis=0)),
         mean=_estimate(own, lambda drawn: np.mean([task.mean(axis=0) for task in drawn], axis=0)),
-        optimality_gap=_estimate(own, lambda drawn: 1 - np.minimum(_pooled(drawn), 1).mean(axis=0)),
+        optimality_gap=_estimate(own, lambda drawn: 1 - np.minimum(np.concatenate(drawn), 1).mean(axis=0)),
         profile=profile[0],
         profile_low=profile[1],
         profile_high=profile[2],
@@ -286,12 +290,8 @@ def _result(
     )
 
 
-def _pooled(drawn: Sequence[Values]) -> Values:
-    return np.concatenate(drawn)
-
-
 def _iqm(drawn: Sequence[Values]) -> Values:
-    return statistics.iqm(_pooled(drawn), 0)
+    return statistics.iqm(np.concatenate(drawn), 0)
 
 
 def _estimate(
@@ -311,13 +311,6 @@ def _improvement(a: Mapping[str, Values], b: Mapping[str, Values]) -> Estimate:
 
     strata = [own[task][:, np.newaxis] for task in a for own in (a, b)]
     return _estimate(strata, probability, cells=max(len(a[task]) * len(b[task]) for task in a))
-
-
-def _positions(groups: Sequence[Group], metric: tuple[str, str], tasks: Sequence[str]) -> Values:
-    """Return the positions that every run in these environments covers, evenly spaced."""
-    curves = [points for run in _runs(groups, tasks) if (points := points_of(run, *metric, aligned=True))]
-    first, last = max(map(min, curves)), min(map(max, curves))
-    return np.linspace(first, last, POINTS) if first < last else np.array([float(last)])
 
 
 def _runs(groups: Sequence[Group], tasks: Sequence[str]) -> list[RunSeries]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import Final
 
 from runner.analysis.diff.settings import Change
-from runner.recording.code import Code, patch_parts, unified_diff
+from runner.recording.code import patch_parts, unified_diff
 from runner.recording.reader import Recording
 from runner.util.humanize import counted
 
@@ -53,26 +53,22 @@ def code_changes(a: Recording, b: Recording) -> list[FileChange]:
     if not (ours.files or ours.patch) or not (theirs.files or theirs.patch):
         return []
     commits = [one.provenance.get("git", "").removesuffix("-dirty") for one in (a, b)]
-    return list(_changes(ours, theirs, same_commit=commits[0] == commits[1]))
-
-
-def _changes(a: Code, b: Code, same_commit: bool) -> Iterator[FileChange]:
-    parts = patch_parts(a.patch), patch_parts(b.patch)
-    paths = sorted({*a.files, *b.files, *parts[0], *parts[1]})
-    shown = 0
-    for path in paths:
-        ours, theirs = a.files.get(path), b.files.get(path)
-        added = ours is None and path in b.new
-        removed = theirs is None and path in a.new
-        if added or removed or (ours is not None and theirs is not None):
-            lines = [] if ours == theirs else _compared(ours, theirs, path)
-        elif same_commit and parts[0].get(path) != parts[1].get(path):
+    parts = patch_parts(ours.patch), patch_parts(theirs.patch)
+    changes: list[FileChange] = []
+    for path in sorted({*ours.files, *theirs.files, *parts[0], *parts[1]}):
+        left, right = ours.files.get(path), theirs.files.get(path)
+        is_added = left is None and path in theirs.new
+        is_removed = right is None and path in ours.new
+        lines = []
+        if is_added or is_removed or (left is not None and right is not None):
+            lines = [] if left == right else _compared(left, right, path)
+        elif commits[0] == commits[1] and parts[0].get(path) != parts[1].get(path):
             lines = _patches(parts[0].get(path), parts[1].get(path))
-        else:
-            continue
         if lines:
-            yield _change(path, lines, MAX_LINES if shown < MAX_FILES else 0)
-            shown += 1
+            signs = Counter(line[:1] for line in lines if not line.startswith(("+++", "---")))
+            shown = lines[: MAX_LINES if len(changes) < MAX_FILES else 0]
+            changes.append(FileChange(path, signs["+"], signs["-"], shown, len(lines) - len(shown)))
+    return changes
 
 
 def _compared(a: str | None, b: str | None, path: str) -> list[str]:
@@ -101,14 +97,6 @@ def _patches(a: str | None, b: str | None) -> list[str]:
         else:
             undone.append(opposite.get(line[:1], line[:1]) + line[1:])
     return undone
-
-
-def _change(path: str, lines: Sequence[str], limit: int) -> FileChange:
-    heads = ("+++", "---")
-    added = sum(line.startswith("+") and not line.startswith(heads) for line in lines)
-    removed = sum(line.startswith("-") and not line.startswith(heads) for line in lines)
-    shown = list(islice(lines, limit))
-    return FileChange(path, added, removed, shown, len(lines) - len(shown))
 
 
 def made_in_words(files: Sequence[FileChange], provenance: Sequence[Change]) -> list[str]:

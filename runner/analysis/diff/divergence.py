@@ -160,7 +160,7 @@ def _bits(values: Array) -> NDArray[Any]:
 def training_divergence(a: Recording, b: Recording) -> Divergence | None:
     """Return where the training of two jobs diverges; None if it takes the same steps, equally many."""
     streams = [recording.blocks(schema.TRAIN_STEP, 0, unbroken(recording)[0]) for recording in (a, b)]
-    return _divergence("train", first_difference(streams[0], streams[1]))
+    return _divergence("train", streams[0], streams[1])
 
 
 def evaluation_divergences(a: Recording, b: Recording) -> Iterator[Divergence]:
@@ -174,9 +174,7 @@ def evaluation_divergences(a: Recording, b: Recording) -> Iterator[Divergence]:
         steps = [_trial_steps(one, first, trials) for one, first in ((a, left.start), (b, right.start))]
         if steps[0] is None or steps[1] is None:
             continue
-        divergence = _divergence(
-            "eval", first_difference(steps[0], steps[1], _EVALUATION_FIELDS), _EVALUATION_FIELDS
-        )
+        divergence = _divergence("eval", steps[0], steps[1], _EVALUATION_FIELDS)
         if divergence is not None:
             start = right.start if divergence.a_step is None else left.start
             yield replace(
@@ -210,10 +208,10 @@ def _trial_steps(recording: Recording, first: int, trials: int) -> Iterator[Bloc
 
 
 def _divergence(
-    phase: str, found: tuple[int, Block | None, Block | None] | None, fields: tuple[str, ...] = FIELDS
+    phase: str, a_steps: Iterator[Block], b_steps: Iterator[Block], fields: tuple[str, ...] = FIELDS
 ) -> Divergence | None:
-    """Return what `first_difference` found of two streams of steps."""
-    if found is None:
+    """Return where two streams of steps differ."""
+    if (found := first_difference(a_steps, b_steps, fields)) is None:
         return None
     _, left, right = found
     name, a, b = "step", "none" if left is None else "one more", "none" if right is None else "one more"
@@ -281,7 +279,7 @@ def _first_in_phase(a: Recording, b: Recording, phase: str) -> Divergence | None
     common = set.intersection(*(set(one.row_dtype(name).names or ()) for one in (a, b)))
     digest = ("digest",) if all(alone) else ()
     fields = (*(each for each in (FIELDS if is_tabular else _TRANSITION_FIELDS) if each in common), *digest)
-    divergence = _divergence(phase, first_difference(a.rows(name), b.rows(name), fields), fields)
+    divergence = _divergence(phase, a.rows(name), b.rows(name), fields)
     if not is_tabular:  # else a step has the state before it
         divergence = (
             _reset_divergence(a, b, phase, math.inf if divergence is None else divergence.step) or divergence
@@ -316,7 +314,7 @@ def branch_divergence(a: Recording, b: Recording, origin: BranchOrigin) -> Diver
         episode_blocks(one, origin.phase, origin.episode if one.run_id == origin.run else 0) for one in (a, b)
     ]
     fields = tuple(name for name in (FIELDS if a.kind == "step" else _TRANSITION_FIELDS) if name != "episode")
-    divergence = _divergence(origin.phase, first_difference(blocks[0], blocks[1], fields), fields)
+    divergence = _divergence(origin.phase, blocks[0], blocks[1], fields)
     if divergence is None:
         return None
     at = StepRef.parse(origin.at)

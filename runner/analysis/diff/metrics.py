@@ -51,7 +51,21 @@ def metric_diffs(a: Recording, b: Recording, targets: Mapping[str, float]) -> li
         if names and name not in names:
             listed = ", ".join(names)
             raise RunnerError(f"target: found {name!r}, expected one of {listed}.{nearest(name, names)}")
-    return [_metric_diff(name, values[0][name], values[1][name], targets.get(name)) for name in names]
+    diffs = []
+    for name in names:
+        left, right = values[0][name], values[1][name]
+        episodes = sorted(left.keys() & right.keys())
+        ours, theirs = [left[e] for e in episodes], [right[e] for e in episodes]
+        area = mean_height(episodes, [y - x for x, y in zip(ours, theirs, strict=True)])
+        level = targets.get(name)
+        crossings = (
+            {}
+            if level is None
+            else {f"{level:g}": (first_crossing(left, level), first_crossing(right, level))}
+        )
+        ends = left[max(left)], right[max(right)]
+        diffs.append(MetricDiff(name, episodes, ours, theirs, *ends, area, crossings))
+    return diffs
 
 
 def _values(recording: Recording) -> dict[str, dict[int, float]]:
@@ -66,14 +80,6 @@ def _values(recording: Recording) -> dict[str, dict[int, float]]:
                 if not math.isnan(own):
                     table.setdefault(line, {})[int(metrics["episode"])] = float(own)
     return table
-
-
-def _metric_diff(name: str, a: dict[int, float], b: dict[int, float], level: float | None) -> MetricDiff:
-    episodes = sorted(a.keys() & b.keys())
-    left, right = [a[e] for e in episodes], [b[e] for e in episodes]
-    area = mean_height(episodes, [y - x for x, y in zip(left, right, strict=True)])
-    crossings = {} if level is None else {f"{level:g}": (first_crossing(a, level), first_crossing(b, level))}
-    return MetricDiff(name, episodes, left, right, a[max(a)], b[max(b)], area, crossings)
 
 
 def loop_means(recording: Recording) -> dict[str, float]:

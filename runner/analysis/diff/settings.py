@@ -85,7 +85,10 @@ def environment_diff(a: Mdp, b: Mdp) -> EnvironmentDiff:
     if a.next_state.shape[:2] != b.next_state.shape[:2]:
         sizes = Change("states x actions", a.next_state.shape[:2], b.next_state.shape[:2])
         return EnvironmentDiff(description=[sizes, *description])
-    differs = _pairs_that_differ(a, b)
+    differs = np.zeros(a.next_state.shape[:2], np.bool_)  # padding does not count
+    for k in range(max(a.next_state.shape[2], b.next_state.shape[2])):
+        for left, right in zip(_outcome(a, k), _outcome(b, k), strict=True):
+            differs |= left != right
     pairs = np.argwhere(differs)
     return EnvironmentDiff(
         description=description,
@@ -100,15 +103,6 @@ def loop_environment_diff(a: Recording, b: Recording) -> EnvironmentDiff:
     """Return how the descriptions of two environments and their spaces differ."""
     described = [{"spaces": one.spaces, **one.environment} for one in (a, b)]
     return EnvironmentDiff(changes_in(*described))
-
-
-def _pairs_that_differ(a: Mdp, b: Mdp) -> NDArray[np.bool_]:
-    """Return, for each (state, action), whether its outcomes differ; padding does not count."""
-    differs = np.zeros(a.next_state.shape[:2], np.bool_)
-    for k in range(max(a.next_state.shape[2], b.next_state.shape[2])):
-        for left, right in zip(_outcome(a, k), _outcome(b, k), strict=True):
-            differs |= left != right
-    return differs
 
 
 def _outcome(mdp: Mdp, k: int) -> list[Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
@@ -51,8 +52,19 @@ def table_diffs(a: Recording, b: Recording, visits: NDArray[np.int64] | None) ->
 
     `visits` is how often each state was acted in, [S], both runs together.
     """
+    weights = visits if visits is not None and visits.sum() else None
     for left, right in common_snapshots(a, b):
-        yield _table_diff(a.mdp, left, right, visits)
+        apart = np.abs(left.values - right.values)
+        other = left.values.argmax(axis=1) != right.values.argmax(axis=1)
+        yield TableDiff(
+            episode=left.episode,
+            agent=left.agent,
+            largest=float(apart.max()),
+            mean=float(apart.mean()),
+            greedy_share=float(other.mean()),
+            greedy_share_visited=math.nan if weights is None else float(other @ weights / weights.sum()),
+            cells=_largest_cells(a.mdp, left, right, apart),
+        )
 
 
 def common_snapshots(a: Recording, b: Recording) -> Iterator[tuple[QTable, QTable]]:
@@ -63,37 +75,18 @@ def common_snapshots(a: Recording, b: Recording) -> Iterator[tuple[QTable, QTabl
         while right is not None and _moment(right) < _moment(left):
             right = next(theirs, None)
         if right is not None and _moment(right) == _moment(left) and right.values.shape == left.values.shape:
-            _check_shape(a, left)
+            states, actions = left.values.shape
+            widths = {a.mdp.joint_actions, *a.mdp.action_counts}
+            if states != a.mdp.states or actions not in widths:
+                raise RecordingError(
+                    f"{a.path}: found a Q-table of shape {left.values.shape}, expected {a.mdp.states} states "
+                    f"and one of {sorted(widths)} actions."
+                )
             yield left, right
 
 
 def _moment(table: QTable) -> tuple[int, int]:
     return table.episode, table.table
-
-
-def _check_shape(recording: Recording, table: QTable) -> None:
-    mdp = recording.mdp
-    widths = (mdp.joint_actions, *mdp.action_counts)
-    if table.values.shape[0] != mdp.states or table.values.shape[1] not in widths:
-        raise RecordingError(
-            f"{recording.path}: found a Q-table of shape {table.values.shape}, expected {mdp.states} states "
-            f"and one of {sorted(set(widths))} actions."
-        )
-
-
-def _table_diff(mdp: Mdp, a: QTable, b: QTable, visits: NDArray[np.int64] | None) -> TableDiff:
-    apart = np.abs(a.values - b.values)
-    other = a.values.argmax(axis=1) != b.values.argmax(axis=1)
-    weights = visits if visits is not None and visits.sum() else None
-    return TableDiff(
-        episode=a.episode,
-        agent=a.agent,
-        largest=float(apart.max()),
-        mean=float(apart.mean()),
-        greedy_share=float(other.mean()),
-        greedy_share_visited=float("nan") if weights is None else float(other @ weights / weights.sum()),
-        cells=_largest_cells(mdp, a, b, apart),
-    )
 
 
 def _largest_cells(mdp: Mdp, a: QTable, b: QTable, apart: NDArray[np.float64]) -> list[Cell]:

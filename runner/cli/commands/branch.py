@@ -14,7 +14,7 @@ from click.core import ParameterSource
 from runner.analysis.sections import Grid
 from runner.cli.command import Command, option
 from runner.cli.options import json_option, recordings_option, run_argument, set_option, trust_option
-from runner.cli.output import draw, facts, grid_table, print_json, say
+from runner.cli.output import draw, facts, grid_table, print_json, print_result, say
 from runner.cli.parameter_types import COUNT, INDEX, PLACE
 from runner.cli.progress import steps_line
 from runner.cli.runs import command_for, compilation_notice, find_recorded, run_as_json, run_facts
@@ -248,9 +248,7 @@ def _print_what_if(run: Run, at: StepRef, actions: tuple[str, ...], as_json: boo
 
     with compilation_notice():
         result = what_if(run, at=at, actions=actions)
-    if as_json:
-        print_json(result.as_json())
-        return
-    draw(facts({"run": f"{run.run_id}  {run.title}"} | result.facts), "", grid_table(result.grid))
-    for note in result.notes:
+    head = facts({"run": f"{run.run_id}  {run.title}"} | result.facts)
+    print_result(as_json, result.as_json(), head, "", grid_table(result.grid))
+    for note in () if as_json else result.notes:
         say(f"Note: {note}.")

@@ -20,7 +20,7 @@ from runner.cli.options import (
     recordings_option,
     run_argument,
 )
-from runner.cli.output import draw, facts, print_json, say, table, title
+from runner.cli.output import draw, facts, print_json, print_result, say, table, title
 from runner.cli.runs import find
 from runner.errors import ExitCode, RunnerError
 from runner.runs.catalogue.columns import with_same_as
@@ -65,11 +65,10 @@ def label_command(
     if name is not None or note is not None or tags or untags:
         labels = label(run, name, _from_stdin() if note == "-" else note, tags, untags)
     shown_name = labels.name or run.file.name
-    if as_json:
-        print_json({"run_id": run.run_id, "name": shown_name, "tags": list(labels.tags), "note": labels.note})
-    else:
-        tag_list = " ".join(labels.tags) or UNKNOWN
-        draw(facts({"run": run.run_id, "name": shown_name, "tags": tag_list, "note": labels.note or UNKNOWN}))
+    values = {"run_id": run.run_id, "name": shown_name, "tags": list(labels.tags), "note": labels.note}
+    tag_list = " ".join(labels.tags) or UNKNOWN
+    rows = {"run": run.run_id, "name": shown_name, "tags": tag_list, "note": labels.note or UNKNOWN}
+    print_result(as_json, values, facts(rows))
     if missing:
         say(f"Run {run.run_id} had no tag {', '.join(missing)}.")
 

@@ -13,7 +13,7 @@ import click
 from runner.cli import error_as_json, exit_code_of
 from runner.cli.command import Group, argument, option, record
 from runner.cli.options import json_option, limit_option, recordings_option, workers_option
-from runner.cli.output import draw, facts, print_json, say, table
+from runner.cli.output import draw, facts, print_json, print_result, say, table
 from runner.cli.parameter_types import FILE, ConfigName, RunName
 from runner.cli.progress import bytes_line
 from runner.cli.runs import find_recorded, print_received
@@ -314,12 +314,10 @@ def _watched(client: Client, number: int) -> RemoteJob:
 
 
 def _print_job(job: RemoteJob, as_json: bool) -> None:
-    if as_json:
-        print_json(_job_as_json(job))
-        return
     runs = "\n".join(f"{run_id}  seed {seed}" for seed, run_id in job.begun.items())
     title = f"{job.number}  {job.name}, {job.state}"
-    draw(facts({"job": title, "runs": runs or UNKNOWN, "error": job.error}))
+    rows = {"job": title, "runs": runs or UNKNOWN, "error": job.error}
+    print_result(as_json, _job_as_json(job), facts(rows))
 
 
 def _job_as_json(job: RemoteJob) -> dict[str, object]:

@@ -18,9 +18,9 @@ from runner.cli.parameter_types import INDEX
 from runner.cli.runs import find
 from runner.errors import RunnerError
 from runner.runs.catalogue.columns import STATUSES
-from runner.runs.listing import run_in
 from runner.runs.run import Run, recordings_folder
 from runner.util.humanize import UNKNOWN, ago, counted, number, size
+from runner.util.values import Json
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.removal import Removal
@@ -110,7 +110,7 @@ def prune_command(
     """
     from runner.runs.catalogue.filters import parse, seconds_of
     from runner.runs.catalogue.index import look
-    from runner.runs.catalogue.removal import Criteria, plan, plan_row, unwanted
+    from runner.runs.catalogue.removal import Criteria, plan_row, unwanted
 
     if explanations:
         if words or older_than is not None or keep_last is not None or statuses or foreign:
@@ -127,11 +127,7 @@ def prune_command(
     if criteria.filter.condition is None and older_than is None and keep_last is None and not statuses:
         raise click.UsageError("expected a FILTER, --older-than, --keep-last or --status: which runs?")
     rows, protected = look(recordings, lambda index: unwanted(index, criteria, time.time()), say)
-    if dry_run:
-        removals = [plan_row(row, foreign) for row in rows]
-    else:
-        places = [(Path(row["root"]), row["entry"]) for row in rows]
-        removals = [plan(run, root, foreign) for root, entry in places if (run := run_in(root / entry))]
+    removals = [plan_row(row, foreign) for row in rows]
     refusals = {each.run_id: each.refusal for each in removals if each.refusal}
     for run_id, reason in refusals.items():
         say(f"Run {run_id} stays: {reason}.")
@@ -159,17 +155,23 @@ def _prune_explanations(recordings: Sequence[Path], dry_run: bool, yes: bool, as
         draw(table("explanation", "runs", "frees", rows=cells, left=("explanation",)))
         for run in (run for each in explanations for run in each.runs if run.refusal):
             say(f"Run {run.run_id} stays: {run.refusal}.")
+    what = counted(len(explanations), "explanation")
     if explanations and not dry_run:
-        _confirm(f"Remove {counted(len(explanations), 'explanation')} for good, and free {size(freed)}?", yes)
+        _confirm(f"Remove {what} for good, and free {size(freed)}?", yes)
         for each in explanations:
             remove_trained(each)
+    rows = [{"name": each.name, "bytes": each.bytes} for each in explanations]
+    _print_removed(what, {"dry_run": dry_run, "freed": freed, "removed": rows}, as_json)
+
+
+def _print_removed(what: str, result: Json, as_json: bool) -> None:
+    """Print what was removed, or would be."""
     if as_json:
-        rows = [{"name": each.name, "bytes": each.bytes} for each in explanations]
-        print_json({"dry_run": dry_run, "freed": freed, "removed": rows})
-    elif dry_run:
-        say(f"Nothing was removed; it would free {size(freed)}.")
+        print_json(result)
+    elif result["dry_run"]:
+        say(f"Nothing was removed; it would free {size(result['freed'])}.")
     else:
-        echo(f"Removed {counted(len(explanations), 'explanation')}, freed {size(freed)}.")
+        echo(f"Removed {what}, freed {size(result['freed'])}.")
 
 
 def _confirm(question: str, yes: bool) -> None:
@@ -202,30 +204,40 @@ def _carry_out(
             remove(removal, foreign)
         for root in {removal.root for removal in removals}:
             clean(root)
-    if as_json:
-        reasons = [{"run_id": run_id, "why": reason} for run_id, reason in kept.items()]
-        removed = [_as_json(removal) for removal in removals]
-        print_json(
-            {"dry_run": dry_run, "freed": freed, "checkpoints": contents, "removed": removed, "kept": reasons}
-        )
-    elif dry_run:
-        say(f"Nothing was removed; it would free {size(freed)}.")
-    else:
-        echo(f"Removed {counted(len(removals), 'run')}, freed {size(freed)}.")
-
-
-def _as_json(removal: Removal) -> dict[str, object]:
-    return {
-        "run_id": removal.run_id,
-        "name": removal.name,
-        "status": removal.status,
-        "path": str(removal.folder.absolute()),
-        "bytes": removal.freed,
+    removed = [
+        {
+            "run_id": removal.run_id,
+            "name": removal.name,
+            "status": removal.status,
+            "path": str(removal.folder.absolute()),
+            "bytes": removal.freed,
+        }
+        for removal in removals
+    ]
+    reasons = [{"run_id": run_id, "why": reason} for run_id, reason in kept.items()]
+    result = {
+        "dry_run": dry_run,
+        "freed": freed,
+        "checkpoints": contents,
+        "removed": removed,
+        "kept": reasons,
     }
+    _print_removed(counted(len(removals), "run"), result, as_json)
 
 
 def _draw(removals: Sequence[Removal]) -> None:
-    rows = [_cells(removal) for removal in removals]
+    rows = [
+        (
+            removal.run_id,
+            removal.name,
+            UNKNOWN if removal.seed is None else str(removal.seed),
+            removal.status,
+            UNKNOWN if removal.success_percent is None else number(removal.success_percent),
+            ago(removal.created),
+            size(removal.freed),
+        )
+        for removal in removals
+    ]
     if console().is_terminal and len(removals) <= _MAX_DRAWN:
         draw(table(*_HEADINGS, rows=rows, left=_LEFT, shrinking=("name",)))
     else:
@@ -233,18 +245,6 @@ def _draw(removals: Sequence[Removal]) -> None:
     for removal in removals:
         if removal.is_archived:
             say(_archive_notice(removal.run()))
-
-
-def _cells(removal: Removal) -> tuple[str, ...]:
-    return (
-        removal.run_id,
-        removal.name,
-        UNKNOWN if removal.seed is None else str(removal.seed),
-        removal.status,
-        UNKNOWN if removal.success_percent is None else number(removal.success_percent),
-        ago(removal.created),
-        size(removal.freed),
-    )
 
 
 def _archive_notice(run: Run) -> str:

@@ -10,11 +10,11 @@ import click
 
 from runner.cli.command import Command, option
 from runner.cli.options import json_option, recordings_option, run_argument, trust_option
-from runner.cli.output import draw, facts, print_json
+from runner.cli.output import facts, print_result
 from runner.cli.parameter_types import COUNT
 from runner.cli.progress import bytes_line, count_line
 from runner.cli.runs import command_for, find_recording, folded, job_progress, require_over
-from runner.errors import Diverged, ExitCode, RunnerError
+from runner.errors import ExitCode, RunnerError
 from runner.runs.locking import locked
 from runner.runs.run import Run
 from runner.runs.shards import shards_in_words, shards_of
@@ -23,7 +23,6 @@ from runner.util.humanize import UNKNOWN, counted, size
 if TYPE_CHECKING:
     from runner.execution.verification import Verification
     from runner.recording.repair import Repair
-    from runner.replay.differences import Difference
 
 
 @click.command("verify", cls=Command)
@@ -88,10 +87,7 @@ def verify_command(
 
         with count_line("steps rerun", 0 if sample else found.train_steps + found.eval_steps) as count:
             found = rerun_loop(found, sample, tolerance, trust, count)
-    if as_json:
-        print_json(_as_json(found))
-    else:
-        draw(facts(_rows(found, run)))
+    print_result(as_json, _as_json(found), facts(_rows(found, run)))
     if not found.sound or (rerun and found.reason):
         raise click.exceptions.Exit(ExitCode.DIFFERENT)
 
@@ -154,27 +150,35 @@ def _verdict(found: Verification) -> str:
 
 def _as_json(found: Verification) -> dict[str, object]:
     """Return a verdict and all that belongs to it, as JSON."""
-    keys = ("verdict", "act", "train_steps", "eval_steps", "episodes", "unfinished", "steps")
-    more = ("left_out", "cut_off", "of_episodes", "tolerance", "assumed", "notes")
-    texts = {
-        key: getattr(found, key) or None for key in ("reason", "finding", "content_digest", "not_compared")
-    }
-    changes = {key: {"then": then, "here": here} for key, (then, here) in found.changes.items()}
-    values = {key: getattr(found, key) for key in (*keys, *more)}
-    difference = None if found.difference is None else _difference(found.difference)
+    keys = (
+        "verdict",
+        "act",
+        "train_steps",
+        "eval_steps",
+        "episodes",
+        "unfinished",
+        "steps",
+        "left_out",
+        "cut_off",
+        "of_episodes",
+        "tolerance",
+        "assumed",
+        "notes",
+    )
+    texts = ("reason", "finding", "content_digest", "not_compared")
+    plain = (str, int, float, list, dict, type(None))
     return {
         "path": str(found.path.absolute()),
-        **values,
-        **texts,
+        **{key: getattr(found, key) for key in keys},
+        **{key: getattr(found, key) or None for key in texts},
         "environment": None if found.composition is None else found.composition.as_json(),
-        "difference": difference,
-        "changes": changes,
+        "difference": found.difference
+        and {
+            key: value if isinstance(value, plain) else str(value)
+            for key, value in vars(found.difference).items()
+        },
+        "changes": {key: {"then": then, "here": here} for key, (then, here) in found.changes.items()},
     }
-
-
-def _difference(difference: Diverged | Difference) -> dict[str, object]:
-    plain = (str, int, float, list, dict, type(None))
-    return {key: value if isinstance(value, plain) else str(value) for key, value in vars(difference).items()}
 
 
 _MESSAGES: Final = {
@@ -244,11 +248,9 @@ def repair_command(
                 # Resuming the run must arrive at the digest that it had.
                 own.update(status="interrupted", proof=own.summary.content_digest)
         done.append((repaired, own))
-    if as_json:
-        first, *others = [_repair_as_json(repaired) for repaired, _ in done]
-        print_json(first | ({"shards": others} if others else {}))
-    else:
-        draw(*(facts(_repair(repaired, own)) for repaired, own in done))
+    first, *others = [_repair_as_json(repaired) for repaired, _ in done]
+    value = first | ({"shards": others} if others else {})
+    print_result(as_json, value, *(facts(_repair(repaired, own)) for repaired, own in done))
     whole = run if run is None else folded(run)
     if not all(repaired.lossless for repaired, _ in done) or (whole and whole.summary.unfolded):
         raise click.exceptions.Exit(ExitCode.DIFFERENT)

@@ -90,10 +90,7 @@ def plan(run: Run, root: Path, foreign: bool = False) -> Removal:
 
 
 def plan_row(row: IndexRow, foreign: bool = False) -> Removal:
-    """Return the removal of a run by its row in the index, which is quicker for very many runs.
-
-    This is for showing only: before runs are removed, `plan` reads their own files.
-    """
+    """Return the removal of a run by its row in the index, which is quicker for very many runs."""
     folder = Path(row["root"], row["entry"])
     return _removal(row, folder, _linked(folder) or _unreadable(folder), foreign)
 
