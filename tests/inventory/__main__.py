@@ -1,24 +1,20 @@
 """Compare all that a user can see or read by a program with the inventory.
 
 `python -m tests.inventory` names what is missing and what is new, and ends with exit code 1 if anything is;
-`--write` takes the inventory; `--screenshots FOLDER` takes pictures of every page.
+`--write` adds what is new, and removes what gone.txt names;
+`--screenshots FOLDER` takes pictures of every page.
 """
 
 from __future__ import annotations
 
 import argparse
-import fnmatch
-import os
 import sys
 import tempfile
 from pathlib import Path
 
-from tests.inventory.reading import differences, read, write
-from tests.inventory.taking import FILES, Shop, chromium, screenshots
-
-HERE = Path(__file__).parent
-GONE = HERE / "gone.txt"
-"""Patterns `NAME: LINE` of what was removed on purpose, each below a comment that says why."""
+from tests.browsing import chromium
+from tests.inventory.comparing import ADVICE, differences, gone_patterns, read, write
+from tests.inventory.taking import FILES, Shop, screenshots
 
 
 def main() -> int:
@@ -27,29 +23,18 @@ def main() -> int:
     parser.add_argument("--write", action="store_true", help="write the inventory")
     parser.add_argument("--screenshots", type=Path, metavar="FOLDER", help="write pictures of every page")
     options = parser.parse_args()
-    os.environ |= {"DUALTAXI_CODE": "off", "MUJOCO_GL": "egl"}
-    with tempfile.TemporaryDirectory() as folder:
-        for name in ("XDG_CACHE_HOME", "XDG_DATA_HOME", "XDG_CONFIG_HOME", "XDG_STATE_HOME"):
-            os.environ[name] = f"{folder}/{name}"
-        with Shop(Path(folder) / "shop") as shop, chromium() as browser:
-            if options.screenshots:
-                screenshots(shop, browser, options.screenshots)
-                return 0
-            found = []
-            for name, take in FILES.items():
-                inventory = take(shop, browser)
-                if options.write:
-                    write(HERE / name, inventory)
-                else:
-                    found += differences(read(HERE / name), inventory, is_gone)
-    print("\n".join(found) or "Nothing is missing, and nothing is new.")
-    return 1 if found else 0
-
-
-def is_gone(name: str, line: str) -> bool:
-    """Return whether a line may be missing."""
-    patterns = [text for text in GONE.read_text(encoding="utf-8").splitlines() if text and text[0] != "#"]
-    return any(fnmatch.fnmatchcase(f"{name}: {line}", pattern) for pattern in patterns)
+    problems = []
+    with tempfile.TemporaryDirectory() as folder, Shop(Path(folder)) as shop, chromium() as browser:
+        if options.screenshots:
+            screenshots(shop, browser, options.screenshots)
+            return 0
+        for name, take in FILES.items():
+            found = take(shop, browser)
+            if options.write:
+                write(name, found, gone_patterns())
+            problems += differences(read(name), found, gone_patterns())
+    print("\n".join([*problems, ADVICE] if problems else ["Nothing is missing, and nothing is new."]))
+    return 1 if problems else 0
 
 
 if __name__ == "__main__":

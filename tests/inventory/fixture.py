@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,13 @@ from runner.config.job import Job
 from runner.execution.session import run_job
 from runner.export.mcap import export_mcap
 from runner.integrations.tensorboard import SummaryWriter
+from runner.recording.host import HostSampler
+from runner.recording.metadata import packed_provenance
+from runner.recording.observer import Observer
+from runner.recording.rewriting import rewrite
+from runner.runs import provenance
 from runner.runs.importing import import_recording
-from runner.runs.run import Run, create_run
+from runner.runs.run import Run, create_run, made_by
 from tests.runner.loops.making import Rooms
 
 ROOT = Path(__file__).parents[2]
@@ -38,6 +44,31 @@ def quick(**changes: Any) -> dict[str, Any]:
     return config | {"episodes": 30, "evaluation": evaluation} | changes
 
 
+def constant(content: bytes, *spaces: Any) -> Callable[[Any], float]:
+    """Return a policy that is the same for every observation; for `values`."""
+    return lambda observation: 0.5
+
+
+@contextlib.contextmanager
+def same_everywhere() -> Iterator[None]:
+    """Record no fact of this machine or installation, and of each run what it used of the machine, once."""
+    take = Observer.take
+
+    def take_measured(observer: Observer, is_last: bool = False) -> Any:
+        if is_last and observer.host:
+            observer.see_host(HostSampler().sample())
+        return take(observer, is_last)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Observer, "take", take_measured)
+        machine = {"dualtaxi": "1.0", "python": "3.11", "platform": "Linux"}
+        patch.setattr(provenance, "_machine", lambda: machine)
+        patch.setattr(provenance, "_packages", lambda: {"package.gymnasium": "1.2"})
+        patch.setattr(provenance, "_packed_constants", provenance._packed_constants.__wrapped__)
+        patch.setattr(provenance, "_settings", lambda _: {"host": "machine", "user": "user"})
+        yield
+
+
 def make_runs(folder: Path) -> dict[str, Run]:
     """Record a run of each kind into a folder; return them by name."""
     runs = dict(_jobs(folder)) | dict(_loops(folder))
@@ -45,14 +76,25 @@ def make_runs(folder: Path) -> dict[str, Run]:
         runs["cooperative"], at="5:2", action="north + east", name="job-branch", recordings=folder
     )
     runs["job-branch"] = branch.run
-    runs["loop-branch"] = runner.branch(
+    loop_branch = runner.branch(
         runs["pole"], at="0:3", action=0, policy="random", name="loop-branch", recordings=folder
-    ).run
-    _sweep(folder)
-    runner.explain(
-        quick(name="plain"), quick(name="eager", epsilon=0.5), seeds=2, workers=1, recordings=folder
     )
+    runs["loop-branch"] = _made_here(loop_branch.run)
+    _sweep(folder)
+    plain, eager = quick(name="plain"), quick(name="eager", epsilon=0.5)
+    for config in (plain, eager):
+        folder.with_name(f"{config['name']}.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
+    runner.explain(plain, eager, seeds=2, workers=1, recordings=folder)
     return runs
+
+
+def _made_here(run: Run) -> Run:
+    """Give a run that another process recorded the same provenance as the others."""
+    fresh = run.folder / "fresh.mcap"
+    here = packed_provenance(provenance.provenance())
+    rewrite(run.recording, fresh, lambda name, entries: here if name == "provenance" else entries)
+    fresh.replace(run.recording)
+    return run.update(provenance=made_by(provenance.provenance()))
 
 
 def _jobs(folder: Path) -> Iterator[tuple[str, Run]]:
@@ -68,7 +110,8 @@ def _jobs(folder: Path) -> Iterator[tuple[str, Run]]:
             recordings=folder,
         ),
     )
-    yield "sparse", runner.run(quick(name="sparse", recording={"steps": "none"}), seed=2, recordings=folder)
+    sparse = {"steps": "none", "system": False}
+    yield "sparse", runner.run(quick(name="sparse", recording=sparse), seed=2, recordings=folder)
     config = from_mapping(quick(name="interrupted"))
     yield "interrupted", run_job(Job(config, 0), create_run(folder, config, 0), stop=_after(2))
     damaged = runner.run(quick(name="damaged"), seed=3, recordings=folder)

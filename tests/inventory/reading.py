@@ -5,24 +5,23 @@ from __future__ import annotations
 import inspect
 import json
 import re
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-import click
 from click.testing import CliRunner
 from selenium.common.exceptions import TimeoutException
 from selenium.webdriver.remote.webdriver import WebDriver
 
 import runner
 from runner.cli import cli
+from tests.doors import walk
 from tests.runner.service.served import wait
 
 Lines = dict[str, list[str]]
 """What is inventoried -> its lines, sorted, each once."""
 
-_MASKS = (
+_MASKS: Final = (
+    (r"\bdualtaxi_[\w-]{43}", "TOKEN"),
     (r"\b[0-9a-f]{8,}\b", "HEX"),
     (r"[+-]?\d[\d,.]*(e[+-]?\d+)?", "#"),
     (r"# (k|M|G)?B\b", "SIZE"),
@@ -31,11 +30,6 @@ _MASKS = (
     (r"\bjust now\b|\bnow\b", "TIME"),
 )
 """Patterns of what differs from run to run or machine to machine, and what stands for them."""
-
-
-_MACHINE = re.compile(r"(^|[ .])(env\.[A-Z]|container|gpu|git\.|processor|memory|packages|code\.script)")
-"""Lines about the machine, which are left out: another machine has others."""
-STILL_SECONDS = 0.4
 
 
 class Mask:
@@ -57,18 +51,44 @@ class Mask:
 
     def lines(self, texts: Iterable[str]) -> list[str]:
         """Return masked lines, sorted, each once."""
-        return sorted({line for line in map(self, texts) if line and not _MACHINE.search(line)})
+        return sorted({line for line in map(self, texts) if line})
 
 
 # --- pages ----------------------------------------------------------------------------------------------
 
-READ_PAGE = """
+COUNT_REQUESTS: Final = """
+window.requestsUnderWay = 0;
+const request = window.fetch;
+window.fetch = async (...words) => {
+    window.requestsUnderWay += 1;
+    try {
+        const response = await request(...words);
+        const isRead = response.clone().blob().catch(() => {});
+        isRead.finally(() => setTimeout(() => { window.requestsUnderWay -= 1; }));
+        return response;
+    } catch (error) {
+        window.requestsUnderWay -= 1;
+        throw error;
+    }
+};
+"""
+"""Counts the requests of a page whose responses were not read to their end; runs before its own scripts."""
+READ_PAGE: Final = """
+return (async () => {
+const frame = () => new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve)));
+const isBusy = () => document.readyState !== "complete" || window.requestsUnderWay > 0 ||
+    document.querySelector("[aria-busy]") || [...document.images].some((image) => !image.complete);
+for (const node of document.querySelectorAll("details:not([open])")) {
+    node.open = node.dataset.wasClosed = true;
+}
+await frame();
+await frame();  // in which what is seen for the first time begins to load
+if (isBusy()) return null;
 const lines = [];
-const text = (node) => (node.innerText || node.textContent || "").trim().replace(/\\s+/g, " ");
-for (const node of document.querySelectorAll("details")) node.open = true;
-const seen = (node) => node.checkVisibility();
+const text = (node) => (node.innerText || node.textContent || "").trim();
 const each = (selector, describe) => {
-    for (const node of document.querySelectorAll(selector)) if (seen(node)) lines.push(describe(node));
+    const shown = [...document.querySelectorAll(selector)].filter((node) => node.checkVisibility());
+    lines.push(...shown.map(describe).filter((line) => !/^\\w+: *$/.test(line)));
 };
 lines.push("title: " + document.title);
 each("h1, h2, h3, h4", (node) => "heading: " + text(node));
@@ -78,39 +98,36 @@ each("a[href]", (node) => "link: " + text(node) + " -> " + decodeURIComponent(no
 each("button", (node) => "button: " + (text(node) || node.getAttribute("aria-label") || node.name));
 each("input, select, textarea", (node) => "field: " + (node.name || node.id) + " " + node.type +
     (node.options ? ": " + [...node.options].map(text).join(", ") : ""));
-each("svg[aria-label], svg[role=img], canvas[aria-label]", (node) => "chart: " +
-    (node.getAttribute("aria-label") || text(node.querySelector("title") || node)));
+const nameOf = (node) => node.getAttribute("aria-label") || text(node.querySelector("title") || node);
+each("[role=img], svg[aria-label], canvas[aria-label]", (node) => "chart: " + nameOf(node));
 each("svg title", (node) => "chart: " + text(node));
+each("svg[aria-label] text", (node) => /\\p{L}/u.test(text(node)) ?
+    "drawn: " + nameOf(node.closest("svg")) + ": " + text(node) : "drawn: ");
+each("svg[aria-label] [stroke^='var(--line-']", (node) => "drawn: " + nameOf(node.closest("svg")) +
+    ": curve " + "ABCDEFGHIJ"[/\\d+/.exec(node.getAttribute("stroke"))[0]]);
 each(".key li, .key button, .legend li", (node) => "series: " + text(node));
-const isOfMachine = (node) => node.closest("tr")?.querySelector("th[scope=row], th") &&
-    /\\/(config|system)$/.test(location.pathname);
 each("p, li, dt, dd, td, label, output, .message, [data-message]", (node) => {
     const own = [...node.childNodes].filter((child) => child.nodeType === Node.TEXT_NODE ||
         ["B", "EM", "STRONG", "CODE", "SPAN", "TIME", "KBD", "I", "SUB"].includes(child.nodeName));
-    if (node.nodeName === "TD" && isOfMachine(node)) return "";
     return "text: " + own.map((child) => (child.textContent || "").trim()).join(" ");
 });
 return lines;
+})();
 """
+"""Returns the lines of a page; null as long as it loads anything."""
 
 
 def read_page(browser: WebDriver, address: str, mask: Mask) -> list[str]:
-    """Return the lines of a page after its scripts ran: when nothing changed for a moment."""
+    """Return the lines of a page after its scripts ran: when it loads nothing and reads the same twice."""
     browser.get(address)
-    before: list[str] = []
-    changed = time.monotonic()
-    pending = (
-        "return document.readyState !== 'complete' || !!document.querySelector('[aria-busy]') || "
-        "/Computing|being made/.test(document.body.innerText)"
-    )
+    before: list[str] | None = None
 
     def is_still() -> bool:
-        nonlocal before, changed
-        is_pending = browser.execute_script(pending)  # first, as reading takes a while
-        now = mask.lines(browser.execute_script(READ_PAGE))
-        if is_pending or now != before:
-            before, changed = now, time.monotonic()
-        return time.monotonic() - changed > STILL_SECONDS
+        nonlocal before
+        lines = browser.execute_script(READ_PAGE)
+        now = None if lines is None else mask.lines(lines)
+        is_same, before = now is not None and now == before, now
+        return is_same
 
     try:
         wait(browser, is_still)
@@ -136,23 +153,12 @@ def key_paths(value: Any, path: str = "") -> Iterator[str]:
 # --- commands -------------------------------------------------------------------------------------------
 
 
-def walk(group: Any = cli, path: tuple[str, ...] = ()) -> Iterator[tuple[str, click.Command]]:
-    """Yield the words of every command, and the command."""
-    context = click.Context(group)
-    for name in group.list_commands(context):
-        command = group.get_command(context, name)
-        if isinstance(command, click.Group):
-            yield from walk(command, (*path, name))
-        else:
-            yield " ".join((*path, name)), command
-
-
 def read_help() -> Lines:
     """Return the help of every command."""
-    names = ["", *(name for name, _ in walk())]
+    names = ["", *(" ".join(path) for path, _ in walk())]
     return {
-        f"dualtaxi {name} --help".replace("  ", " "): CliRunner()
-        .invoke(cli, [*name.split(), "--help"], terminal_width=100)
+        " ".join(("dualtaxi", *name.split(), "--help")): CliRunner()
+        .invoke(cli, [*name.split(), "--help"], terminal_width=1000)
         .stdout.splitlines()
         for name in names
     }
@@ -168,8 +174,9 @@ def read_command(words: list[str], masking: Callable[[], Mask]) -> list[str]:
     lines = [f"exit code {done.exit_code:d}"]
     if "--json" in words:
         objects = [json.loads(line) for line in _json_texts(done.stdout)]
+        objects += [json.loads(line) for line in done.stderr.splitlines() if line.startswith("{")]
         return [*lines, *mask.lines(f"key: {path}" for each in objects for path in key_paths(each))]
-    printed = [*done.stdout.splitlines(), *(f"stderr: {line}" for line in done.stderr.splitlines())]
+    printed = [*done.stdout.splitlines(), *(f"stderr: {line}" for line in done.stderr.splitlines() if line)]
     return [*lines, *mask.lines(printed)]
 
 
@@ -210,37 +217,3 @@ def _signature(name: str, value: object) -> str:
         parameters = inspect.signature(value).parameters.values()
         return f"{name}({', '.join(f'{each.kind.description[:3]} {each.name}' for each in parameters)})"
     return name
-
-
-# --- files ----------------------------------------------------------------------------------------------
-
-
-def write(file: Path, inventory: Lines) -> None:
-    """Write an inventory as text: a heading, then its lines, indented."""
-    parts = [f"{name}\n" + "".join(f"    {line}\n" for line in lines) for name, lines in inventory.items()]
-    file.write_text("".join(parts), encoding="utf-8")
-
-
-def read(file: Path) -> Lines:
-    """Return an inventory from its text."""
-    inventory: Lines = {}
-    name = ""
-    for line in file.read_text(encoding="utf-8").splitlines():
-        if line.startswith("    "):
-            inventory[name].append(line[4:])
-        elif line:
-            name = line
-            inventory[name] = []
-    return inventory
-
-
-def differences(kept: Lines, found: Lines, is_gone: Callable[[str, str], bool]) -> list[str]:
-    """Return what is missing and what is new, a line each; what may be gone is left out."""
-    result = []
-    for name in dict.fromkeys([*kept, *found]):
-        before, now = kept.get(name, []), found.get(name, [])
-        result += [
-            f"missing: {name}: {line}" for line in before if line not in now and not is_gone(name, line)
-        ]
-        result += [f"new: {name}: {line}" for line in now if line not in before]
-    return result

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import itertools
 import os
 import shlex
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Self
 
-from selenium import webdriver
-from selenium.webdriver.chrome.service import Service
+import pytest
 from selenium.webdriver.remote.webdriver import WebDriver
 
 from runner.debugging.explanation_files import explanations_in
@@ -20,9 +19,10 @@ from runner.runs.listing import list_runs
 from runner.runs.run import UNLISTED
 from runner.service.app import create_app
 from runner.service.settings import Settings
-from tests.inventory.fixture import make_runs
-from tests.inventory.forms import COMMANDS, PAGES, ROUTE_RUNS, ROUTES, RUN_PAGES
+from tests.inventory.fixture import make_runs, same_everywhere
+from tests.inventory.forms import ADDRESSES, COMMANDS, REPORTS, ROUTE_RUNS, ROUTES
 from tests.inventory.reading import (
+    COUNT_REQUESTS,
     Lines,
     Mask,
     key_paths,
@@ -32,93 +32,103 @@ from tests.inventory.reading import (
     read_page,
 )
 from tests.runner.service.served import Served
+from tests.waiting import until
 
+ENVIRONMENT: Final = {"DUALTAXI_CODE": "off", "MUJOCO_GL": "egl", "COLUMNS": "200", "NO_COLOR": "1"}
+CLOSE: Final = """
+for (const node of document.querySelectorAll("details[data-was-closed]")) node.open = false;
+return document.body.scrollHeight;
+"""
+"""Closes what was opened to be read; returns the height of the page."""
+WINDOW: Final = (1440, 8000)
 WIDTHS: Final = (1440, 390)
 THEMES: Final = ("light", "dark")
 
 
-class Shop:
-    """The folder of runs, and a service over it; a context manager."""
+class Shop(contextlib.ExitStack):
+    """A folder with runs of every kind, and a service over it; a context manager."""
 
     def __init__(self, folder: Path) -> None:
+        super().__init__()
         self.folder = folder
         self.recordings = folder / "recordings"
         self.out = folder / "out"
 
     def __enter__(self) -> Self:
+        super().__enter__()
         self.out.mkdir(parents=True)
+        patch = self.enter_context(pytest.MonkeyPatch.context())
+        for name in ("XDG_CACHE_HOME", "XDG_DATA_HOME", "XDG_CONFIG_HOME", "XDG_STATE_HOME"):
+            patch.setenv(name, str(self.folder / name))
+        for name, value in ENVIRONMENT.items():
+            patch.setenv(name, value)
+        self.enter_context(same_everywhere())
         self.runs = make_runs(self.recordings)
-        (self.explanation,) = explanations_in(self.recordings)
-        self.served = Served(self.recordings)
-        self.served.start()
-        config = "name: queued\nmode: cooperative\nepisodes: 20\nseed: 0\n"
-        self.served.post("/jobs", config)
+        (explanation,) = explanations_in(self.recordings)
+        self.pair = explanation.split("/")[0]
+        self.served = self.enter_context(Served(self.recordings))
+        self.served.post("/jobs", "name: queued\nmode: cooperative\nepisodes: 20\nseed: 0\n")
         self.served.until(lambda jobs: jobs[1]["state"] == "finished")
+        until(bool, lambda: self.served.get("/runs?filter=name:queued AND status:finished")["runs"])
+        patch.setenv("DUALTAXI_RECORDINGS", str(self.recordings))
         return self
-
-    def __exit__(self, *_: object) -> None:
-        self.served.stop()
 
     @property
     def mask(self) -> Mask:
         """What masks the ids of all runs that there are now, folders, and the explanation's name."""
-        folders = (self.recordings, self.recordings / UNLISTED, self.out / "branches")
+        folders = (self.recordings, self.recordings / UNLISTED)
         ids = {run.run_id: f"RUN-{run.name}" for folder in folders for run in list_runs(folder)}
         names = {run.run_id: name.upper() for name, run in self.runs.items()}
-        caches = {os.environ.get("XDG_CACHE_HOME", "-"): "CACHE"}
-        paths = caches | {str(self.folder): "FOLDER", str(Path.cwd()): "CURRENT"}
-        explanation = {self.explanation: "EXPLANATION", self.explanation.split("/")[0]: "EXPLANATION"}
-        return Mask(explanation | paths | ids | names)
+        paths = {
+            os.environ["XDG_CACHE_HOME"]: "CACHE",
+            str(self.folder): "FOLDER",
+            str(Path.cwd()): "CURRENT",
+        }
+        return Mask({self.pair: "PAIR"} | paths | ids | names)
 
     def filled(self, text: str) -> str:
         """Return an address or command with the ids of runs in place of their names in braces."""
         for name, run in self.runs.items():
             text = text.replace(f"{{{name}}}", run.run_id)
-        return text.replace("{explanation}", self.explanation).replace("{out}", str(self.out))
+        words = {
+            "pair": self.pair,
+            "files": self.folder,
+            "out": self.out,
+            "url": self.served.url,
+        }
+        for name, word in words.items():
+            text = text.replace(f"{{{name}}}", str(word))
+        return text
 
     @property
     def addresses(self) -> dict[str, str]:
         """The pages: their addresses, as inventoried -> as the browser opens them."""
-        pages = {page: self.filled(page) for page in PAGES}
-        for ending, names in RUN_PAGES.items():
-            pages |= {
-                f"/runs/{{{name}}}{ending}": f"/runs/{self.runs[name].run_id}{ending}" for name in names
-            }
-        pages["/queue/1"] = "/queue/1"
-        return pages
-
-
-@contextlib.contextmanager
-def chromium() -> Iterator[WebDriver]:
-    """Start a browser."""
-    options = webdriver.ChromeOptions()
-    options.binary_location = shutil.which("chromium") or "chromium"
-    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1440,8000"):
-        options.add_argument(argument)
-    with webdriver.Chrome(options=options, service=Service(shutil.which("chromedriver"))) as browser:
-        yield browser
+        files = {name: f"file://{self.folder / name}" for name in REPORTS}
+        return {page: self.served.url + self.filled(page) for page in ADDRESSES} | files
 
 
 def take_pages(shop: Shop, browser: WebDriver) -> Lines:
     """Return what every page shows."""
+    _prepare(shop, browser)
     mask = shop.mask
-    return {
-        page: read_page(browser, shop.served.url + address, mask) for page, address in shop.addresses.items()
-    }
+    return {page: read_page(browser, address, mask) for page, address in shop.addresses.items()}
+
+
+def _prepare(shop: Shop, browser: WebDriver) -> None:
+    """Write the pages that commands write, and let the browser count requests and show whole pages."""
+    for name, words in REPORTS.items():
+        lines = read_command(shlex.split(shop.filled(f"{words} {shop.folder / name}")), lambda: shop.mask)
+        assert (shop.folder / name).exists(), lines
+    browser.set_window_size(*WINDOW)
+    browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": COUNT_REQUESTS})
 
 
 def take_commands(shop: Shop, _: WebDriver) -> Lines:
     """Return the help of every command, and what typical ones print."""
-    before = {name: os.environ.get(name) for name in ("DUALTAXI_RECORDINGS", "COLUMNS", "NO_COLOR")}
-    os.environ |= {"DUALTAXI_RECORDINGS": str(shop.recordings), "COLUMNS": "200", "NO_COLOR": "1"}
-    try:
-        typed = {
-            f"dualtaxi {words}": read_command(shlex.split(shop.filled(words)), lambda: shop.mask)
-            for words in COMMANDS
-        }
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.__setitem__(name, value)
+    typed = {
+        f"dualtaxi {words}".strip(): read_command(shlex.split(shop.filled(words)), lambda: shop.mask)
+        for words in COMMANDS
+    }
     return read_help() | typed
 
 
@@ -157,21 +167,20 @@ FILES: Final[dict[str, Callable[[Shop, WebDriver], Lines]]] = {
 
 
 def screenshots(shop: Shop, browser: WebDriver, folder: Path) -> None:
-    """Write a picture of every page, wide and narrow, light and dark."""
+    """Write a picture of every page, at most 4000 pixels of it, wide and narrow, light and dark."""
     folder.mkdir(parents=True, exist_ok=True)
-    for theme in THEMES:
+    _prepare(shop, browser)
+    mask = shop.mask
+    for theme, width in itertools.product(THEMES, WIDTHS):
         features = [{"name": "prefers-color-scheme", "value": theme}]
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
-        for width in WIDTHS:
-            metrics = {"width": width, "height": 1000, "deviceScaleFactor": 1, "mobile": width < 500}
-            browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
-            for number, (page, address) in enumerate(shop.addresses.items()):
-                read_page(browser, shop.served.url + address, shop.mask)
-                name = "".join(letter if letter.isalnum() else "-" for letter in page).strip("-") or "home"
-                height = browser.execute_script("return document.documentElement.scrollHeight")
-                clip = {"x": 0, "y": 0, "width": width, "height": min(height, 4000), "scale": 1}
-                shot = browser.execute_cdp_cmd(
-                    "Page.captureScreenshot", {"clip": clip, "captureBeyondViewport": True}
-                )
-                file = folder / f"{number:02}-{name}-{width}-{theme}.png"
-                file.write_bytes(base64.b64decode(shot["data"]))
+        metrics = {"width": width, "height": 4000, "deviceScaleFactor": 1, "mobile": width < 500}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+        for number, (page, address) in enumerate(shop.addresses.items()):
+            read_page(browser, address, mask)
+            name = "".join(letter if letter.isalnum() else "-" for letter in page).strip("-") or "home"
+            height = browser.execute_script(CLOSE)
+            clip = {"x": 0, "y": 0, "width": width, "height": min(height, 4000), "scale": 1}
+            shot = browser.execute_cdp_cmd("Page.captureScreenshot", {"clip": clip})
+            file = folder / f"{number:02}-{name}-{width}-{theme}.png"
+            file.write_bytes(base64.b64decode(shot["data"]))

@@ -2,21 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-
 import pytest
 
+from tests import browsing
 from tests.runner.recording.making import LAKE, TAXIS, make_run
-
-ARGUMENTS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--disable-dev-shm-usage",
-    "--window-size=1300,1000",
-    "--enable-unsafe-swiftshader",
-    "--use-angle=swiftshader",
-)
 
 
 @pytest.fixture(scope="session")
@@ -34,19 +23,7 @@ def lake(tmp_path_factory):
 @pytest.fixture(scope="session")
 def chromium():
     """Return Chromium, whose log holds its requests and errors."""
-    from selenium import webdriver
-    from selenium.webdriver.chrome.service import Service
-
-    program = shutil.which("chromium") or shutil.which("chromium-browser")
-    driver = shutil.which("chromedriver")
-    if (program is None or driver is None) and "DUALTAXI_CI" not in os.environ:
-        pytest.skip("needs Debian's chromium and chromium-driver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = program
-    for argument in ARGUMENTS:
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    with webdriver.Chrome(options=options, service=Service(driver)) as started:
+    with browsing.chromium(*browsing.WEBGL) as started:
         yield started
 
 

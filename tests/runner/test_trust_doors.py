@@ -14,7 +14,6 @@ import shutil
 import sys
 from pathlib import Path
 
-import click
 import gymnasium
 import pytest
 from click.testing import CliRunner
@@ -37,6 +36,7 @@ from runner.runs.marks import MARK_FILE
 from runner.runs.run import Run
 from runner.service.app import create_app
 from runner.service.settings import Settings
+from tests.doors import commands, routes
 
 TRAP = """\
 from pathlib import Path
@@ -274,16 +274,8 @@ WITHOUT_RUN = frozenset(
 """Commands that copy files or numbers, talk to a server, or do what a file of the user's own says."""
 
 
-def leaves(command=cli, path=()):
-    if not isinstance(command, click.Group):
-        return [" ".join(path)]
-    context = click.Context(command)
-    names = command.list_commands(context)
-    return [leaf for name in names for leaf in leaves(command.get_command(context, name), (*path, name))]
-
-
 def test_every_command_is_walked_or_reads_no_run():
-    assert sorted(leaves()) == sorted([*COMMANDS, *WITHOUT_RUN])
+    assert sorted(map(" ".join, commands())) == sorted([*COMMANDS, *WITHOUT_RUN])
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
@@ -399,14 +391,6 @@ OF_NO_RUN = frozenset(
     }
 )
 ENDLESS = ("/events",)
-
-
-def routes(owner):
-    for route in owner:
-        if hasattr(route, "path"):
-            yield from ((method, route.path) for method in sorted(getattr(route, "methods", None) or ["GET"]))
-        else:
-            yield from routes(getattr(route, "original_router", route).routes)
 
 
 @pytest.fixture

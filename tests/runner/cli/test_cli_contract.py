@@ -24,20 +24,9 @@ from runner.client.jobs import RemoteJob
 from runner.errors import ExitCode
 from runner.recording.rewriting import rewrite
 from runner.runs.resolve import find_run
+from tests.doors import commands
 
-
-def walk(group=cli, path=()):
-    """Yield the path of every command and the command."""
-    context = click.Context(group)
-    for name in group.list_commands(context):
-        command = group.get_command(context, name)
-        if isinstance(command, click.Group):
-            yield from walk(command, (*path, name))
-        else:
-            yield (*path, name), command
-
-
-EVERY = dict(walk())
+EVERY = commands()
 WITH_JSON = {
     path: command for path, command in EVERY.items() if any(p.name == "as_json" for p in command.params)
 }

@@ -14,20 +14,12 @@ from click.shell_completion import ShellComplete
 from click.testing import CliRunner
 
 from runner.cli import COMMANDS, cli, commands
+from tests.doors import walk
 
 HEAVY = {"numpy", "numba", "gymnasium", "pydantic", "rich", "yaml", "mcap", "google", "blake3", "psutil"}
 
 
-def _walk(group, path=()):
-    context = click.Context(group)
-    for name in group.list_commands(context):
-        command = group.get_command(context, name)
-        yield (*path, name), command
-        if isinstance(command, click.Group):
-            yield from _walk(command, (*path, name))
-
-
-EVERY = list(_walk(cli))
+EVERY = list(walk())
 NAMES = [" ".join(path) for path, _ in EVERY]
 
 
