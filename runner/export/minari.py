@@ -18,7 +18,8 @@ from runner.export.contents import Ranges, whole_ranges
 from runner.export.minari_episodes import Episode, episodes_in
 from runner.recording.gym_spaces import restore_space
 from runner.recording.reader import Recording
-from runner.replay.trust import require_may_train
+from runner.replay.trust import require_listed, trusting
+from runner.runs.marks import environment_of_job
 from runner.util.arrays import Array
 from runner.util.extras import require
 
@@ -182,10 +183,12 @@ def _environment_spec(
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            made = {"env": {"id": env_id, "kwargs": kwargs}, "rewards": recording.config.get("rewards")}
-            require_may_train(recording.path, made)
-            env = gymnasium.make(env_id, **kwargs)
-            env.close()
+            maker = environment_of_job(recording.config) if recording.is_job else recording.maker
+            with trusting(recording.path, maker) as is_trusted:
+                if not is_trusted:
+                    require_listed(env_id, kwargs)
+                env = gymnasium.make(env_id, **kwargs)
+                env.close()
     except Exception as error:  # an environment may raise anything
         return None, [f"{env_id} cannot be made here ({error}); the dataset does not specify it."]
     if (env.observation_space, env.action_space) == (observations, actions):

@@ -71,6 +71,16 @@ def test_observations_and_actions_equal_those_of_the_loop(name, tmp_path, monkey
         assert dataset.recover_environment().spec.id == name
 
 
+def test_the_users_own_environment_of_no_listed_package_is_specified(tmp_path, monkeypatch):
+    spec = gymnasium.envs.registration.EnvSpec("own/Rooms-v0", entry_point="tests.runner.loops.making:Rooms")
+    monkeypatch.setitem(gymnasium.registry, "own/Rooms-v0", spec)
+    with runner.record(gymnasium.make("own/Rooms-v0"), tmp_path, name="own") as rec:
+        list(play(rec, 40))
+    dataset, output = exported(rec.run, tmp_path, monkeypatch)
+    assert "did not record" not in output
+    assert dataset.recover_environment().spec.id == "own/Rooms-v0"
+
+
 def test_images_are_exported_exactly(tmp_path, monkeypatch):
     class Camera(Rooms):
         def __init__(self) -> None:
