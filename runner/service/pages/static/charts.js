@@ -5,23 +5,32 @@ import { request } from "./api.js";
 
 const box = document.querySelector("[data-charts]");
 const runs = JSON.parse(box.dataset.charts);
-const plots = box.querySelector("[data-plots]"), message = box.querySelector("[data-message]");
-const form = box.querySelector("form"), fields = form.elements;
-const COLOURS = 7;  // of lines, in the style
+const plots = box.querySelector("[data-plots]"),
+  message = box.querySelector("[data-message]");
+const form = box.querySelector("form"),
+  fields = form.elements;
+const COLOURS = 7; // of lines, in the style
 const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3]];
-const MAX_AXES = 100;  // logged values among the axes to choose from
+const MAX_AXES = 100; // logged values among the axes to choose from
 const SHARES = "training.reward";
 const shown = new Map();
-let requests = 0, last = null;
+let requests = 0,
+  last = null;
 
 // --- what is chosen: in the address, and in the form ----------------------------------------------------
 
 function chosen() {
   const query = new URLSearchParams(location.search);
-  const number = (name) => query.get(name) ? Number(query.get(name)) : null;
+  const number = (name) => (query.get(name) ? Number(query.get(name)) : null);
   return {
-    axis: query.get("axis") ?? "episodes", from: number("from"), to: number("to"), smooth: number("smooth") ?? 0,
-    log_x: query.has("log_x"), log_y: query.has("log_y"), lines: query.has("lines"), logged: query.get("logged") ?? "",
+    axis: query.get("axis") ?? "episodes",
+    from: number("from"),
+    to: number("to"),
+    smooth: number("smooth") ?? 0,
+    log_x: query.has("log_x"),
+    log_y: query.has("log_y"),
+    lines: query.has("lines"),
+    logged: query.get("logged") ?? "",
   };
 }
 
@@ -47,7 +56,8 @@ function change(changes, keep = true) {
 // --- data -----------------------------------------------------------------------------------------------
 
 async function draw() {
-  const mine = ++requests, { axis, from, to, lines, smooth, logged } = chosen();
+  const mine = ++requests,
+    { axis, from, to, lines, smooth, logged } = chosen();
   const query = new URLSearchParams({ axis, points: Math.max(400, Math.round(plots.clientWidth)) });
   for (const run of runs) query.append("run", run.id);
   if (from !== null) query.set("start", Math.max(0, from));
@@ -60,15 +70,23 @@ async function draw() {
     const found = await request(`/api/v1/curves?${query}`);
     if (mine !== requests) return;
     last = found;
-    const named = found.axes.map(({ name }) => name), others = found.names.filter((name) => !named.includes(name)).slice(0, MAX_AXES);
-    fields.axis.replaceChildren(...[...found.axes, ...others.map((name) => ({ name, label: name }))].map(({ name, label }) => new Option(label, name, false, name === found.axis)));
+    const named = found.axes.map(({ name }) => name),
+      others = found.names.filter((name) => !named.includes(name)).slice(0, MAX_AXES);
+    fields.axis.replaceChildren(
+      ...[...found.axes, ...others.map((name) => ({ name, label: name }))].map(
+        ({ name, label }) => new Option(label, name, false, name === found.axis),
+      ),
+    );
     box.querySelector("[data-names]").hidden = found.names.length < 2;
     fields.logged.list.replaceChildren(...found.names.map((name) => new Option(name)));
     box.querySelector("[data-seeds]").hidden = found.groups.every((group) => group.runs.length < 2);
-    found.groups.forEach((group, i) => group.runs.forEach((id) => {  // the colours of the runs above
-      const swatch = document.querySelector(`.swatch[data-run="${id}"]`);
-      if (swatch) swatch.className = `swatch line-${i % COLOURS}`;
-    }));
+    found.groups.forEach((group, i) =>
+      group.runs.forEach((id) => {
+        // the colours of the runs above
+        const swatch = document.querySelector(`.swatch[data-run="${id}"]`);
+        if (swatch) swatch.className = `swatch line-${i % COLOURS}`;
+      }),
+    );
     show();
   } catch (error) {
     message.textContent = error.message;
@@ -85,18 +103,40 @@ function show() {
   }
   const ranked = [...metrics].sort(([one], [other]) => rank(one) - rank(other));
   for (const [metric, panel] of ranked) plot(metric, panel);
-  for (const [metric, one] of shown) if (!metrics.has(metric)) { one.chart?.destroy(); one.figure.remove(); shown.delete(metric); }
-  const thinned = last.curves.filter((curve) => curve.thinned), repeated = last.groups.flatMap((group) => group.left_out);
-  const parts = [!last.curves.length ? "No metrics were recorded."
-    : thinned.length ? `Thinned: of up to ${Math.max(...thinned.map((curve) => curve.of)).toLocaleString("en")} points a curve the lowest and highest of each stretch are drawn. Zoom in for all of them.`
-      : `${last.averaged || "Every recorded point is drawn."} Drag across a plot to zoom; double click shows all.`];
-  if (last.groups.some((group) => group.runs.length > 1)) parts.push("Runs that differ only in the seed: interquartile mean with its 95 % interval; below four runs, mean and range.");
+  for (const [metric, one] of shown)
+    if (!metrics.has(metric)) {
+      one.chart?.destroy();
+      one.figure.remove();
+      shown.delete(metric);
+    }
+  const thinned = last.curves.filter((curve) => curve.thinned),
+    repeated = last.groups.flatMap((group) => group.left_out);
+  const parts = [
+    !last.curves.length
+      ? "No metrics were recorded."
+      : thinned.length
+        ? `Thinned: of up to ${Math.max(...thinned.map((curve) => curve.of)).toLocaleString("en")} points a curve ` +
+          "the lowest and highest of each stretch are drawn. Zoom in for all of them."
+        : `${last.averaged || "Every recorded point is drawn."} Drag across a plot to zoom; double click shows all.`,
+  ];
+  if (last.groups.some((group) => group.runs.length > 1))
+    parts.push(
+      "Runs that differ only in the seed: interquartile mean with its 95 % interval; below four runs, mean and range.",
+    );
   if (repeated.length) parts.push(`Left out, as the same run is there: ${repeated.map(named).join(", ")}.`);
   message.textContent = [...parts, ...last.notes].join(" ");
 }
 
 function rank(metric) {
-  return metric === SHARES ? 4 : metric.startsWith("training.logged.") ? 3 : metric.startsWith("training.") ? 2 : metric.startsWith("event.") ? 1 : 0;
+  return metric === SHARES
+    ? 4
+    : metric.startsWith("training.logged.")
+      ? 3
+      : metric.startsWith("training.")
+        ? 2
+        : metric.startsWith("event.")
+          ? 1
+          : 0;
 }
 
 const named = (id) => runs.find((run) => run.id === id)?.label ?? id;
@@ -116,19 +156,35 @@ function seriesOf(panel, state) {
   const series = [];
   let left = 0;
   for (const curve of panel.curves) {
-    const at = lines.indexOf(curve.line), several = last.groups.length > 1;
-    const keep = curve.positions.map((place, i) => !(state.log_x && place <= 0) && !(logy && curve.values[i] !== null && curve.values[i] <= 0));
+    const at = lines.indexOf(curve.line),
+      several = last.groups.length > 1;
+    const keep = curve.positions.map(
+      (place, i) => !(state.log_x && place <= 0) && !(logy && curve.values[i] !== null && curve.values[i] <= 0),
+    );
     left += keep.filter((kept) => !kept).length;
-    const only = (values) => values.filter((_, i) => keep[i]).map((value) => logy && value <= 0 ? null : value);
+    const only = (values) => values.filter((_, i) => keep[i]).map((value) => (logy && value <= 0 ? null : value));
     const positions = curve.positions.filter((_, i) => keep[i]);
-    const base = { stroke: colour(several ? curve.group : at), dash: DASHES[at % DASHES.length], width: 1.8, points: positions.length > 80 ? 0 : positions.length > 1 ? 4 : 9 };
+    const base = {
+      stroke: colour(several ? curve.group : at),
+      dash: DASHES[at % DASHES.length],
+      width: 1.8,
+      points: positions.length > 80 ? 0 : positions.length > 1 ? 4 : 9,
+    };
     const add = (values, style) => series.push({ ...base, positions, values, label: "", ...style });
     if (curve.low) {
       add(only(curve.high), { width: 0, points: 0, fill: `${base.stroke}33` });
       add(only(curve.low), { width: 0, points: 0 });
     }
-    curve.runs.forEach((values, i) => add(only(values), { width: 0.7, points: 0, stroke: `${base.stroke}aa`, label: `${named(last.groups[curve.group].runs[i])}${curve.line && lines.length > 1 ? `, ${spoken(curve.line)}` : ""}` }));
-    const values = only(curve.values), label = labelOf(curve, lines);
+    curve.runs.forEach((values, i) =>
+      add(only(values), {
+        width: 0.7,
+        points: 0,
+        stroke: `${base.stroke}aa`,
+        label: `${named(last.groups[curve.group].runs[i])}${curve.line && lines.length > 1 ? `, ${spoken(curve.line)}` : ""}`,
+      }),
+    );
+    const values = only(curve.values),
+      label = labelOf(curve, lines);
     if (!curve.smoothed) add(values, { label });
     else {
       add(values, { stroke: `${base.stroke}55`, width: 1, points: 0 });
@@ -139,22 +195,38 @@ function seriesOf(panel, state) {
 }
 
 function labelOf(curve, lines) {
-  const parts = [last.groups.length > 1 || runs.length > 1 ? groupName(curve.group) : "", lines.length > 1 && curve.line ? spoken(curve.line) : ""];
+  const parts = [
+    last.groups.length > 1 || runs.length > 1 ? groupName(curve.group) : "",
+    lines.length > 1 && curve.line ? spoken(curve.line) : "",
+  ];
   return parts.filter(Boolean).join(", ") || curve.title;
 }
 
 // --- plots ----------------------------------------------------------------------------------------------
 
 const look = () => getComputedStyle(document.documentElement);
-const colour = (i) => look().getPropertyValue(`--line-${i % COLOURS}`).trim();
+const colour = (i) =>
+  look()
+    .getPropertyValue(`--line-${i % COLOURS}`)
+    .trim();
 const spoken = (name) => name.replaceAll("_", " ");
 
 function plot(metric, panel) {
-  const state = chosen(), { series, left, logy } = seriesOf(panel, state);
+  const state = chosen(),
+    { series, left, logy } = seriesOf(panel, state);
   const data = uPlot.join(series.map(({ positions, values }) => [positions, values]));
-  const kinds = JSON.stringify([series.map(({ label, stroke, width, points }) => [label, stroke, width, points]), state.log_x, logy, state.axis, plots.clientWidth < 500]);
+  const kinds = JSON.stringify([
+    series.map(({ label, stroke, width, points }) => [label, stroke, width, points]),
+    state.log_x,
+    logy,
+    state.axis,
+    plots.clientWidth < 500,
+  ]);
   let one = shown.get(metric);
-  if (one && one.kinds !== kinds) { one.chart.destroy(); one.chart = null; }
+  if (one && one.kinds !== kinds) {
+    one.chart.destroy();
+    one.chart = null;
+  }
   if (!one) {
     one = { figure: document.createElement("figure") };
     one.figure.className = metric === SHARES ? "wide" : "";
@@ -166,14 +238,22 @@ function plot(metric, panel) {
   const [caption, place, key] = one.figure.children;
   const [title, unit] = [document.createElement("b"), document.createElement("span")];
   title.textContent = panel.title;
-  unit.textContent = [panel.unit, panel.curves.some((curve) => curve.thinned) && "thinned",
+  unit.textContent = [
+    panel.unit,
+    panel.curves.some((curve) => curve.thinned) && "thinned",
     state.log_y && !logy && "not logarithmic: no value is positive",
     left && `${left.toLocaleString("en")} point${left > 1 ? "s" : ""} at 0 or below left out`,
-    series.every(({ positions }) => positions.length === 0) && "no point in this part"].filter(Boolean).join(", ");
+    series.every(({ positions }) => positions.length === 0) && "no point in this part",
+  ]
+    .filter(Boolean)
+    .join(", ");
   caption.replaceChildren(title, " ", unit);
   place.setAttribute("role", "img");
   const lines = [...new Set(panel.curves.map((curve) => curve.line))];
-  place.setAttribute("aria-label", `${panel.title}, ${panel.unit}: ${panel.curves.map((curve) => summary(curve, lines)).join("; ")}`);
+  place.setAttribute(
+    "aria-label",
+    `${panel.title}, ${panel.unit}: ${panel.curves.map((curve) => summary(curve, lines)).join("; ")}`,
+  );
   if (one.chart) one.chart.setData(data);
   else {
     one.chart = new uPlot(options(panel, series, state, logy, place, key), data, place);
@@ -185,9 +265,10 @@ function plot(metric, panel) {
 // A key of all labelled lines, as they are drawn; a click hides or shows a line. While the cursor is over a plot,
 // the key shows the position and the values there.
 function legend(chart, key, series) {
-  const labelled = series.flatMap(({ label }, i) => label ? [i + 1] : []);
+  const labelled = series.flatMap(({ label }, i) => (label ? [i + 1] : []));
   const entries = labelled.map((number) => {
-    const entry = document.createElement("button"), value = document.createElement("output");
+    const entry = document.createElement("button"),
+      value = document.createElement("output");
     const { label, stroke, dash } = series[number - 1];
     entry.type = "button";
     entry.dataset.series = value.dataset.series = number;
@@ -214,10 +295,13 @@ function sample(stroke, dash) {
 }
 
 function readOut(chart, key) {
-  const at = chart.cursor.idx, outputs = [...key.querySelectorAll("output")], position = outputs.pop();
+  const at = chart.cursor.idx,
+    outputs = [...key.querySelectorAll("output")],
+    position = outputs.pop();
   if (!position) return;
   const there = at !== null && at !== undefined && chart.cursor.left >= 0;
-  const value = (i) => there && chart.data[i][at] !== null && chart.data[i][at] !== undefined ? exact(chart.data[i][at]) : "";
+  const value = (i) =>
+    there && chart.data[i][at] !== null && chart.data[i][at] !== undefined ? exact(chart.data[i][at]) : "";
   if (outputs.length > 1) for (const output of outputs) output.textContent = value(output.dataset.series);
   const alone = outputs.length === 1 && value(outputs[0].dataset.series);
   const axis = last.axes.find(({ name }) => name === last.axis);
@@ -228,7 +312,13 @@ const exact = (value) => Number(value.toPrecision(6)).toLocaleString("en", { max
 
 function tick(value) {
   if (value === null) return "";
-  const size = Math.abs(value), units = [[1e12, "T"], [1e9, "G"], [1e6, "M"], [1e4, "k"]];
+  const size = Math.abs(value),
+    units = [
+      [1e12, "T"],
+      [1e9, "G"],
+      [1e6, "M"],
+      [1e4, "k"],
+    ];
   if (size >= 1e15 || (size > 0 && size < 1e-4)) return value.toExponential(0);
   const [, unit] = units.find(([least]) => size >= least) ?? [1, ""];
   const shown = unit === "k" ? value / 1e3 : unit ? value / units.find(([, name]) => name === unit)[0] : value;
@@ -236,29 +326,56 @@ function tick(value) {
 }
 
 function summary(curve, lines) {
-  const known = curve.values.filter((value) => value !== null), end = known.at(-1);
+  const known = curve.values.filter((value) => value !== null),
+    end = known.at(-1);
   if (end === undefined) return `${labelOf(curve, lines)} has no point in this part`;
-  return `${labelOf(curve, lines)} ends at ${Number(end.toPrecision(4))}, between ${Number(Math.min(...known).toPrecision(4))} and ${Number(Math.max(...known).toPrecision(4))}`;
+  const short = (number) => Number(number.toPrecision(4));
+  const range = `between ${short(Math.min(...known))} and ${short(Math.max(...known))}`;
+  return `${labelOf(curve, lines)} ends at ${short(end)}, ${range}`;
 }
 
 function options(panel, series, state, logy, place, key) {
-  const percent = panel.unit.startsWith("percent"), positive = series.every(({ values }) => values.every((value) => value === null || value >= 0));
+  const percent = panel.unit.startsWith("percent"),
+    positive = series.every(({ values }) => values.every((value) => value === null || value >= 0));
   const axis = {
-    stroke: look().getPropertyValue("--soft").trim(), grid: { stroke: look().getPropertyValue("--line").trim(), width: 1 },
-    ticks: { show: false }, font: "12px system-ui, sans-serif", values: (_, ticks) => ticks.map(tick),
+    stroke: look().getPropertyValue("--soft").trim(),
+    grid: { stroke: look().getPropertyValue("--line").trim(), width: 1 },
+    ticks: { show: false },
+    font: "12px system-ui, sans-serif",
+    values: (_, ticks) => ticks.map(tick),
   };
-  const scale = (log, range) => ({ distr: log ? 3 : 1, range: (_, low, high) => log ? uPlot.rangeLog(low > 0 ? low : 0.1, high > 0 ? high : 1, 10, false) : range(low, high) });
-  const lines = series.map(({ label, stroke, dash, width, points }) => ({ label, stroke, dash, width, spanGaps: true, points: { show: points > 0, size: points } }));
+  const scale = (log, range) => ({
+    distr: log ? 3 : 1,
+    range: (_, low, high) =>
+      log ? uPlot.rangeLog(low > 0 ? low : 0.1, high > 0 ? high : 1, 10, false) : range(low, high),
+  });
+  const lines = series.map(({ label, stroke, dash, width, points }) => ({
+    label,
+    stroke,
+    dash,
+    width,
+    spanGaps: true,
+    points: { show: points > 0, size: points },
+  }));
   return {
-    width: place.clientWidth, height: 216, padding: [8, 22, 0, 0],
+    width: place.clientWidth,
+    height: 216,
+    padding: [8, 22, 0, 0],
     scales: {
       x: { time: false, ...scale(state.log_x, (low, high) => [state.from ?? low ?? 0, state.to ?? high ?? 1]) },
       y: scale(logy, (low, high) => bounds(low, high, percent, positive)),
     },
     series: [{}, ...lines],
-    bands: series.flatMap(({ fill }, i) => fill ? [{ series: [i + 1, i + 2], fill }] : []),
+    bands: series.flatMap(({ fill }, i) => (fill ? [{ series: [i + 1, i + 2], fill }] : [])),
     axes: [
-      { ...axis, size: 28, label: last.axes.find(({ name }) => name === last.axis).label, labelSize: 18, labelGap: 0, labelFont: axis.font },
+      {
+        ...axis,
+        size: 28,
+        label: last.axes.find(({ name }) => name === last.axis).label,
+        labelSize: 18,
+        labelGap: 0,
+        labelFont: axis.font,
+      },
       { ...axis, size: (_, values) => 18 + 7.2 * Math.max(3, ...(values ?? []).map((text) => text.length)) },
     ],
     legend: { show: false },
@@ -277,7 +394,7 @@ function bounds(low, high, percent, positive) {
 // --- events ---------------------------------------------------------------------------------------------
 
 function go(from, to) {
-  const end = (value, round) => value === null || chosen().axis === "time" ? value : round(value);
+  const end = (value, round) => (value === null || chosen().axis === "time" ? value : round(value));
   change({ from: end(from, Math.floor), to: end(to, Math.ceil) });
   draw();
 }
@@ -291,13 +408,27 @@ function zoom(chart) {
 
 form.addEventListener("submit", (event) => {
   event.preventDefault();
-  const end = (name) => fields[name].value === "" ? null : Number(fields[name].value);
+  const end = (name) => (fields[name].value === "" ? null : Number(fields[name].value));
   go(end("from"), end("to"));
 });
-fields.axis.addEventListener("change", () => { change({ axis: fields.axis.value, from: null, to: null }); draw(); document.dispatchEvent(new Event("axischange")); });
-fields.logged.addEventListener("change", () => { change({ logged: fields.logged.value }); draw(); });
-fields.lines.addEventListener("change", () => { change({ lines: fields.lines.checked }); draw(); });
-for (const name of ["log_x", "log_y"]) fields[name].addEventListener("change", () => { change({ [name]: fields[name].checked }); if (last) show(); });
+fields.axis.addEventListener("change", () => {
+  change({ axis: fields.axis.value, from: null, to: null });
+  draw();
+  document.dispatchEvent(new Event("axischange"));
+});
+fields.logged.addEventListener("change", () => {
+  change({ logged: fields.logged.value });
+  draw();
+});
+fields.lines.addEventListener("change", () => {
+  change({ lines: fields.lines.checked });
+  draw();
+});
+for (const name of ["log_x", "log_y"])
+  fields[name].addEventListener("change", () => {
+    change({ [name]: fields[name].checked });
+    if (last) show();
+  });
 let sliding = 0;
 fields.smooth.addEventListener("input", () => {
   change({ smooth: Number(fields.smooth.value) }, false);
@@ -306,16 +437,25 @@ fields.smooth.addEventListener("input", () => {
 });
 box.querySelector("[data-reset]").addEventListener("click", () => go(null, null));
 plots.addEventListener("dblclick", () => go(null, null));
-addEventListener("popstate", () => { fill(chosen()); draw(); });
+addEventListener("popstate", () => {
+  fill(chosen());
+  draw();
+});
 
 let width = plots.clientWidth;
 new ResizeObserver(() => {
   if (plots.clientWidth === width) return;
   width = plots.clientWidth;
-  for (const { chart, figure } of shown.values()) chart?.setSize({ width: figure.children[1].clientWidth, height: 216 });
+  for (const { chart, figure } of shown.values())
+    chart?.setSize({ width: figure.children[1].clientWidth, height: 216 });
 }).observe(plots);
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { if (last) show(); });
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+  if (last) show();
+});
 
 fill(chosen());
 await draw();
-if (document.querySelector("[data-live]")) setInterval(() => { if (!document.hidden) draw(); }, 4000);
+if (document.querySelector("[data-live]"))
+  setInterval(() => {
+    if (!document.hidden) draw();
+  }, 4000);

@@ -2,8 +2,11 @@
 import { onKeys, partAt } from "./parts.js";
 import { picturesOf } from "./pictures.js";
 
-const root = document.querySelector("[data-part]"), source = root.dataset.part;
-const [toRerun, toWhatIf, toBranch] = ["rerun", "what-if", "branch"].map((name) => root.querySelector(`[data-to-${name}]`));
+const root = document.querySelector("[data-part]"),
+  source = root.dataset.part;
+const [toRerun, toWhatIf, toBranch] = ["rerun", "what-if", "branch"].map((name) =>
+  root.querySelector(`[data-to-${name}]`),
+);
 let writing = null;
 
 // Browsers limit how often the address may change, so a playing replay does not write every step.
@@ -15,12 +18,17 @@ function moved(k) {
   writing = setTimeout(() => history.replaceState(null, "", `?t=${k}`), 150);
 }
 
-const at = Number(root.dataset.at), pictures = picturesOf(root, at);
+const at = Number(root.dataset.at),
+  pictures = picturesOf(root, at);
 const { episode } = await partAt(source, at);
 const replay = new Replay(root, { load: async (k) => (await partAt(source, k)).episode, moved, pictures });
 replay.begin(episode, at);
 
-onKeys("input, textarea, select, button, a, summary", () => replay.play(), (by) => {
-  replay.pause();
-  replay.show(Math.min(replay.length, Math.max(0, replay.k + by)));
-});
+onKeys(
+  "input, textarea, select, button, a, summary",
+  () => replay.play(),
+  (by) => {
+    replay.pause();
+    replay.show(Math.min(replay.length, Math.max(0, replay.k + by)));
+  },
+);

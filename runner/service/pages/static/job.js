@@ -1,11 +1,14 @@
 // A job: the page shows the end of its log; until the job is over, events are added as they arrive.
 const head = document.querySelector("[data-job]");
-const [state, progress, runs, log] = ["state", "progress", "runs", "log"].map((name) => document.querySelector(`[data-${name}]`));
+const [state, progress, runs, log] = ["state", "progress", "runs", "log"].map((name) =>
+  document.querySelector(`[data-${name}]`),
+);
 const count = (number) => number.toLocaleString("en");
 log.scrollTop = log.scrollHeight;
 
 function line(time, ...content) {
-  const item = document.createElement("li"), when = document.createElement("time");
+  const item = document.createElement("li"),
+    when = document.createElement("time");
   when.dateTime = time ?? "";
   when.textContent = (time ?? "").slice(11, 19);
   item.append(when, " ", ...content);
@@ -24,7 +27,10 @@ function linked(id) {
 function progressOf(data) {
   if ("done" in data) return [data.done / Math.max(1, data.runs), `${count(data.done)} of ${count(data.runs)} runs`];
   const run = data.runs > 1 ? `, run ${data.run} of ${data.runs}` : "";
-  return [(data.run - 1 + data.episode / Math.max(1, data.episodes)) / data.runs, `${count(data.episode)} of ${count(data.episodes)} episodes${run}`];
+  return [
+    (data.run - 1 + data.episode / Math.max(1, data.episodes)) / data.runs,
+    `${count(data.episode)} of ${count(data.episodes)} episodes${run}`,
+  ];
 }
 
 function watch() {
@@ -49,7 +55,10 @@ function watch() {
     line(data.time, `job ${data.state}` + (data.error ? `: ${data.error}` : ""));
     state.textContent = data.state;
     state.className = `status ${data.state}`;
-    if (!["queued", "running"].includes(data.state)) { source.close(); location.reload(); }
+    if (!["queued", "running"].includes(data.state)) {
+      source.close();
+      location.reload();
+    }
   });
 }
 

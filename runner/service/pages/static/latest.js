@@ -2,19 +2,23 @@
 import { partAt } from "./parts.js";
 import { picturesOf } from "./pictures.js";
 
-const AGAIN = 3000;  // milliseconds before a server is asked again that has no later episode
+const AGAIN = 3000; // milliseconds before a server is asked again that has no later episode
 
 async function follow(place) {
-  let pictures = null, shown = "";
+  let pictures = null,
+    shown = "";
   for (;;) {
     const pause = new Promise((resolve) => setTimeout(resolve, AGAIN));
     try {
-      const response = await fetch(`${place.dataset.latest}?shown=${encodeURIComponent(shown)}`, { headers: { accept: "text/html" } });
+      const response = await fetch(`${place.dataset.latest}?shown=${encodeURIComponent(shown)}`, {
+        headers: { accept: "text/html" },
+      });
       if (response.status === 204 && response.headers.get("x-run-over")) return;
       if (response.status === 200) {
         pictures?.close();
-        place.innerHTML = await response.text();  // rendered, and escaped, by the server
-        const root = place.querySelector("[data-source]"), { source } = root.dataset;
+        place.innerHTML = await response.text(); // rendered, and escaped, by the server
+        const root = place.querySelector("[data-source]"),
+          { source } = root.dataset;
         shown = root.dataset.episode;
         root.querySelector(".own").hidden = false;
         pictures = picturesOf(root);
@@ -23,7 +27,9 @@ async function follow(place) {
         replay.play();
         await over(replay);
       }
-    } catch { /* the service is not available: try again */ }
+    } catch {
+      /* the service is not available: try again */
+    }
     await pause;
   }
 }

@@ -5,8 +5,10 @@ async function look() {
   try {
     const response = await fetch(place.dataset.live, { headers: { accept: "text/html" } });
     if (response.status === 204) return location.reload();
-    if (response.ok) place.innerHTML = await response.text();  // rendered, and escaped, by the server
-  } catch { /* the service is not available: try again */ }
+    if (response.ok) place.innerHTML = await response.text(); // rendered, and escaped, by the server
+  } catch {
+    /* the service is not available: try again */
+  }
   setTimeout(look, document.hidden ? 10000 : 1500);
 }
 

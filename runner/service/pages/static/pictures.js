@@ -1,5 +1,7 @@
 // The pictures of an episode, fetched in pieces as they are made: of those around the step shown, a limited number.
-const PIECE = 64, KEPT = 1500, AHEAD = 256;
+const PIECE = 64,
+  KEPT = 1500,
+  AHEAD = 256;
 
 // Return the function that `Replay` requests pictures with, or null where a replay has none.
 //
@@ -9,8 +11,17 @@ const PIECE = 64, KEPT = 1500, AHEAD = 256;
 export function picturesOf(root, at = 0) {
   const source = root.dataset.pictures;
   if (!source) return null;
-  const image = root.querySelector(".frame"), kept = new Map(), messages = new Map();
-  let note = root.querySelector(".frame-note").textContent, wanted = at, show = () => {}, reading = null, waiting = null, retry = null, last = Infinity, closed = false;
+  const image = root.querySelector(".frame"),
+    kept = new Map(),
+    messages = new Map();
+  let note = root.querySelector(".frame-note").textContent,
+    wanted = at,
+    show = () => {},
+    reading = null,
+    waiting = null,
+    retry = null,
+    last = Infinity,
+    closed = false;
 
   const known = (k) => kept.has(k) || messages.has(k) || k > last;
 
@@ -41,9 +52,23 @@ export function picturesOf(root, at = 0) {
     };
     try {
       const response = await fetch(`${source}?start=${start}&steps=${PIECE}`, { signal: own.control.signal });
-      if (response.status === 503) retry = setTimeout(() => { messages.clear(); more(); }, 2500);  // others are looking
-      if (!response.ok) throw new Error((await response.json().catch(() => null))?.error.message ?? `The service responded with status ${response.status}.`);
-      const failed = await records(response.body.getReader(), (bytes, number) => take(start + number, bytes), (text) => { note = text; });
+      if (response.status === 503)
+        retry = setTimeout(() => {
+          messages.clear();
+          more();
+        }, 2500); // others are looking
+      if (!response.ok)
+        throw new Error(
+          (await response.json().catch(() => null))?.error.message ??
+            `The service responded with status ${response.status}.`,
+        );
+      const failed = await records(
+        response.body.getReader(),
+        (bytes, number) => take(start + number, bytes),
+        (text) => {
+          note = text;
+        },
+      );
       if (failed !== null) throw new Error(failed);
       if (own.next < own.stop) last = Math.min(last, own.next - 1);
     } catch (error) {
@@ -69,11 +94,14 @@ export function picturesOf(root, at = 0) {
     let k = wanted;
     while (known(k) && k < wanted + AHEAD) k++;
     if (k > last || k >= wanted + AHEAD || messages.has(k)) return;
-    waiting = setTimeout(read, k === wanted && kept.size > 1 ? 60 : 0, k);  // a slider passes many steps
+    waiting = setTimeout(read, k === wanted && kept.size > 1 ? 60 : 0, k); // a slider passes many steps
   }
 
   if (image?.getAttribute("src")) keep(at, image.getAttribute("src"));
-  addEventListener("pagehide", () => { reading?.control.abort(); clearTimeout(retry); });
+  addEventListener("pagehide", () => {
+    reading?.control.abort();
+    clearTimeout(retry);
+  });
   more();
   const pictures = (k, display) => {
     wanted = k;
@@ -81,7 +109,8 @@ export function picturesOf(root, at = 0) {
     tell();
     more();
   };
-  pictures.close = () => {  // of a replay that is no longer shown
+  pictures.close = () => {
+    // of a replay that is no longer shown
     closed = true;
     reading?.control.abort();
     clearTimeout(retry);
@@ -94,7 +123,8 @@ export function picturesOf(root, at = 0) {
 // Call `take` with the bytes and the number of each picture, and `noted` with a note; return the message that ends
 // the stream, or null.
 async function records(reader, take, noted) {
-  let bytes = new Uint8Array(0), number = 0;
+  let bytes = new Uint8Array(0),
+    number = 0;
   for (;;) {
     const { value, done } = await reader.read();
     if (done) return null;
@@ -103,7 +133,8 @@ async function records(reader, take, noted) {
     joined.set(value, bytes.length);
     bytes = joined;
     while (bytes.length >= 4) {
-      const view = new DataView(bytes.buffer, bytes.byteOffset), length = view.getUint32(0);
+      const view = new DataView(bytes.buffer, bytes.byteOffset),
+        length = view.getUint32(0);
       if (length === 0xfffffffe) {
         if (bytes.length < 8 || bytes.length < 8 + view.getUint32(4)) break;
         const end = 8 + view.getUint32(4);

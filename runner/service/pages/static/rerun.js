@@ -1,12 +1,15 @@
 // Opens a recording in the Rerun viewer at a step; the viewer's files come from this service.
-const place = document.body.dataset, message = document.getElementById("message");
+const place = document.body.dataset,
+  message = document.getElementById("message");
 const theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
 const wait = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
 // The viewer sends usage data to its makers, which the policy of this page forbids; this avoids the attempt.
 const own = window.fetch.bind(window);
-window.fetch = (what, how) => new URL(what.url ?? what, location.href).origin === location.origin
-  ? own(what, how) : Promise.resolve(new Response(null, { status: 204 }));
+window.fetch = (what, how) =>
+  new URL(what.url ?? what, location.href).origin === location.origin
+    ? own(what, how)
+    : Promise.resolve(new Response(null, { status: 204 }));
 
 // Commands to the viewer are Protocol Buffers messages: rerun.viewer_control.v1alpha1.
 function varint(value) {
@@ -16,7 +19,7 @@ function varint(value) {
     bytes.push(Number(rest & 127n) | 128);
   }
 }
-const field = (number, content) => [number << 3 | 2, ...varint(content.length), ...content];
+const field = (number, content) => [(number << 3) | 2, ...varint(content.length), ...content];
 
 function setTimeCursor(timeline, time) {
   const name = field(1, [...new TextEncoder().encode(timeline)]);
@@ -38,8 +41,13 @@ async function open() {
   await wasm_bindgen({ module_or_path: place.wasm });
   const handle = new wasm_bindgen.WebHandle({
     url: [new URL(place.recording, location.href).href],
-    hide_welcome_screen: true, enable_history: false, notebook: false, persist: false, theme,
-    render_backend: "webgl", manifest_url: null,
+    hide_welcome_screen: true,
+    enable_history: false,
+    notebook: false,
+    persist: false,
+    theme,
+    render_backend: "webgl",
+    manifest_url: null,
   });
   await handle.start(document.getElementById("viewer"));
   message.hidden = true;
@@ -51,10 +59,13 @@ async function open() {
       document.body.dataset.opened = place.step;
       return;
     } catch (error) {
-      if (error.name !== "ViewerControlError") throw error;  // the recording is not there yet
+      if (error.name !== "ViewerControlError") throw error; // the recording is not there yet
       await wait(150);
     }
   }
 }
 
-open().catch((error) => { message.hidden = false; message.textContent = error.message; });
+open().catch((error) => {
+  message.hidden = false;
+  message.textContent = error.message;
+});

@@ -4,12 +4,17 @@ import { picturesOf } from "./pictures.js";
 
 const bar = document.querySelector("[data-together]");
 const [slider, button, count] = [".both", ".both-play", ".both-count"].map((name) => bar.querySelector(name));
-let timer = null, writing = null;
+let timer = null,
+  writing = null;
 
 async function start(root) {
-  const { source } = root.dataset, { episode } = await partAt(source, 0);
+  const { source } = root.dataset,
+    { episode } = await partAt(source, 0);
   const k = Math.min(Math.max(0, Number(bar.dataset.at) - Number(root.dataset.offset ?? 0)), episode.length);
-  const replay = new Replay(root, { load: async (k) => (await partAt(source, k)).episode, pictures: picturesOf(root, k) });
+  const replay = new Replay(root, {
+    load: async (k) => (await partAt(source, k)).episode,
+    pictures: picturesOf(root, k),
+  });
   await replay.begin(episode, k);
   return replay;
 }
@@ -17,10 +22,16 @@ async function start(root) {
 const roots = [...document.querySelectorAll("[data-source]")];
 for (const root of roots) root.querySelector(".description").textContent = "Loading …";
 const offset = (replay) => Number(replay.root.dataset.offset ?? 0);
-const replays = (await Promise.all(roots.map((root) => start(root).catch((error) => {
-  root.querySelector(".description").textContent = error.message;
-  return null;
-})))).filter(Boolean);
+const replays = (
+  await Promise.all(
+    roots.map((root) =>
+      start(root).catch((error) => {
+        root.querySelector(".description").textContent = error.message;
+        return null;
+      }),
+    ),
+  )
+).filter(Boolean);
 const length = Number(bar.dataset.length) || Math.max(0, ...replays.map((replay) => replay.length));
 
 function show(k) {
@@ -46,11 +57,17 @@ function play() {
   button.textContent = "\u275a\u275a";
   button.setAttribute("aria-label", "Pause all");
   const pace = Math.max(...replays.map((replay) => replay.pace));
-  timer = setInterval(() => Number(slider.value) < length ? show(Number(slider.value) + 1) : pause(), pace);
+  timer = setInterval(() => (Number(slider.value) < length ? show(Number(slider.value) + 1) : pause()), pace);
 }
 
 slider.max = length;
-slider.addEventListener("input", () => { pause(); show(Number(slider.value)); });
+slider.addEventListener("input", () => {
+  pause();
+  show(Number(slider.value));
+});
 button.addEventListener("click", play);
-onKeys("input:not([type=range]), textarea, select, button, a, summary", play, (by) => { pause(); show(Number(slider.value) + by); });
+onKeys("input:not([type=range]), textarea, select, button, a, summary", play, (by) => {
+  pause();
+  show(Number(slider.value) + by);
+});
 show(Number(bar.dataset.at));

@@ -1,10 +1,14 @@
 // The form of a configuration: checked as it is written, with a link from each mistake to its line.
-const form = document.querySelector("[data-submit]"), text = form.elements.text;
-const problems = document.getElementById("problems"), valid = document.getElementById("valid");
-let timer = null, checks = 0;
+const form = document.querySelector("[data-submit]"),
+  text = form.elements.text;
+const problems = document.getElementById("problems"),
+  valid = document.getElementById("valid");
+let timer = null,
+  checks = 0;
 
 function go(line) {
-  const lines = text.value.split("\n"), start = lines.slice(0, line - 1).join("\n").length + (line > 1 ? 1 : 0);
+  const lines = text.value.split("\n"),
+    start = lines.slice(0, line - 1).join("\n").length + (line > 1 ? 1 : 0);
   text.focus();
   text.setSelectionRange(start, start + (lines[line - 1] ?? "").length);
   text.scrollTop = (line - 4) * Number.parseFloat(getComputedStyle(text).lineHeight);
@@ -34,12 +38,18 @@ function problemBox({ line, path, message }) {
 
 async function check() {
   const mine = ++checks;
-  const response = await fetch("/api/v1/jobs/check", { method: "POST", body: text.value, headers: { "content-type": "application/yaml" } }).catch(() => null);
+  const response = await fetch("/api/v1/jobs/check", {
+    method: "POST",
+    body: text.value,
+    headers: { "content-type": "application/yaml" },
+  }).catch(() => null);
   if (mine !== checks || !response) return;
   const found = await response.json();
   if (response.ok) {
     problems.replaceChildren();
-    valid.textContent = `Valid: ${found.kind} ${found.name}, ${found.runs.toLocaleString("en")} ${found.runs === 1 ? "run" : "runs"}${found.bytes ? `, about ${(found.bytes / 1e6).toFixed(found.bytes < 1e7 ? 1 : 0)} MB` : ""}.`;
+    const runs = `${found.runs.toLocaleString("en")} ${found.runs === 1 ? "run" : "runs"}`;
+    const size = found.bytes ? `, about ${(found.bytes / 1e6).toFixed(found.bytes < 1e7 ? 1 : 0)} MB` : "";
+    valid.textContent = `Valid: ${found.kind} ${found.name}, ${runs}${size}.`;
     return;
   }
   valid.textContent = "";
@@ -47,7 +57,10 @@ async function check() {
   problems.replaceChildren(...(error.problems.length ? error.problems : [{ message: error.message }]).map(problemBox));
 }
 
-text.addEventListener("input", () => { clearTimeout(timer); timer = setTimeout(check, 700); });
+text.addEventListener("input", () => {
+  clearTimeout(timer);
+  timer = setTimeout(check, 700);
+});
 problems.addEventListener("click", (event) => {
   const line = event.target.closest("[data-line]")?.dataset.line;
   if (!line) return;

@@ -2,10 +2,13 @@
 const form = document.querySelector("[data-rows]");
 const search = document.querySelector("[data-focus]");
 
-function chosen() { return form.querySelectorAll("input[name=run]:checked").length; }
+function chosen() {
+  return form.querySelectorAll("input[name=run]:checked").length;
+}
 
 function update() {
-  const button = form.querySelector("[data-compare]"), count = chosen();
+  const button = form.querySelector("[data-compare]"),
+    count = chosen();
   button.disabled = count < 2;
   button.textContent = count < 2 ? "Select two or more runs to compare" : `Compare ${count} runs`;
 }
@@ -17,14 +20,27 @@ function step(by) {
 }
 
 document.addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input:not([type=checkbox]), textarea, select")) return;
-  if (event.key === "/") { event.preventDefault(); search.focus(); search.select(); }
+  if (
+    event.ctrlKey ||
+    event.metaKey ||
+    event.altKey ||
+    event.target.matches("input:not([type=checkbox]), textarea, select")
+  )
+    return;
+  if (event.key === "/") {
+    event.preventDefault();
+    search.focus();
+    search.select();
+  }
   if (!form) return;
   if (event.key === "j") step(1);
   if (event.key === "k") step(-1);
   if (event.key === "x") {
     const box = document.activeElement.closest("tr")?.querySelector("input[name=run]");
-    if (box) { box.checked = !box.checked; update(); }
+    if (box) {
+      box.checked = !box.checked;
+      update();
+    }
   }
 });
 if (form) {
