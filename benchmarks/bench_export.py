@@ -98,7 +98,7 @@ def logged_rate(recording: Path, path: Path) -> float:
     """Return steps a second of logging the same archetypes one by one, without computing anything."""
     import rerun as rr
 
-    from runner.export.rerun.columns import new_stream
+    from runner.export.rerun.tracks import new_stream
 
     with open_recording(recording) as opened:
         steps = next(opened.blocks(schema.TRAIN_STEP))[:LOGGED_STEPS]

@@ -50,7 +50,7 @@ def rerun(
     from runner.recording.reader import open_recording
 
     require_rerun("export rerun")
-    from runner.export.rerun.runs import Source
+    from runner.export.rerun.tracks import Source
     from runner.export.rerun.writing import export
 
     started = time.monotonic()

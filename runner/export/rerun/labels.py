@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -18,8 +19,8 @@ from numpy.typing import NDArray
 from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names, numbered_actions, spoken
-from runner.export.rerun.columns import Column
 from runner.export.rerun.scene import Scene
+from runner.export.rerun.tracks import Column, Track
 from runner.util.arrays import Array
 
 MAX_REWARDS: Final = 2_000
@@ -27,10 +28,16 @@ MAX_T: Final = 10_000
 MAX_LEVELS: Final = 4_000
 BAD_SIGN: Final = "✗"
 GOOD_SIGN: Final = "✓"
+STATUS_Y: Final = 0.35
+"""From the grid to `t` and the rewards below it."""
+STATUS_LINE: Final = 0.3
+MOVER_LABEL_Y: Final = -0.5
+"""From a mover to the top of its label: above what is drawn."""
+PASSENGER_LABEL_Y: Final = 0.12
 
 
 class Labels:
-    """Texts and colours, numbered, and the numbers of what is shown at each step.
+    """Texts and colours, numbered, and the numbers and points of what is written at each step.
 
     `value_range` is the lowest and the highest value of the tables.
     """
@@ -42,6 +49,7 @@ class Labels:
         learners: Sequence[str],
         value_range: tuple[float, float] = (0.0, 0.0),
     ) -> None:
+        self.scene = scene
         self.texts: list[str] = []
         self._colours: list[str] = []
         if scene:
@@ -53,7 +61,16 @@ class Labels:
         """The empty label of a passenger that is carried: the label of its carrier shows it."""
         self._longest = min(mdp.step_limit or MAX_T, MAX_T)
         self._t = self._add([*(f"t = {k}" for k in range(self._longest)), f"t ≥ {self._longest}"])
-        self._add_rewards(mdp.rewards_of(len(learners)), learners)
+        self._rewards: list[tuple[int, NDArray[np.float64]]] = []
+        """For each learner its first label, and the rewards it can get, ascending."""
+        rewards, is_alone = mdp.rewards_of(len(learners)), len(learners) == 1
+        for i, learner in enumerate(learners):
+            distinct = np.unique(rewards[..., i])
+            if len(distinct) <= MAX_REWARDS:
+                prefix = "reward" if is_alone else f"reward of {spoken(learner)}"
+                colour = palette.MIDTONE if is_alone else palette.agent(i)
+                first = self._add([f"{prefix} {reward:g}" for reward in distinct], colour)
+                self._rewards.append((first, distinct))
         self.unmarked = self._add([""])
         self.greedy = self._add(["●"])
         """The mark of the greedy action."""
@@ -66,8 +83,8 @@ class Labels:
             self._add_stops(scene)
         self._add_levels(*value_range)
 
-    def log(self, stream: rr.RecordingStream, root: str) -> None:
-        """Log texts and colours for everything below an entity path."""
+    def track(self, root: str) -> Track:
+        """Return the texts and colours of everything below an entity path."""
         classes = [
             {
                 "class_id": number,
@@ -81,10 +98,21 @@ class Labels:
         ]
         # As Arrow, because Rerun is slow to convert thousands of labels.
         empty: Any = rr.AnnotationContext([]).context
-        context: Any = Column(
-            rr.AnnotationContext.descriptor_context(), pa.array([classes], empty.as_arrow_array().type)
-        )
-        stream.log(f"{root}/", [context], static=True)
+        context = pa.array([classes], empty.as_arrow_array().type)
+        return Track(f"{root}/", static=[[Column(rr.AnnotationContext.descriptor_context(), context)]])
+
+    @cached_property
+    def points(self) -> NDArray[np.float32]:
+        """[S, texts, 2]: where the texts of each state are; `t` and the rewards below the grid."""
+        scene, rewards = self.scene, len(self._rewards)
+        assert scene is not None
+        offsets = [[0.0, MOVER_LABEL_Y]] * len(scene.movers)
+        offsets += [[0.0, PASSENGER_LABEL_Y]] * len(scene.passengers)
+        points = scene.points + np.array(offsets, np.float32).reshape(-1, 2)
+        x = np.array([0.25] + [0.65] * rewards) * scene.columns
+        y = scene.rows + STATUS_Y + STATUS_LINE * np.array([0, *range(rewards)])
+        status = np.stack((x, y), axis=1).astype(np.float32)
+        return np.concatenate((points, np.broadcast_to(status, (len(points), *status.shape))), axis=1)
 
     def of_movers(self, is_carrying: NDArray[np.int64], events: NDArray[np.uint32]) -> NDArray[np.uint16]:
         """Return the label of each mover in each step, [n, movers]: its name, and what happened to it."""
@@ -92,18 +120,20 @@ class Labels:
         return self._movers[movers, is_carrying, np.searchsorted(self._masks, events)[:, None]]
 
     def of_t(self, t: Array) -> NDArray[np.uint16]:
-        """Return the label of each `t`."""
-        return np.asarray(self._t + np.minimum(t, self._longest), np.uint16)
+        """Return the label of each `t`, [n, 1]."""
+        return np.asarray(self._t + np.minimum(t, self._longest), np.uint16)[:, None]
 
     def of_rewards(self, rewards: NDArray[np.float64]) -> NDArray[np.uint16]:
         """Return the label of each learner's reward, [n, labelled learners]."""
-        numbers = [
-            first + np.searchsorted(labelled, rewards[:, i]).clip(max=len(labelled) - 1)
-            for i, (first, labelled) in enumerate(self.rewards)
-        ]
-        return (
-            np.stack(numbers, axis=1).astype(np.uint16) if numbers else np.empty((len(rewards), 0), np.uint16)
-        )
+        labels = np.empty((len(rewards), len(self._rewards)), np.uint16)
+        for i, (first, distinct) in enumerate(self._rewards):
+            labels[:, i] = first + np.searchsorted(distinct, rewards[:, i]).clip(max=len(distinct) - 1)
+        return labels
+
+    def of_values(self, values: NDArray[np.float64]) -> NDArray[np.uint16]:
+        """Return the label of each value."""
+        levels = np.rint(np.nan_to_num(values, posinf=np.inf, neginf=-np.inf) / self._unit) - self._lowest
+        return (self._levels + levels.clip(0, self._level_count - 1)).astype(np.uint16)
 
     def _add(self, texts: Sequence[str], colour: str = palette.MIDTONE) -> int:
         """Add texts; return the number of the first."""
@@ -128,18 +158,6 @@ class Labels:
                         [text], palette.BAD if is_bad else palette.agent(i)
                     )
 
-    def _add_rewards(self, rewards: NDArray[np.float64], learners: Sequence[str]) -> None:
-        self.rewards: list[tuple[int, NDArray[np.float64]]] = []
-        """For each learner its first label, and the rewards it can get, ascending."""
-        for i, learner in enumerate(learners):
-            distinct = np.unique(rewards[..., i])
-            if len(distinct) <= MAX_REWARDS:
-                prefix = f"reward of {spoken(learner)}" if len(learners) > 1 else "reward"
-                colour = palette.agent(i) if len(learners) > 1 else palette.MIDTONE
-                self.rewards.append(
-                    (self._add([f"{prefix} {_signed(r)}" for r in distinct], colour), distinct)
-                )
-
     def _add_stops(self, scene: Scene) -> None:
         is_named = action_names(scene.mdp) is not None
         for agent, names in enumerate(numbered_actions(scene.mdp)):
@@ -152,24 +170,16 @@ class Labels:
     def _add_levels(self, low: float, high: float) -> None:
         """Number values to three digits of the greatest one, with a margin on both sides."""
         low, high = min(low, 0.0), max(high, 0.0)
-        self.unit = 10.0 ** (math.floor(math.log10(max(-low, high, 1e-9))) - 2)
-        while (high - low) / self.unit > MAX_LEVELS:
-            self.unit *= 10
-        margin = (high - low) / 2 + self.unit
-        self._lowest, highest = (
-            math.floor((low - margin) / self.unit),
-            math.ceil((high + margin) / self.unit),
-        )
-        digits = max(0, -round(math.log10(self.unit)))
-        texts = [_signed(round(k * self.unit, digits), digits) for k in range(self._lowest, highest + 1)]
+        self._unit = 10.0 ** (math.floor(math.log10(max(-low, high, 1e-9))) - 2)
+        while (high - low) / self._unit > MAX_LEVELS:
+            self._unit *= 10
+        margin = (high - low) / 2 + self._unit
+        self._lowest = math.floor((low - margin) / self._unit)
+        highest = math.ceil((high + margin) / self._unit)
+        digits = max(0, -round(math.log10(self._unit)))
+        texts = [f"{k * self._unit:.{digits}f}" for k in range(self._lowest, highest + 1)]
         texts[0], texts[-1] = f"≤ {texts[0]}", f"≥ {texts[-1]}"
         self._levels, self._level_count = self._add(texts), len(texts)
-
-    @property
-    def value_marks(self) -> tuple[int, ...]:
-        """The labels of marks, the first label of a value, the lowest level, and the number of levels."""
-        marks = self.unmarked, self.greedy, self.exploited, self.explored
-        return *marks, self._levels, self._lowest, self._level_count
 
 
 def _event_labels(mdp: Mdp, mask: int, agent: str) -> list[str]:
@@ -181,7 +191,3 @@ def _event_labels(mdp: Mdp, mask: int, agent: str) -> list[str]:
             is_bad = owner == "" or (name not in mdp.success_events and event != "pickup")
             labels.append(f"{BAD_SIGN if is_bad else GOOD_SIGN} {spoken(event)}")
     return labels
-
-
-def _signed(value: float, digits: int | None = None) -> str:
-    return f"{value:g}" if digits is None else f"{value:.{digits}f}"

@@ -1,261 +1,317 @@
-"""A loop recorded with `record` in Rerun: episodes, logged values, frames, arrays, and the selected steps.
+"""A loop recorded with `record` as tracks: episodes, logged values, frames, arrays, and the selected steps.
 
 Entities of a vector environment are below `train/env_3`, those of a game's agent below `train/agent_0`.
 """
 
 from __future__ import annotations
 
+import io
+import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import islice
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from runner.export.rerun.columns import MAX_ROWS, Batch, Sender, scalars
-from runner.export.rerun.frames import FrameSender
+from runner.errors import CannotRedo
+from runner.export import pictures
+from runner.export.encoded import encoded_picture
+from runner.export.painting import redrawn
 from runner.export.rerun.labels import Labels
-from runner.export.rerun.layout import RunView, time_axis
-from runner.export.rerun.members import Member, entity_name, members_of, numbers_in
+from runner.export.rerun.layout import OVERVIEW
 from runner.export.rerun.metrics import line_colours, phase_colours, series_lines
-from runner.export.rerun.runs import Source
-from runner.export.rerun.scene import scene_of
+from runner.export.rerun.scene import background, scene_of
 from runner.export.rerun.selection import MAX_MEMBERS, Selection
-from runner.export.rerun.steps import StepWriter
-from runner.export.values import FEW
+from runner.export.rerun.steps import Batch, StepTracks, grid_view
+from runner.export.rerun.tracks import (
+    MAX_ROWS,
+    Row,
+    Source,
+    Times,
+    Track,
+    View,
+    cleared,
+    grouped,
+    rows_of,
+    scalars,
+    times_of,
+)
+from runner.export.values import FEW, number_names
 from runner.recording import schema
-from runner.recording.spaces import least_number
-from runner.replay.steps import check_steps
+from runner.recording.messages import frame_place, media_type
+from runner.recording.reader import Recording
+from runner.recording.spaces import least_number, leaves_of
+from runner.replay.steps import check_steps, environment_of, frames_every, log_times_of
 from runner.util.arrays import Array, MaskedArray
+from runner.util.extras import require
 
 MAX_BARS: Final = 16
 """Extras of more numbers are drawn as bars."""
-MAX_ARRAYS: Final = 2
-MAX_LOGGED: Final = 6
-"""Views of logged arrays, and of logged scalars, in the blueprint; all are sent."""
+MAX_LINES: Final = 24
+"""Observations or actions of more numbers are not drawn as lines."""
+FRAMES_SENT: Final = 64
+"""Pictures sent at once."""
+LOG: Final = View("log", "Log", rrb.TextLogView)
 _BATCH_BYTES: Final = 64 << 20
-_OVERVIEW: Final = "Overview"
-_BY_EPISODE: Final = ("return", "length")
-"""Titles of views of whole episodes, whose time axis is that of the run."""
+Part = tuple[tuple[str, ...], int, list[str]]
+"""The path of a field in the record of a step, what is added to its numbers, and their names."""
 
 
-class LoopExporter:
-    """Sends one loop to a stream."""
+class Member(NamedTuple):
+    """An environment of a vector, or an agent of a game."""
 
-    def __init__(self, stream: rr.RecordingStream, source: Source, selection: Selection) -> None:
-        recording, root = source.recording, source.root
-        self._stream = stream
-        self._recording = recording
-        self._selection = selection
-        self._root, self._title = root, source.title
-        scene = scene_of(recording.mdp) if recording.tabular else None
-        self._grid: tuple[RunView, Labels] | None = None
-        """The view of its grid, and the labels there; None where the states have no scene."""
-        if scene is not None:
-            view = RunView(root, source.title, recording.mdp, scene, recording.agents)
-            self._grid = view, Labels(recording.mdp, scene, recording.agents)
+    number: int
+    name: str = ""
+    """`env_3`, or the agent; empty if there is only one."""
+    column: int = 0
+    """Its column among the rewards."""
+    parts: Mapping[str, list[Part]] = {}
+    """`observation` and `action`, if they are drawn as lines."""
+
+
+class LoopReader:
+    """Reads a loop as tracks: an overview, then the selected steps, and pictures that are drawn of them."""
+
+    def __init__(
+        self, source: Source, selection: Selection, trust: bool, stage: Callable[[str], None]
+    ) -> None:
+        recording = self._recording = source.recording
+        self._source, self._root, self._selection = source, source.root, selection
+        self._trust, self._stage = trust, stage
+        self._scene = scene_of(recording.mdp) if recording.tabular else None
         self._is_game = len(recording.agents) > 1
-        self._members = members_of(recording, scene is not None)
-        self._plots: dict[str, dict[str, list[str]]] = {_OVERVIEW: {}}
-        """The entities that views show as lines, by tab and title."""
-        self._drawn: set[str] = set()
-        """All entities that are lines."""
-        self._logged: dict[str, None] = {}
-        """Names of logged scalars; a dictionary keeps them in order."""
-        self._bars: dict[str, str] = {}
-        """Titles of extras that are drawn as bars, by entity."""
-        names = [""] if self._is_game else [member.name for member in self._members]
-        self._frames = FrameSender(stream, root, recording, names)
-        self._arrays: dict[str, None] = {}
-        self._has_log = False
+        if self._is_game:
+            agents = enumerate(recording.agents)
+            self._members = [Member(i, entity_name(a), i, _parts(recording, a)) for i, a in agents]
+        else:
+            parts, n = {} if self._scene else _parts(recording), recording.environments
+            self._members = [Member(i, f"env_{i}" if n > 1 else "", 0, parts) for i in range(n)]
+        self._described: set[str] = set()
+        """Entities that are lines."""
+        self._pictured: dict[str, int] = {}
+        """The step of the last picture, by entity."""
         self._last = 0
-        """The last step for which anything was sent."""
+        """The last step that was read."""
 
-    def view(self) -> rrb.Container:
-        """Return the arrangement of what `export` has sent."""
-        root, title = self._root, self._title
-        left: list[tuple[rrb.View | rrb.Container, int]] = []  # views and their shares of the height
-        if self._grid is not None:
-            left.append((self._grid[0].grid_view(), 4))
-        left += [(view, 3) for view in self._frames.views()]
-        left += [
-            (rrb.TensorView(origin=f"{root}/array/{name}", name=name), 2)
-            for name in islice(self._arrays, MAX_ARRAYS)
-        ]
-        if self._has_log:
-            left.append((rrb.TextLogView(origin=f"{root}/log", name="Log"), 1))
-        tabs = []
-        for tab, plots in self._plots.items():
-            views = [
-                self._plot(title, entities, None if title in _BY_EPISODE else self._selection.focus)
-                for title, entities in plots.items()
-            ]
-            if tab == _OVERVIEW:
-                views += [
-                    rrb.BarChartView(origin=f"{root}/{entity}", name=name)
-                    for entity, name in islice(self._bars.items(), MAX_ARRAYS)
-                ]
-                views += [self._plot(name, [f"logged/{name}"]) for name in islice(self._logged, MAX_LOGGED)]
-            tabs.append(rrb.Grid(*views, grid_columns=2, name=tab))
-        right = tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0)
-        if not left:
-            return rrb.Vertical(right, name=title)
-        shown, shares = zip(*left, strict=True)
-        column = rrb.Vertical(*shown, row_shares=shares)
-        share = 3 if len(self._members) > 1 else 2
-        return rrb.Horizontal(column, right, column_shares=[share, 3], name=title)
-
-    def export(self) -> None:
-        """Send everything that is selected."""
+    def overview(self) -> Iterator[Track]:
+        """Yield everything but the steps."""
+        recording, root = self._recording, self._root
         for phase in schema.PHASES:
-            self._send_episodes(phase)
-            self._frames.send_recorded(phase)
-        self._frames.send_logged()
-        self._send_logged()
-        self._send_texts()
-        self._send_arrays()
-        if self._grid is not None:
-            view, labels = self._grid
-            labels.log(self._stream, self._root)
-            view.draw_background(self._stream)
+            yield from self._episodes(phase)
+            for entity, frames in grouped(self._recorded_frames(phase), FRAMES_SENT):
+                yield rows_of(entity, frames, self._frame_view(entity))
+        for image in recording.decoded(schema.IMAGE_TOPIC):
+            name, data = entity_name(image["frame_id"]), image["data"]
+            if media_type(data) not in ("image/png", "image/jpeg"):
+                data = _first_frame(data)
+            if data:
+                view = View("pictures", name, rrb.Spatial2DView)
+                yield rows_of(f"{root}/picture/{name}", [(_step(image["log_time"]), _picture(data))], view)
+        values = (
+            (entity_name(scalar["name"]), (scalar["log_time"], scalar["episode"], scalar["value"]))
+            for scalar in recording.decoded(schema.SCALAR_TOPIC)
+        )
+        for name, rows in grouped(values, MAX_ROWS):
+            log_times, episodes, numbers = (np.array(part) for part in zip(*rows, strict=True))
+            times, view = times_of(log_times, episode=episodes), View("logged", name.replace("_", " "))
+            static = [series_lines([name])]
+            yield Track(f"{root}/logged/{name}", times, scalars(numbers[:, np.newaxis]), static, view)
+        texts = (
+            (
+                f"{root}/log",
+                (_step(text["log_time"]), rr.TextLog(f"{text['name']}: {text['message']}", level="INFO")),
+            )
+            for text in recording.decoded(schema.LOG_TOPIC)
+        )
+        for entity, lines in grouped(texts, MAX_ROWS):
+            yield rows_of(entity, lines, LOG)
+        arrays = recording.messages(schema.ARRAY_TOPIC)
+        for (time, _), array in zip(arrays, recording.arrays(), strict=True):
+            name, tensor = entity_name(array.name), rr.Tensor(np.atleast_1d(array.values))
+            view = View("array", name, rrb.TensorView)
+            yield rows_of(f"{root}/array/{name}", [(_step(time), tensor)], view)
+
+    def steps(self) -> Iterator[Track]:
+        """Yield the selected steps of every environment and agent, and pictures that are drawn of them."""
+        recording, root, scene, title = self._recording, self._root, self._scene, self._source.title
         for phase, spans in self._selection.by_phase.items():
-            self._send_steps(phase, spans)
-
-    def draw_frames(self, trust: bool, stage: Callable[[str], None]) -> None:
-        """Send pictures of the chosen episodes that the environment draws; report what is missing."""
+            grid = None
+            if scene and spans:
+                labels = Labels(recording.mdp, scene, recording.agents)
+                grid = StepTracks(root, phase, recording.mdp, labels)
+                yield labels.track(root)
+                yield from background(root, scene, grid_view(title, scene))
+                yield from grid.still(title)
+            ends = [block["log_time"] for block in recording.blocks(schema.TRAIN_EPISODE)] if grid else []
+            for steps in self._batches(phase, spans):
+                yield from self._lines_of(phase, steps)
+                if grid:
+                    number = episode = steps["episode"].astype(np.int64)
+                    if phase == "eval":  # shown by the training episodes before it
+                        trained = np.concatenate([np.empty(0, np.uint64), *ends])
+                        episode = np.searchsorted(trained, steps["log_time"])
+                    yield from grid.of(Batch(steps, episode, number))
+            if grid:
+                yield from cleared([f"{grid.path}/grid"], [stop for _, stop in grid.covered])
         for phase, episodes in self._selection.drawn.items():
-            for note in self._frames.draw(phase, episodes, trust, stage):
-                self._selection.warnings.append(note)
-                self._has_log = True
-                self._log(self._last * schema.STEP_NANOSECONDS, "log", rr.TextLog(note, level="WARN"))
+            yield from self._drawn_frames(phase, episodes)
 
-    def _send_episodes(self, phase: str) -> None:
-        """Send returns and lengths: of a game one length, and the return of each agent."""
+    def _episodes(self, phase: str) -> Iterator[Track]:
+        """Yield returns and lengths: of a game one length, and the return of each agent."""
         for block in self._recording.blocks(schema.PHASES[phase][1]):
             for member in self._members:
                 own = block if self._is_game else block[self._is_of(block["last_step"], member)]
-                if not len(own):
-                    continue
-                times = self._times(own["log_time"], own["episode"])
-                self._send_lines(phase, member, "return", times, own["returns"][:, [member.column]])
-                if member.column == 0:
-                    length = own["length"].astype(np.float64)[:, np.newaxis]
-                    one = member._replace(name="") if self._is_game else member
-                    self._send_lines(phase, one, "length", times, length)
+                if len(own):
+                    times = self._times(own)
+                    yield self._line(phase, member, "return", times, own["returns"][:, [member.column]])
+                    if member.column == 0:
+                        one = member._replace(name="") if self._is_game else member
+                        yield self._line(phase, one, "length", times, own["length"][:, np.newaxis])
 
-    def _send_logged(self) -> None:
-        """Send the logged scalars, a batch of each name at a time."""
-        sender = self._sender("logged")
-        waiting: dict[str, list[tuple[int, int, float]]] = {}
+    def _lines_of(self, phase: str, steps: NDArray[np.void]) -> Iterator[Track]:
+        """Yield rewards, observations, actions and extras of steps."""
+        extras = self._recording.extras(phase).at(steps["step"])
+        for member in self._members:
+            is_own = self._is_of(steps["step"], member)
+            if self._is_game:
+                is_own = (steps["acted"] >> member.number & 1).astype(np.bool_)
+            if not is_own.any():
+                continue
+            own = steps[is_own]
+            times = self._times(own, t=own["t"])
+            yield self._line(phase, member, "reward", times, own["rewards"][:, [member.column]])
+            for quantity, parts in member.parts.items():
+                numbers = [_numbers_in(own, path) + start for path, start, _ in parts]
+                names = [name for _, _, of_part in parts for name in of_part]
+                yield self._line(phase, member, quantity, times, np.concatenate(numbers, axis=1), names)
+            for name, values in extras.items():
+                agent, _, own_name = name.partition("/") if self._is_game else (member.name, "", name)
+                if entity_name(agent) == (member.name or "_"):
+                    yield from self._extra(phase, member, own_name, values[is_own], times)
 
-        def send(name: str) -> None:
-            times, episodes, values = (np.array(column) for column in zip(*waiting.pop(name), strict=True))
-            columns = scalars(values.astype(np.float64)[:, np.newaxis])
-            sender.send(name, self._times(times, episodes), columns)
+    def _extra(
+        self, phase: str, member: Member, name: str, values: MaskedArray, times: Times
+    ) -> Iterator[Track]:
+        """Yield a value that the loop recorded with steps: as lines, or as bars if it is many numbers."""
+        is_given = ~np.ma.getmaskarray(values).reshape(len(values), -1)[:, 0]
+        numbers = values.data.reshape(len(values), -1).astype(np.float64)
+        quantity = f"extra/{entity_name(name)}"
+        if numbers.shape[1] <= MAX_BARS:
+            # A gap in the line where the value was not recorded
+            numbers = np.where(is_given[:, np.newaxis], numbers, np.nan)
+            names = [f"{name}[{i}]" for i in range(numbers.shape[1])]
+            yield self._line(phase, member, quantity, times, numbers, names)
+        elif is_given.any():
+            bars = zip(times["step"][is_given].tolist(), map(rr.BarChart, numbers[is_given]), strict=True)
+            view = View("bars", " ".join(filter(None, [member.name, name])), rrb.BarChartView)
+            yield rows_of(self._entity(phase, member.name, quantity), list(bars), view)
 
-        for scalar in self._recording.decoded(schema.SCALAR_TOPIC):
-            name = entity_name(scalar["name"])
-            if name not in self._logged:
-                self._logged[name] = None
-                sender.send_static(name, series_lines([name]))
-            rows = waiting.setdefault(name, [])
-            rows.append((scalar["log_time"], scalar["episode"], scalar["value"]))
-            if len(rows) == MAX_ROWS:
-                send(name)
-        for name in list(waiting):
-            send(name)
-
-    def _send_texts(self) -> None:
-        for text in self._recording.decoded(schema.LOG_TOPIC):
-            self._has_log = True
-            line = rr.TextLog(f"{text['name']}: {text['message']}", level="INFO")
-            self._log(text["log_time"], "log", line)
-
-    def _send_arrays(self) -> None:
-        times = (time for time, _ in self._recording.messages(schema.ARRAY_TOPIC))
-        for time, array in zip(times, self._recording.arrays(), strict=True):
-            name = entity_name(array.name)
-            self._arrays[name] = None
-            self._log(time, f"array/{name}", rr.Tensor(np.atleast_1d(array.values)))
-
-    def _send_steps(self, phase: str, spans: Sequence[range]) -> None:
-        """Send steps of every environment and agent, in all their views."""
-        recording = self._recording
-        grid: StepWriter | None = None
-        training_ends = self._training_ends() if self._grid is not None and phase == "eval" else None
-        for steps in self._batches(f"/{phase}/step", spans):
-            extras = recording.extras(phase).at(steps["step"])
-            for member in self._members:
-                is_own = (
-                    (steps["acted"] >> member.number & 1).astype(np.bool_)
-                    if self._is_game
-                    else self._is_of(steps["step"], member)
-                )
-                if not is_own.any():
-                    continue
-                own = steps[is_own]
-                times = self._times(own["log_time"], own["episode"])
-                times.append(rr.TimeColumn("t", sequence=own["t"].astype(np.int64)))
-                self._send_lines(phase, member, "reward", times, own["rewards"][:, [member.column]])
-                for quantity, parts in member.parts.items():
-                    numbers = [numbers_in(own, path) + start for path, start, _ in parts]
-                    names = [name for _, _, each in parts for name in each]
-                    self._send_lines(phase, member, quantity, times, np.concatenate(numbers, axis=1), names)
-                values = {name: each[is_own] for name, each in extras.items()}
-                self._send_extras(phase, member, values, own["log_time"], times)
-            if self._grid is not None:
-                view, labels = self._grid
-                grid = grid or StepWriter(self._stream, view, phase, labels)
-                episode = steps["episode"].astype(np.int64)
-                if training_ends is not None:  # evaluation is shown by the training episodes before it
-                    episode = np.searchsorted(training_ends, steps["log_time"])
-                grid.write(Batch.of(steps, episode))
-        if grid is not None:
-            grid.clear_gaps(["grid"], grid.covered[-1][1])
-
-    def _is_of(self, steps: Array, member: Member) -> NDArray[np.bool_]:
-        """Return which steps, given by number, were taken in an environment."""
-        return np.asarray(steps % self._recording.environments == member.number)
-
-    def _training_ends(self) -> NDArray[np.uint64]:
-        """Return the times at which training episodes ended."""
-        ends = [block["log_time"] for block in self._recording.blocks(schema.TRAIN_EPISODE)]
-        return np.concatenate([np.empty(0, np.uint64), *ends])
-
-    def _send_extras(
+    def _line(
         self,
         phase: str,
         member: Member,
-        extras: Mapping[str, MaskedArray],
-        log_times: Array,
-        times: list[rr.TimeColumn],
-    ) -> None:
-        """Send the values that the loop recorded with these steps: as lines, or as bars if they are many."""
-        for name, values in extras.items():
-            own = name
-            if self._is_game:
-                agent, _, own = name.partition("/")
-                if entity_name(agent) != member.name:
-                    continue
-            given = ~np.ma.getmaskarray(values).reshape(len(values), -1)[:, 0]
-            numbers = values.data.reshape(len(values), -1).astype(np.float64)
-            quantity = f"extra/{entity_name(own)}"
-            if numbers.shape[1] > MAX_BARS:
-                entity = _join(phase, member.name, quantity)
-                self._bars.setdefault(entity, _spaced(member.name, own))
-                for time, row in zip(log_times[given].tolist(), numbers[given], strict=True):
-                    self._log(time, entity, rr.BarChart(row))
-                continue
-            # A gap in the line where the value was not recorded
-            numbers = np.where(given[:, np.newaxis], numbers, np.nan)
-            names = [f"{own}[{i}]" for i in range(numbers.shape[1])]
-            self._send_lines(phase, member, quantity, times, numbers, names)
+        quantity: str,
+        times: Times,
+        values: Array,
+        names: Sequence[str] = ("",),
+    ) -> Track:
+        """Return series, [rows, names]; the first also with how they are drawn, and in which view.
 
-    def _batches(self, name: str, spans: Sequence[range]) -> Iterator[NDArray[np.void]]:
+        A view shows a quantity of all environments; one of several numbers those of one environment.
+        """
+        recording, entity = self._recording, self._entity(phase, member.name, quantity)
+        if entity in self._described:
+            return Track(entity, times, scalars(values))
+        self._described.add(entity)
+        colours = phase_colours(phase, len(names))
+        if member.name and len(names) == 1:
+            shades = line_colours(min(len(self._members), MAX_MEMBERS))
+            colours = [shades[member.number % len(shades)]]
+        lines = names if len(names) > 1 else [" ".join(filter(None, [phase, member.name]))]
+        style: Any = series_lines(lines, colours)
+        if names == ["action"]:  # of a Discrete space: lines between such numbers mean nothing
+            style = rr.SeriesPoints(names=lines, colors=colours, marker_sizes=[1.5])
+        tab, title = OVERVIEW, quantity.removeprefix("extra/")
+        agent = recording.agents[member.number] if self._is_game else ""
+        actions = recording.action_names(phase, agent)
+        if quantity == "action" and 0 < len(actions) <= FEW:
+            space = recording.spaces["action"]
+            least = least_number(space["spaces"][agent] if agent else space)
+            title = f"action: {', '.join(f'{i} {name}' for i, name in enumerate(actions, least))}"
+        if member.name and len(names) > 1:
+            tab, title = title.capitalize(), f"{member.name} {title}"
+        view = View(tab, title.replace("_", " "), has_focus=title not in ("return", "length"))
+        shown = view if member.number < MAX_MEMBERS else None
+        return Track(entity, times, scalars(values), [style], shown)
+
+    def _recorded_frames(self, phase: str) -> Iterator[tuple[str, Row]]:
+        """Yield entity and row of each recorded frame, at the step of its own environment."""
+        recording, n = self._recording, 1 if self._is_game else len(self._members)
+        is_each_step = frames_every(recording) == 1
+        for frame in recording.decoded(recording.topic(f"/{phase}/frame")):
+            environment, _ = frame_place(frame)
+            if environment < n:
+                entity = self._frame_entity(phase, environment)
+                step = max(0, _step(frame["log_time"]) - (n - 1 - environment))
+                if self._is_later(entity, step) or not is_each_step:
+                    yield entity, (step, _picture(frame["data"]))
+
+    def _drawn_frames(self, phase: str, episodes: Sequence[int]) -> Iterator[Track]:
+        """Yield pictures of episodes that the environment draws, as far as it does what was recorded."""
+        recording = self._recording
+        sources = {number: pictures.source_of(recording, phase, self._trust, number) for number in episodes}
+        notes = sorted({f"No {phase} pictures: {reason}" for _, reason in sources.values() if reason})
+        chosen = [number for number, (source, _) in sources.items() if source is pictures.Source.REDRAWN]
+        number, times, entity, rows = 0, [0], "", []
+        try:
+            for number, t, pixels in redrawn(recording, phase, chosen, self._trust) if chosen else ():
+                if t == 0:
+                    times = [_step(time) for time in log_times_of(recording, phase, number)]
+                    entity = self._frame_entity(phase, environment_of(recording, phase, number))
+                    self._stage(f"drawing {phase} episode {chosen.index(number) + 1:,} of {len(chosen):,}")
+                step = times[t - 1] if t else times[0] - 1
+                if self._is_later(entity, step):
+                    rows.append((step, _picture(encoded_picture(pixels))))
+                if t == len(times) or len(rows) == FRAMES_SENT:
+                    yield rows_of(entity, rows, self._frame_view(entity))
+                    rows = []
+                if t == len(times):  # nothing is shown until the next picture
+                    n = 1 if self._is_game else len(self._members)
+                    clear = rr.Clear.columns(is_recursive=[False])
+                    yield Track(entity, {"step": np.array([step + n])}, clear)
+        except CannotRedo as error:
+            notes.append(f"No {phase} pictures from episode {number or chosen[0]} on: {error}")
+        if rows:
+            yield rows_of(entity, rows, self._frame_view(entity))
+        for note in notes:
+            self._selection.warnings.append(note)
+            yield rows_of(f"{self._root}/log", [(self._last, rr.TextLog(note, level="WARN"))], LOG)
+
+    def _is_later(self, entity: str, step: int) -> bool:
+        """Return whether a picture is later than the one before.
+
+        With a picture at each step, that of a reset must not hide that of the last step.
+        """
+        before, self._pictured[entity] = self._pictured.get(entity, -1), step
+        return before < step
+
+    def _entity(self, *parts: str) -> str:
+        return "/".join([self._root, *filter(None, parts)])
+
+    def _frame_entity(self, phase: str, environment: int) -> str:
+        return self._entity(phase, "" if self._is_game else self._members[environment].name, "frame")
+
+    def _frame_view(self, entity: str) -> View:
+        phase, *rest = entity.removeprefix(f"{self._root}/").split("/")
+        return View(phase, " ".join([phase, *rest]), rrb.Spatial2DView)
+
+    def _batches(self, phase: str, spans: Sequence[range]) -> Iterator[NDArray[np.void]]:
         """Yield the steps of all environments, at most a batch of each at a time."""
-        recording, topic = self._recording, self._recording.topic(name)
+        recording, name = self._recording, f"/{phase}/step"
+        topic = recording.topic(name)
         if topic not in recording.dtypes:  # they vary in size, so they are read from the first on
             for span in spans:
                 for block in recording.rows(name):
@@ -264,91 +320,75 @@ class LoopExporter:
                     if len(own := block[(block["step"] >= span.start) & (block["step"] < span.stop)]):
                         yield own
             return
-        size = recording.dtypes[topic].itemsize
-        limit = max(1, min(MAX_ROWS * recording.environments, _BATCH_BYTES // size))
+        dtype = recording.dtypes[topic]
+        limit = max(1, min(MAX_ROWS * recording.environments, _BATCH_BYTES // dtype.itemsize))
         for span in spans:
             for start in range(span.start, span.stop, limit):
-                steps = np.concatenate(
-                    [
-                        np.empty(0, recording.dtypes[topic]),
-                        *recording.blocks(topic, start, min(start + limit, span.stop)),
-                    ]
-                )
+                blocks = recording.blocks(topic, start, min(start + limit, span.stop))
+                steps = np.concatenate([np.empty(0, dtype), *blocks])
                 steps = steps[steps["t"] != schema.RESET_ONLY]
-                if not len(steps):
-                    continue
-                if self._grid is not None:
-                    check_steps(steps, recording.mdp, str(recording.path), "recorded")
-                yield steps
+                if len(steps):
+                    if self._scene:
+                        check_steps(steps, recording.mdp, str(recording.path), "recorded")
+                    yield steps
 
-    def _send_lines(
-        self,
-        phase: str,
-        member: Member,
-        quantity: str,
-        times: list[rr.TimeColumn],
-        values: NDArray[np.float64],
-        names: Sequence[str] = ("",),
-    ) -> None:
-        """Send series, [rows, names]; at first also how they are drawn, and in which view.
+    def _is_of(self, steps: Array, member: Member) -> NDArray[np.bool_]:
+        """Return which steps, given by number, were taken in an environment."""
+        return np.asarray(steps % self._recording.environments == member.number)
 
-        A view shows a quantity of all environments; one of several numbers those of one environment.
-        """
-        entity = _join(phase, member.name, quantity)
-        if entity not in self._drawn:
-            self._drawn.add(entity)
-            colours = phase_colours(phase, len(names))
-            if member.name and len(names) == 1:
-                shown = line_colours(min(len(self._members), MAX_MEMBERS))
-                colours = [shown[member.number % len(shown)]]
-            lines = names if len(names) > 1 else [_spaced(phase, member.name)]
-            style: Any = series_lines(lines, colours)
-            if names == ["action"]:  # of a Discrete space: lines between such numbers mean nothing
-                style = rr.SeriesPoints(names=lines, colors=colours, marker_sizes=[1.5])
-            self._sender("").send_static(entity, style)
-            tab, title = _OVERVIEW, quantity.removeprefix("extra/")
-            agent = self._recording.agents[member.number] if self._is_game else ""
-            actions = self._recording.action_names(phase, agent)
-            if quantity == "action" and 0 < len(actions) <= FEW:
-                space = self._recording.spaces["action"]
-                least = least_number(space["spaces"][agent] if agent else space)
-                title = f"action: {', '.join(f'{i} {name}' for i, name in enumerate(actions, least))}"
-            if member.name and len(names) > 1:
-                tab, title = title.capitalize(), _spaced(member.name, title)
-            if member.number < MAX_MEMBERS:
-                self._plots.setdefault(tab, {}).setdefault(title, []).append(entity)
-        self._sender("").send(entity, times, scalars(values))
+    def _times(self, records: NDArray[np.void], **timelines: Array) -> Times:
+        times = times_of(records["log_time"], episode=records["episode"], **timelines)
+        self._last = max(self._last, int(times["step"].max()))
+        return times
 
-    def _sender(self, part: str) -> Sender:
-        return Sender(self._stream, f"{self._root}/{part}" if part else self._root)
 
-    def _plot(self, name: str, entities: Sequence[str], focus: tuple[int, int] | None = None) -> rrb.View:
-        contents = [f"{self._root}/{entity}" for entity in entities]
-        return rrb.TimeSeriesView(
-            origin=f"{self._root}/",
-            contents=contents,
-            name=name.replace("_", " "),
-            axis_x=time_axis(self._last, focus),
-        )
-
-    def _log(self, log_time: int, entity: str, archetype: rr.AsComponents) -> None:
-        step = log_time // schema.STEP_NANOSECONDS
-        self._last = max(self._last, step)
-        self._stream.set_time("step", sequence=step)
-        self._stream.log(f"{self._root}/{entity}", archetype)
-
-    def _times(self, log_time: Array, episode: Array) -> list[rr.TimeColumn]:
-        steps = log_time.astype(np.int64) // schema.STEP_NANOSECONDS
-        self._last = max(self._last, int(steps.max(initial=0)))
-        return [
-            rr.TimeColumn("step", sequence=steps),
-            rr.TimeColumn("episode", sequence=episode.astype(np.int64)),
+def _parts(recording: Recording, agent: str = "") -> dict[str, list[Part]]:
+    """Return the numbers of a step, of one agent or of all, that are drawn as lines."""
+    spaces = recording.spaces
+    if recording.kind == "step":
+        fields = {"observation": "state", "action": "action"}
+        return {part: [((field,), least_number(spaces[part]), [field])] for part, field in fields.items()}
+    by_part: dict[str, list[Part]] = {}
+    for part, field in (("observation", "next_observation"), ("action", "action")):
+        leaves = [
+            leaf
+            for leaf in leaves_of(spaces[part], f"the {part} space")
+            if leaf.dtype is not None and (not agent or leaf.path[0] == agent)
         ]
+        count = sum(math.prod(leaf.dtype.shape) for leaf in leaves if leaf.dtype is not None)
+        if recording.kind != "variable" and 0 < count <= MAX_LINES:
+            names = [list(number_names(leaf, part, skip=1 if agent else 0)) for leaf in leaves]
+            by_part[part] = [((field, *leaf.path), 0, own) for leaf, own in zip(leaves, names, strict=True)]
+    return by_part
 
 
-def _join(*parts: str) -> str:
-    return "/".join(filter(None, parts))
+def _numbers_in(steps: NDArray[np.void], path: tuple[str, ...]) -> NDArray[np.float64]:
+    """Return the numbers of a field, [n, numbers]."""
+    column: NDArray[Any] = steps
+    for name in path:
+        column = column[name]
+    return column.reshape(len(steps), -1).astype(np.float64)
 
 
-def _spaced(*parts: str) -> str:
-    return " ".join(filter(None, parts))
+def entity_name(name: str) -> str:
+    """Return a user's name as a part of an entity's path."""
+    return re.sub(r"[^\w.-]+", "_", name)[:80] or "_"
+
+
+def _picture(data: bytes) -> rr.EncodedImage:
+    return rr.EncodedImage(contents=data, media_type=media_type(data) or "image/jpeg")
+
+
+def _first_frame(data: bytes) -> bytes:
+    """Return the first frame of a film as PNG; empty if it is none."""
+    image = require("PIL.Image", extra="plots", purpose="logged films in Rerun")
+    try:
+        with image.open(io.BytesIO(data), formats=["WEBP"]) as film:
+            film.convert("RGB").save(buffer := io.BytesIO(), "png")
+    except (OSError, ValueError, image.DecompressionBombError):
+        return b""
+    return buffer.getvalue()
+
+
+def _step(log_time: int) -> int:
+    return log_time // schema.STEP_NANOSECONDS

@@ -1,45 +1,45 @@
-"""Q-values at a step, sent as a table of values and as maps."""
+"""Q-values at a step, read by replaying the tables, and shown as a table of values and as maps.
+
+The tables are replayed from the recorded steps, so everything shown is exact for its step. Where a repair
+lost steps, the values after them are unknown up to the next snapshot, and are left out.
+"""
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Iterator
+from typing import Any, Final
 
-import numba
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from runner.drawing import palette
+from runner.environments.mdp import Mdp
 from runner.environments.naming import numbered_actions, spoken
-from runner.export.rerun.columns import (
-    Batch,
-    Sender,
-    images,
-    instances,
-    pixel_centres,
-    ragged,
-    repeated_point,
-    rgba,
-    scalars,
-    strips,
-    texts,
-)
 from runner.export.rerun.labels import Labels
-from runner.export.rerun.layout import (
-    BAR_LEFT,
-    BAR_LENGTH,
-    CHOSEN_X,
-    GREEDY_X,
-    LABEL_RISE,
-    MAP_LABEL_Y,
-    NUMBER_X,
-    RunView,
-    bar_rows,
-)
 from runner.export.rerun.metrics import series_lines
-from runner.export.rerun.scene import Scene
-from runner.export.rerun.step_values import StepValues
+from runner.export.rerun.scene import Scene, crossing_lines
+from runner.export.rerun.steps import Batch
+from runner.export.rerun.tracks import Track, View, columns, point, rgba, scalars, texts
+from runner.recording.reader import Recording
+from runner.recording.schema import STEP_NANOSECONDS
+from runner.replay.step_replay import StateProbe
+from runner.replay.tables import TableReplay, known_steps
 
+NAME_X: Final = 1.0
+BAR_LEFT: Final = 2.5
+BAR_LENGTH: Final = 5.0
+NUMBER_X: Final = 9.4
+GREEDY_X: Final = 12.2
+CHOSEN_X: Final = 15.2
+TABLE_WIDTH: Final = 17.0
+TABLE_TOP: Final = -1.7
+"""Columns and top of the table of values, in rows of height 1."""
+LABEL_RISE: Final = 0.5
+"""From a row of the table up to the point of a label in it, which is written below that point."""
+MAP_LABEL_Y: Final = -2.6
+_AGENT_GAP: Final = 2.0
 _BAR_FRACTION: Final = 64
 """The length of a bar is rounded to this fraction of a row's height: invisible, and smaller in the file."""
 _LETTER_RISE: Final = 0.6
@@ -49,88 +49,156 @@ _AGENT_OFFSET: Final = 0.21
 _ARROW_SCALE: Final = 1.2
 
 
-class TableWriter(Sender):
-    """Sends the table of values of one phase; its numbers as text are rounded, its scalars exact."""
+class ValueReader:
+    """Reads the Q-values at the steps of a recorded job, with maps of placements if there are any."""
 
-    def __init__(self, stream: rr.RecordingStream, path: str, view: RunView, labels: Labels) -> None:
-        super().__init__(stream, path)
-        mdp = view.mdp
-        self._labels = labels
-        self._own = mdp.own_actions
-        self._y = np.concatenate(bar_rows(mdp))
-        agents, counts = len(mdp.agents), mdp.action_counts
-        self._bounds = np.cumsum((0, *counts))
-        """The first value of each agent, and the number of values."""
-        self._explored_bit = np.arange(agents) if len(view.learners) == agents else np.zeros(agents, np.int64)
+    def __init__(self, recording: Recording, scene: Scene | None) -> None:
+        self._recording = recording
+        self._mdp: Mdp = recording.mdp
+        placements = scene.placements if scene else None
+        self._context = placements.context if placements else np.zeros(self._mdp.states, np.int64)
+        self._states = placements.states if placements else np.empty((1, 0), np.int32)
+        self._known_ranges = known_steps(recording)
+        self._replay: TableReplay | None = None
+        self._last = (0, -1)
+        """Time and context of the step before."""
+
+    def split(self, block: NDArray[np.void]) -> Iterator[NDArray[np.void]]:
+        """Yield a block of training steps in parts whose values are either all known or all unknown."""
+        first = int(block["step"][0])
+        edges = [edge for start, last in self._known_ranges for edge in (start, last + 1)]
+        yield from np.split(block, [edge - first for edge in edges if 0 < edge - first < len(block)])
+
+    def values(self, block: NDArray[np.void], train_step: int | None = None) -> tuple[Any, ...]:
+        """Return the values of a `Batch` before the update of each step of a part; nothing if unknown.
+
+        `train_step` is the number of training steps before a block of evaluation steps.
+        """
+        step = int(block["step"][0]) if train_step is None else train_step
+        if not any(first <= step <= last for first, last in self._known_ranges):
+            return ()
+        if self._replay is None:
+            self._replay = TableReplay(self._recording, step)
+        elif self._replay.step != step:
+            self._replay.seek(step)
+        context = self._context[block["state"]]
+        has_map = block["t"] == 0  # and where the context changes
+        has_map[1:] |= context[1:] != context[:-1]
+        has_map[0] |= (int(block["log_time"][0]) - STEP_NANOSECONDS, int(context[0])) != self._last
+        self._last = (int(block["log_time"][-1]), int(context[-1]))
+        rows = np.flatnonzero(has_map)
+        shape = len(rows), len(self._recording.agents), self._states.shape[1]
+        maps = np.empty(shape, np.float32), np.empty(shape, np.int32)
+        probe = StateProbe(rows, self._states[context[rows]], *maps)
+        if train_step is None:
+            tables = self._replay.empty_rows(len(block))
+            self._replay.apply(block, tables, probe)
+        else:
+            self._replay.read(probe)
+            tables = self._replay.values_in(block["state"])
+        return *self._by_agent(tables), has_map, *maps
+
+    def _by_agent(self, tables: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return values and greedy actions by agent, of rows by learner."""
+        counts = self._mdp.action_counts
+        if tables.shape[1] == len(counts):
+            own = [tables[:, i, :count] for i, count in enumerate(counts)]
+            return np.concatenate(own, axis=1), np.stack([q.argmax(axis=1) for q in own], axis=1)
+        joint = tables[:, 0].reshape(-1, *counts)
+        axes = set(range(1, joint.ndim))
+        best = [joint.max(axis=tuple(axes - {1 + i})) for i in range(len(counts))]
+        return np.concatenate(best, axis=1), self._mdp.own_actions[tables[:, 0].argmax(axis=1)]
+
+
+class ValueTracks:
+    """Makes the table of values of one phase: its numbers as text are rounded, its scalars exact."""
+
+    def __init__(self, path: str, mdp: Mdp, labels: Labels, learners: tuple[str, ...]) -> None:
+        self._path, self._mdp, self._labels = path, mdp, labels
+        self._y = np.concatenate(_bar_rows(mdp))
+        counts = mdp.action_counts
+        self._agent = np.repeat(np.arange(len(counts)), counts)
+        """[values]: the agent of each value."""
+        self._first = np.cumsum((0, *counts[:-1]))
+        self._explored_bit = np.arange(len(counts)) * (len(learners) == len(counts))
         height = self._y - LABEL_RISE
-        columns = [
-            np.stack((np.full_like(height, x), height), axis=1) for x in (NUMBER_X, GREEDY_X, CHOSEN_X)
-        ]
-        self._points = np.concatenate(columns).astype(np.float32)
+        marks = [np.stack((np.full_like(height, x), height), axis=1) for x in (NUMBER_X, GREEDY_X, CHOSEN_X)]
+        self._points = np.concatenate(marks).astype(np.float32)
         """The points of each action's number, then of its mark as greedy, then of its mark as chosen."""
-        colours = [rgba(palette.agent(i)) for i, count in enumerate(counts) for _ in range(count)]
-        names = zip(mdp.agents, numbered_actions(mdp), strict=True)
-        series = [f"{spoken(agent)} {name}" for agent, actions in names for name in actions]
-        self.send_static(
-            "q",
-            rr.LineStrips2D.from_fields(colors=colours, radii=0.22),
-            rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=40.0),
-            series_lines(series),
-        )
 
-    def write(self, batch: Batch, values: StepValues) -> None:
-        """Send the values of each step of a batch: as they were before its update."""
-        q, labels = values.values, self._labels
+    def still(self) -> Iterator[Track]:
+        """Yield what never changes."""
+        names = zip(self._mdp.agents, numbered_actions(self._mdp), strict=True)
+        static = [
+            rr.LineStrips2D.from_fields(
+                colors=[rgba(palette.agent(i)) for i in self._agent.tolist()], radii=0.22
+            ),
+            rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=40.0),
+            series_lines([f"{spoken(agent)} {name}" for agent, actions in names for name in actions]),
+        ]
+        yield Track(f"{self._path}/q", static=static, view=table_view(self._mdp))
+
+    def of(self, batch: Batch) -> Iterator[Track]:
+        """Yield the values of each step of a batch: as they were before its update."""
+        q, labels, first, agent = batch.values, self._labels, self._first, self._agent
         n, count = q.shape
-        own = self._own[batch.records["action"]]
-        explored = batch.records["explored"][:, None] >> self._explored_bit & 1
-        classes = np.empty((n, 3 * count), np.uint16)
+        own = self._mdp.own_actions[batch.records["action"]]
+        is_explored = batch.records["explored"][:, None] >> self._explored_bit & 1
+        classes = np.full((n, 3 * count), labels.unmarked, np.uint16)
+        classes[:, :count] = labels.of_values(q)
+        rows = np.arange(n)[:, None]
+        classes[rows, count + first + batch.greedy] = labels.greedy
+        classes[rows, 2 * count + first + own] = np.where(is_explored, labels.explored, labels.exploited)
+        low, high = (bound.reduceat(q, first, axis=1) for bound in (np.minimum, np.maximum))
+        span = high - low
+        scale = np.divide(BAR_LENGTH * _BAR_FRACTION, span, out=np.zeros_like(span), where=span > 0)
         bars = np.empty((n, count, 2, 2), np.float32)
         bars[:, :, 0, 0] = BAR_LEFT
+        bars[:, :, 1, 0] = BAR_LEFT + np.ceil((q - low[:, agent]) * scale[:, agent]) / _BAR_FRACTION
         bars[..., 1] = self._y[:, None]
-        ends = bars[:, :, 1, 0]
-        marks = labels.value_marks
-        _fill_table(q, values.greedy, own, explored, self._bounds, labels.unit, marks, classes, ends)
-        columns = [*scalars(q), *instances(rr.Points2D, class_ids=classes), *strips(bars)]
-        self.send("q", batch.times, columns)
-        rows = values.map_rows  # the points never change, but are cleared with the rest
+        shown = [*columns(rr.Points2D, class_ids=classes), *columns(rr.LineStrips2D, strips=bars)]
+        yield Track(f"{self._path}/q", batch.times(), [*scalars(q), *shown])
+        rows = np.flatnonzero(batch.has_map)  # the points never change, but are cleared with the rest
         points = np.broadcast_to(self._points, (len(rows), *self._points.shape))
-        self.send("q", batch.times_at(rows), instances(rr.Points2D, positions=points))
+        if len(rows):
+            yield Track(f"{self._path}/q", batch.times(rows), columns(rr.Points2D, positions=points))
 
 
-class MapWriter(Sender):
-    """Sends a learner's map in one phase: the greatest value and the greedy moves of every placement.
+class MapTracks:
+    """Makes a learner's map in one phase: the greatest value and the greedy moves of every placement."""
 
-    The scene of the view has placements.
-    """
-
-    def __init__(
-        self, stream: rr.RecordingStream, path: str, view: RunView, labels: Labels, learner: int
-    ) -> None:
-        super().__init__(stream, f"{path}/map")
-        assert view.scene is not None
-        assert view.scene.placements is not None
-        mdp, scene, placements = view.mdp, view.scene, view.scene.placements
-        self._learner = learner
-        self._name = view.learners[learner]
-        self._placements = placements
-        is_joint = len(view.learners) != len(mdp.agents)
-        agents = list(range(len(mdp.agents))) if is_joint else [learner]
-        movers = [
-            scene.mover_agents.index(mdp.agents[agent]) if mdp.agents[agent] in scene.mover_agents else 0
-            for agent in agents
-        ]
+    def __init__(self, path: str, scene: Scene, labels: Labels, learners: tuple[str, ...], i: int) -> None:
+        assert scene.placements is not None
+        mdp, placements = scene.mdp, scene.placements
+        self._learner, self._placements = i, placements
+        self._path, self._name = f"{path}/map/{learners[i]}", learners[i]
+        is_joint = len(learners) != len(mdp.agents)
+        self._agents = list(range(len(mdp.agents))) if is_joint else [i]
+        names = [mdp.agents[agent] for agent in self._agents]
+        movers = [scene.mover_agents.index(name) if name in scene.mover_agents else 0 for name in names]
         self._order = placements.order(movers[0])
         self._pixel = np.argsort(self._order)[placements.pixel]
         """[S]: the pixel of each state."""
-        self._centres = pixel_centres(placements.height, placements.width)
-        x = (np.arange(len(agents)) - (len(agents) - 1) / 2) * 2 * _AGENT_OFFSET
-        offsets = np.stack((x, np.zeros(len(agents))), axis=1).astype(np.float32)
-        origins = self._centres[None] + offsets[:, None]
-        self._letter_points = origins - np.array([0.0, _LETTER_RISE], np.float32)
-        self._arrows, self._letters = _arrows_and_letters(scene, labels, agents, movers, is_joint)
-        colours = [rgba(palette.agent(agent)) for agent in agents for _ in self._centres]
-        text = rr.Points2D.from_fields(radii=0.0, show_labels=True, colors=[rgba(palette.MIDTONE)])
+        pixel = np.arange(placements.height * placements.width)
+        centres = np.stack((pixel % placements.width + 0.5, pixel // placements.width + 0.5), axis=1)
+        self._centres = centres.astype(np.float32)
+        x = (np.arange(len(movers)) - (len(movers) - 1) / 2) * 2 * _AGENT_OFFSET
+        offsets = np.stack((x, np.zeros(len(movers))), axis=1).astype(np.float32)
+        self._origins = self._centres + offsets[:, None]
+        """[agents, pixels, 2]."""
+        own, arrows, letters = mdp.own_actions, [], []
+        for agent, mover in zip(self._agents, movers, strict=True):
+            first = [int(np.argmax(own[:, agent] == action)) for action in range(mdp.action_counts[agent])]
+            actions = own[:, agent] if is_joint else np.arange(len(first))
+            arrows.append((scene.moves[first, mover] * np.float32(_ARROW_SCALE))[actions])
+            letters.append(labels.stops[agent][actions])
+        # The last action is that of pixels without a state, -1.
+        self._arrows = np.pad(np.stack(arrows), ((0, 0), (0, 1), (0, 0)))
+        self._letters = np.pad(np.stack(letters), ((0, 0), (0, 1)), constant_values=-1)
+
+    def still(self) -> Iterator[Track]:
+        """Yield what never changes."""
+        placements = self._placements
         pixels = rr.components.ImageFormat(
             width=placements.width,
             height=placements.height,
@@ -138,150 +206,104 @@ class MapWriter(Sender):
             color_model=rr.ColorModel.L,
         )
         arrows = rr.Arrows2D.from_fields(
-            origins=origins.reshape(-1, 2), colors=colours, radii=0.06, draw_order=40.0
+            origins=self._origins.reshape(-1, 2),
+            colors=[rgba(palette.agent(agent)) for agent in self._agents for _ in self._centres],
+            radii=0.06,
+            draw_order=40.0,
         )
-        here = rr.Boxes2D.from_fields(colors=[rgba(palette.BAD)], radii=0.1, draw_order=50.0)
-        letters = rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=45.0)
-        self.send_static(
-            self._name, rr.DepthImage.from_fields(format=pixels, colormap=rr.components.Colormap.Viridis)
+        rows, width = placements.block
+        lines = crossing_lines(range(0, placements.height + 1, rows), range(0, placements.width + 1, width))
+        parts = {
+            "": rr.DepthImage.from_fields(format=pixels, colormap=rr.components.Colormap.Viridis),
+            "/moves": arrows,
+            "/here": rr.Boxes2D.from_fields(colors=[rgba(palette.BAD)], radii=0.1, draw_order=50.0),
+            "/stops": rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=45.0),
+            "/label": rr.Points2D.from_fields(radii=0.0, show_labels=True, colors=[rgba(palette.MIDTONE)]),
+        }
+        bounds = rrb.VisualBounds2D(
+            x_range=(-0.5, placements.width + 0.5), y_range=(-3.2, placements.height + 0.5)
         )
-        self.send_static(f"{self._name}/moves", arrows)
-        self.send_static(f"{self._name}/here", here)
-        self.send_static(f"{self._name}/stops", letters)
-        self.send_static(f"{self._name}/label", text)
+        name = f"{spoken(self._name)}: max Q, greedy moves"
+        view = View("values", name, rrb.Spatial2DView, {"visual_bounds": bounds})
+        frame = rr.LineStrips2D(lines, colors=[(255, 255, 255)], radii=0.06, draw_order=30)
+        yield Track(f"{self._path.rsplit('/', 3)[0]}/frame", static=[frame], view=view)
+        for part, static in parts.items():
+            yield Track(self._path + part, static=[static], view=view)
 
-    def write(self, batch: Batch, values: StepValues) -> None:
-        """Send where each step of a batch is in the map, and the maps that there are."""
-        here = self._centres.take(self._pixel.take(batch.records["state"]), axis=0)[:, None]
-        self.send(f"{self._name}/here", batch.times, instances(rr.Boxes2D, centers=here))
-        rows = values.map_rows
-        if not len(rows):
+    def of(self, batch: Batch) -> Iterator[Track]:
+        """Yield where each step of a batch is in the map, and the maps that there are."""
+        state, path = batch.records["state"], self._path
+        here = self._centres.take(self._pixel.take(state), axis=0)[:, None]
+        yield Track(f"{path}/here", batch.times(), columns(rr.Boxes2D, centers=here))
+        rows = np.flatnonzero(batch.has_map)
+        if not (n := len(rows)):
             return
-        times, n, pixels = batch.times_at(rows), len(rows), len(self._centres)
-        greedy = values.greedy_maps[:, self._learner][:, self._order]
-        vectors = np.empty((n, len(self._arrows), pixels, 2), np.float32)
-        counts = np.empty(n, np.int64)
-        points = np.empty((n * vectors[0, ..., 0].size, 2), np.float32)
-        classes = np.empty(len(points), np.uint16)
-        total = _fill_moves(
-            greedy, self._arrows, self._letters, self._letter_points, vectors, counts, points, classes
+        times, placements = batch.times(rows), self._placements
+        values, greedy = (
+            maps[:, self._learner][:, self._order] for maps in (batch.value_maps, batch.greedy_maps)
         )
-        letters = ragged(rr.Points2D, counts, positions=points[:total], class_ids=classes[:total])
-        contexts = self._placements.context[batch.records["state"][rows]].tolist()
-        labels = [
-            f"as of step {time:,}\n{self._placements.names[context]}"
-            for time, context in zip(batch.time[rows].tolist(), contexts, strict=True)
+        with np.errstate(all="ignore"):
+            low, high = np.nanmin(values, axis=1), np.nanmax(values, axis=1)
+        ranges = np.stack((low, np.where(high > low, high, low + 1)), axis=1).astype(np.float64)
+        image = [
+            *columns(rr.DepthImage, buffer=np.ascontiguousarray(values).view(np.uint8)[:, None]),
+            *rr.DepthImage.columns(depth_range=np.nan_to_num(ranges)),
         ]
-        label_points = repeated_point(n, self._placements.width / 2, MAP_LABEL_Y)
-        sizes = np.full((n, 1, 2), 0.5, np.float32)
-        self.send(self._name, times, images(values.value_maps[:, self._learner][:, self._order]))
-        self.send(f"{self._name}/here", times, instances(rr.Boxes2D, half_sizes=sizes))
-        self.send(f"{self._name}/moves", times, instances(rr.Arrows2D, vectors=vectors.reshape(n, -1, 2)))
-        self.send(f"{self._name}/stops", times, letters)
-        self.send(
-            f"{self._name}/label", times, instances(rr.Points2D, positions=label_points, labels=texts(labels))
+        vectors = self._arrows[:, greedy].swapaxes(0, 1).reshape(n, -1, 2)
+        letters = self._letters[:, greedy].swapaxes(0, 1)
+        is_letter = letters >= 0
+        points = np.broadcast_to(
+            self._origins - np.array([0.0, _LETTER_RISE], np.float32), (*letters.shape, 2)
         )
+        stops = columns(
+            rr.Points2D,
+            is_letter.sum(axis=(1, 2)),
+            positions=points[is_letter],
+            class_ids=letters[is_letter].astype(np.uint16),
+        )
+        contexts = placements.context[state[rows]].tolist()
+        labels = [
+            f"as of step {time:,}\n{placements.names[context]}"
+            for time, context in zip(times["step"].tolist(), contexts, strict=True)
+        ]
+        where = point(n, placements.width / 2, MAP_LABEL_Y)
+        yield Track(path, times, image)
+        sizes = np.full((n, 1, 2), 0.5, np.float32)
+        yield Track(f"{path}/here", times, columns(rr.Boxes2D, half_sizes=sizes))
+        yield Track(f"{path}/moves", times, columns(rr.Arrows2D, vectors=vectors))
+        yield Track(f"{path}/stops", times, stops)
+        yield Track(f"{path}/label", times, columns(rr.Points2D, positions=where, labels=texts(labels)))
 
 
-def _arrows_and_letters(
-    scene: Scene, labels: Labels, agents: list[int], movers: list[int], is_joint: bool
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Return the arrow, [agents, actions, 2], and the letter, [agents, actions], of each action."""
-    own = scene.mdp.own_actions
-    arrows, letters = [], []
-    for agent, mover in zip(agents, movers, strict=True):
-        count = scene.mdp.action_counts[agent]
-        first = [int(np.argmax(own[:, agent] == action)) for action in range(count)]
-        actions = own[:, agent] if is_joint else np.arange(count)
-        arrows.append((scene.moves[first, mover] * np.float32(_ARROW_SCALE))[actions])
-        letters.append(labels.stops[agent][actions])
-    return np.stack(arrows), np.stack(letters)
+def table_view(mdp: Mdp) -> View:
+    """Return the view of the table of values."""
+    bottom = float(_bar_rows(mdp)[-1][-1]) + 0.9
+    bounds = rrb.VisualBounds2D(x_range=(-0.4, TABLE_WIDTH), y_range=(TABLE_TOP, bottom))
+    name = "Q-values of this state, before the move"
+    return View("values", name, rrb.Spatial2DView, {"visual_bounds": bounds})
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
-def _fill_table(
-    values: NDArray[np.float64],
-    greedy: NDArray[np.int64],
-    own: NDArray[np.int64],
-    explored: NDArray[np.int64],
-    bounds: NDArray[np.int64],
-    unit: float,
-    marks: tuple[int, ...],
-    classes: NDArray[np.uint16],
-    ends: NDArray[np.float32],
-) -> None:
-    """Fill in the label of each value, the marks of greedy and chosen actions, and where the bars end.
-
-    Args:
-        values: [n, values].
-        greedy: [n, agents], the greedy action of each agent.
-        own: [n, agents], its chosen action.
-        explored: [n, agents], whether that was explored.
-        bounds: [agents + 1], the first value of each agent, and the number of values.
-        unit: `Labels.unit`, the rounding of the labels of values.
-        marks: `Labels.value_marks`.
-        classes: [n, 3 * values], filled with the labels of values, greedy and chosen actions.
-        ends: [n, values], filled: a bar reaches from the agent's lowest value in a step to its highest.
-    """
-    unmarked, is_greedy, exploited, is_explored, first_level, lowest, levels = marks
-    count = values.shape[1]
-    for k in range(len(values)):
-        for i in range(count):
-            value = 0.0 if np.isnan(values[k, i]) else values[k, i]
-            level = min(max(np.rint(value / unit) - lowest, 0.0), levels - 1.0)
-            classes[k, i] = first_level + int(level)
-            classes[k, count + i] = classes[k, 2 * count + i] = unmarked
-        for agent in range(len(bounds) - 1):
-            start, stop = bounds[agent], bounds[agent + 1]
-            classes[k, count + start + greedy[k, agent]] = is_greedy
-            chosen = is_explored if explored[k, agent] else exploited
-            classes[k, 2 * count + start + own[k, agent]] = chosen
-            low, high = np.inf, -np.inf
-            for i in range(start, stop):
-                low, high = min(low, values[k, i]), max(high, values[k, i])
-            scale = BAR_LENGTH * _BAR_FRACTION / (high - low) if high > low else 0.0
-            for i in range(start, stop):
-                ends[k, i] = BAR_LEFT + np.ceil((values[k, i] - low) * scale) / _BAR_FRACTION
+def table_words(root: str, mdp: Mdp) -> Track:
+    """Return the headings and names around the table of values."""
+    labels: list[tuple[float, float, str, str]] = []  # x, y, text and colour
+    agents = zip(mdp.agents, _bar_rows(mdp), numbered_actions(mdp), strict=True)
+    for i, (agent, rows, names) in enumerate(agents):
+        labels.append((NAME_X, float(rows[0]) - 1.15, spoken(agent).upper(), palette.agent(i)))
+        labels += [(NAME_X, float(y), name, palette.MIDTONE) for y, name in zip(rows, names, strict=True)]
+    middle = BAR_LEFT + BAR_LENGTH / 2
+    headings = {middle: "worst to best", NUMBER_X: "Q", GREEDY_X: "greedy", CHOSEN_X: "chosen"}
+    labels += [(x, -0.15, heading, palette.MIDTONE) for x, heading in headings.items()]
+    points = rr.Points2D(
+        [(x, y - LABEL_RISE) for x, y, _, _ in labels],
+        labels=[text for _, _, text, _ in labels],
+        colors=[rgba(colour) for _, _, _, colour in labels],
+        radii=0.0,
+        show_labels=True,
+    )
+    return Track(f"{root}/table/words", static=[points], view=table_view(mdp))
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
-def _fill_moves(
-    greedy: NDArray[np.int32],
-    arrows: NDArray[np.float32],
-    letters: NDArray[np.int64],
-    points: NDArray[np.float32],
-    vectors: NDArray[np.float32],
-    counts: NDArray[np.int64],
-    places: NDArray[np.float32],
-    classes: NDArray[np.uint16],
-) -> int:
-    """Fill in the arrows of greedy actions, and the letters of those that do not move.
-
-    Args:
-        greedy: [k, pixels], greedy actions; -1 for no state.
-        arrows: [agents, actions, 2], the arrow of each action.
-        letters: [agents, actions], its letter; -1 for none.
-        points: [agents, pixels, 2], where a letter is written.
-        vectors: [k, agents, pixels, 2], filled with arrows; zero for no state.
-        counts: [k], filled with the number of letters.
-        places: [letters, 2], filled with their points, one map after another.
-        classes: [letters], filled with the letters.
-
-    Returns:
-        The number of letters in all maps.
-    """
-    total = 0
-    for k in range(len(greedy)):
-        before = total
-        for agent in range(len(arrows)):
-            for pixel in range(greedy.shape[1]):
-                action = greedy[k, pixel]
-                vectors[k, agent, pixel, 0] = arrows[agent, action, 0] if action >= 0 else 0.0
-                vectors[k, agent, pixel, 1] = arrows[agent, action, 1] if action >= 0 else 0.0
-                if action >= 0 and letters[agent, action] >= 0:
-                    places[total, 0] = points[agent, pixel, 0]
-                    places[total, 1] = points[agent, pixel, 1]
-                    classes[total] = letters[agent, action]
-                    total += 1
-        counts[k] = total - before
-    return total
+def _bar_rows(mdp: Mdp) -> list[NDArray[np.float64]]:
+    """Return the y of each agent's rows in the table of values, from top to bottom."""
+    starts = np.cumsum((0, *mdp.action_counts)) + 1.0
+    return [np.arange(count) + starts[i] + i * _AGENT_GAP for i, count in enumerate(mdp.action_counts)]

@@ -5,18 +5,20 @@ Coordinates are cells: x to the right, y down, the first cell from (0, 0) to (1,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+import rerun as rr
 from numpy.typing import NDArray
 
 from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names
 from runner.environments.scene import SceneDescription
+from runner.export.rerun.tracks import Track, View
 
 _SPACING: Final = 0.34
 """Between movers in one cell, so that both are visible."""
@@ -204,6 +206,55 @@ class Placements:
         if mover == 0 or (self.height, self.width) == self.block:
             return pixels
         return pixels.reshape(rows, rows, columns, columns).transpose(1, 0, 3, 2).reshape(-1)
+
+
+def background(root: str, scene: Scene, view: View) -> Iterator[Track]:
+    """Yield cells, walls and landmarks."""
+    rows, columns = scene.rows, scene.columns
+    grey, path = palette.rgb(palette.MIDTONE), f"{root}/scene"
+    lines = crossing_lines(range(rows + 1), range(columns + 1))
+    cells = rr.LineStrips2D(lines, colors=[(*grey, 90)], radii=0.008, draw_order=10)
+    border: Any = [(0, 0), (columns, 0), (columns, rows), (0, rows), (0, 0)]
+    strips = [border, *(_wall(first, second) for first, second in scene.description["walls"])]
+    walls = rr.LineStrips2D(strips, colors=[grey], radii=0.05, draw_order=25)
+    parts: dict[str, rr.AsComponents] = {"cells": cells, "walls": walls}
+    if marks := scene.description["landmarks"]:
+        # A line 0.46 wide around this square and along its diagonal fills a cell.
+        square = [(0.25, 0.25), (0.75, 0.25), (0.75, 0.75), (0.25, 0.75), (0.25, 0.25), (0.75, 0.75)]
+        corners = np.array([mark["cell"][::-1] for mark in marks], np.float64)
+        colours = [palette.rgb(mark["colour"]) for mark in marks]
+        parts["landmarks"] = rr.LineStrips2D(
+            list(corners[:, None] + square),
+            colors=[(*colour, 110) for colour in colours],
+            radii=0.23,
+            draw_order=5,
+        )
+        parts["names"] = rr.Points2D(
+            corners + np.array((0.14, 0.72)),
+            labels=[mark["name"] for mark in marks],
+            colors=colours,
+            radii=0.0,
+            show_labels=True,
+            draw_order=26,
+        )
+    for part, static in parts.items():
+        yield Track(f"{path}/{part}", static=[static], view=view)
+
+
+def crossing_lines(rows: range, columns: range) -> list[Any]:
+    """Return horizontal lines at these rows and vertical ones at these columns, over all of them."""
+    across: list[object] = [[(columns[0], y), (columns[-1], y)] for y in rows]
+    return across + [[(x, rows[0]), (x, rows[-1])] for x in columns]
+
+
+def _wall(first: Sequence[int], second: Sequence[int]) -> list[tuple[float, float]]:
+    """Return the line between two neighbouring cells."""
+    (row, column), (other_row, other_column) = first, second
+    if row == other_row:
+        x = max(column, other_column)
+        return [(x, row), (x, row + 1)]
+    y = max(row, other_row)
+    return [(column, y), (column + 1, y)]
 
 
 def scene_of(mdp: Mdp) -> Scene | None:

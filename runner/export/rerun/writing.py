@@ -12,11 +12,11 @@ from pathlib import Path
 import rerun as rr
 
 from runner.drawing import palette
-from runner.export.rerun.columns import new_stream
-from runner.export.rerun.layout import arranged, runs_view
-from runner.export.rerun.loops import LoopExporter
-from runner.export.rerun.runs import RunExporter, Source
+from runner.export.rerun.layout import blueprint
+from runner.export.rerun.loops import LoopReader
+from runner.export.rerun.runs import JobReader
 from runner.export.rerun.selection import Request, Selection, select
+from runner.export.rerun.tracks import Source, Writer, new_stream
 from runner.recording.reader import Recording
 from runner.runs.run import Run
 from runner.util.files import storage_errors
@@ -30,22 +30,24 @@ def export(
     stream = new_stream("-".join(source.recording.run_id for source in sources))
     with _saved(stream, path):
         stream.send_recording_name(" and ".join(source.title for source in sources))
-        exported = list(zip(sources, selections, strict=True))
-        with_tables = [RunExporter(stream, *one) for one in exported if one[0].recording.has_tables]
-        others = [LoopExporter(stream, *one) for one in exported if not one[0].recording.has_tables]
-        entities = {entity for run in with_tables for entity in run.send_metrics()}
-        views = [runs_view([run.view for run in with_tables], entities)] if with_tables else []
-        if not others:  # before the steps; active, as a viewer has arranged the metrics by itself
-            stream.send_blueprint(arranged(views, "paused"))
-        for run in with_tables:
-            run.send_steps()
-        for loop in others:
-            loop.export()
-            if request.frames:
-                loop.draw_frames(request.trust, stage)
-            views.append(loop.view())
-        if others:
-            stream.send_blueprint(arranged(views, "paused"))
+        readers: list[tuple[Writer, JobReader | LoopReader]] = []
+        for source, selection in zip(sources, selections, strict=True):
+            writer = Writer(stream, source, selection.focus)
+            if source.recording.has_tables:
+                job = JobReader(source, selection)
+                writer.last = job.last
+                readers.append((writer, job))
+            else:
+                readers.append((writer, LoopReader(source, selection, request.trust, stage)))
+        for writer, reader in readers:
+            writer.send(reader.overview())
+        are_jobs = all(source.recording.has_tables for source in sources)
+        if are_jobs:  # before the steps; active, as a viewer has arranged the metrics by itself
+            stream.send_blueprint(blueprint([writer for writer, _ in readers]))
+        for writer, reader in readers:
+            writer.send(reader.steps())
+        if not are_jobs:  # their views follow from steps
+            stream.send_blueprint(blueprint([writer for writer, _ in readers]))
     return selections
 
 

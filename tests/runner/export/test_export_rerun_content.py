@@ -232,6 +232,36 @@ def test_means_between_reports_are_of_the_episodes_that_ended_there(exported):
         before = max(before, row["step"])
 
 
+def views_of(path):
+    """Return the entities of each view of an export, by its title."""
+    reader = RrdReader(str(path))
+    titles, entities = {}, {}
+    for chunk in reader.stream(store=reader.blueprints()[0]).to_chunks():
+        values = chunk.to_record_batch().to_pydict()
+        view = str(chunk.entity_path).removeprefix("/view/").partition("/")[0]
+        if "ViewBlueprint:display_name" in values:
+            titles[view] = values["ViewBlueprint:display_name"][0][0]
+        if "ViewContents:query" in values:
+            entities[view] = values["ViewContents:query"][0]
+    return {titles[view]: shown for view, shown in entities.items()}
+
+
+def test_views_show_what_was_sent(exported):
+    recording, views = exported.recording, views_of(exported.path)
+    scene, shown = scene_of(recording.mdp), {entity for entities in views.values() for entity in entities}
+    chunks = exported.store.stream().to_chunks()
+    assert shown <= {str(chunk.entity_path) for chunk in chunks}
+    for phase in TOPICS:
+        parts = ["state", "action"] if scene is None else ["grid/things", "grid/title"]
+        assert {f"/{phase}/{part}" for part in [*parts, "q", "events"]} <= shown
+    for name in recording.agents if scene and scene.placements else ():
+        (view,) = [entities for entities in views.values() if f"/train/map/{name}" in entities]
+        maps = {
+            f"/{phase}/map/{name}{part}" for phase in TOPICS for part in ("", "/moves", "/here", "/stops")
+        }
+        assert {"/frame", *maps} <= set(view)
+
+
 def test_rerun_verifies_the_file(exported, tmp_path):
     path = tmp_path / "some.rrd"
     export([Source(exported.recording, "a run")], Request(episodes=((0, 2),), evaluations=(20,)), path)

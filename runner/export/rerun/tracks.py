@@ -1,0 +1,211 @@
+"""A track is what one entity shows over time: readers of runs yield tracks, and one writer sends them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple, TypeVar
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import ArrayLike, NDArray
+
+from runner.drawing import palette
+from runner.recording.reader import Recording
+from runner.recording.schema import STEP_NANOSECONDS
+from runner.util.arrays import Array
+
+APPLICATION: Final = "dualtaxi"
+MAX_ROWS: Final = 8_192
+"""Maximum number of rows sent at once: the web viewer drops larger columns."""
+MAX_QUEUED: Final = 40 * MAX_ROWS
+"""Rows that may wait to be compressed, which takes longer than making them."""
+_POINT: Final = pa.list_(pa.field("item", pa.float32(), nullable=False), 2)
+_STRIP: Final = pa.list_(pa.field("item", _POINT, nullable=False))
+_BLOB: Final = pa.list_(pa.field("item", pa.uint8(), nullable=False))
+T = TypeVar("T")
+Row = tuple[int, rr.AsComponents]
+"""A step, and what is shown from it on."""
+Times = dict[str, Array]
+"""[n] numbers by timeline."""
+
+
+class View(NamedTuple):
+    """A view of the viewer, of all tracks that name it."""
+
+    group: str
+    """Decides where it is placed."""
+    name: str
+    kind: type[rrb.View] = rrb.TimeSeriesView
+    options: Mapping[str, Any] = {}
+    has_focus: bool = False
+    """Whether its time axis shows the episodes that were asked for alone."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """Rows of an entity; its first track also has what never changes."""
+
+    entity: str
+    times: Times = field(default_factory=dict)
+    columns: Iterable[Any] = ()
+    """Components of as many rows as there are times."""
+    static: Sequence[Any] = ()
+    view: View | None = None
+
+
+@dataclass(frozen=True)
+class Source:
+    """A run to export."""
+
+    recording: Recording
+    title: str
+    root: str = ""
+    """Entity path of everything of the run; empty for the root."""
+    tint: str | None = None
+    """Base colour of its metrics, where runs are compared."""
+
+
+@dataclass(eq=False)
+class Writer:
+    """Sends the tracks of a run to a stream, and keeps which views they have."""
+
+    stream: rr.RecordingStream
+    source: Source
+    focus: tuple[int, int] | None = None
+    """First and last step shown in views that have a focus; None for the whole run."""
+    last: int = 0
+    """The last step of the run, or else of its lines that were sent."""
+    entities: set[str] = field(default_factory=set)
+    views: dict[tuple[str, str], tuple[View, dict[str, None]]] = field(default_factory=dict)
+    """By group and name, each with its entities."""
+    _queued: int = 0
+
+    def send(self, tracks: Iterable[Track]) -> None:
+        """Send tracks by columns."""
+        for track in tracks:
+            if track.entity not in self.entities:
+                self.entities.add(track.entity)
+                for archetype in track.static:
+                    self.stream.log(track.entity, archetype, static=True)
+            if view := track.view:
+                self.views.setdefault((view.group, view.name), (view, {}))[1][track.entity] = None
+            if track.times:
+                steps = track.times["step"]
+                if "episode" in track.times:
+                    self.last = max(self.last, int(steps.max()))
+                times = [rr.TimeColumn(name, sequence=numbers) for name, numbers in track.times.items()]
+                self.stream.send_columns(track.entity, times, track.columns)
+                self._queued += len(steps)
+                if self._queued > MAX_QUEUED:
+                    self.stream.flush()
+                    self._queued = 0
+
+
+class Column(NamedTuple):
+    """An Arrow array with the interface of Rerun's `ComponentColumn`, which would copy it."""
+
+    descriptor: rr.ComponentDescriptor
+    array: pa.Array
+
+    def component_descriptor(self) -> object:
+        """Return the descriptor of the component."""
+        return self.descriptor
+
+    def as_arrow_array(self) -> pa.Array:
+        """Return the array."""
+        return self.array
+
+
+def new_stream(recording_id: str) -> rr.RecordingStream:
+    """Return a stream without the timelines that Rerun adds by itself."""
+    stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    return stream
+
+
+def times_of(log_time: ArrayLike, **timelines: Array) -> Times:
+    """Return the timeline `step` of log times, and others."""
+    steps = np.asarray(log_time, np.int64) // STEP_NANOSECONDS
+    return {"step": steps, **{name: each.astype(np.int64) for name, each in timelines.items()}}
+
+
+def columns(archetype: object, lengths: NDArray[np.int64] | None = None, **parts: Array) -> list[Column]:
+    """Return the columns of n rows of a class such as `rerun.Points2D`, without one object per row.
+
+    The parts are, by component, text or numbers [n, instances], points [n, instances, 2], line strips
+    [n, strips, points, 2] or bytes [n, 1, size]. With `lengths`, rows have different numbers of instances,
+    and the parts are [all instances, ...].
+    """
+    made = []
+    for name, part in parts.items():
+        counts = np.full(len(part), part.shape[1]) if lengths is None else lengths
+        flat = part if lengths is not None else part.reshape(-1, *part.shape[2:])
+        # Arrow refuses memory that is not aligned, which the field of a lone record may be.
+        flat = np.require(flat, requirements=["C", "A"])
+        items = pa.array(flat.reshape(-1))
+        if flat.dtype == np.float32 and flat.ndim > 1:
+            items = pa.FixedSizeListArray.from_arrays(items, type=_POINT)
+        if flat.ndim == 3 or flat.dtype == np.uint8:
+            kind = _BLOB if flat.dtype == np.uint8 else _STRIP
+            items = _listed(np.full(len(flat), flat.shape[1]), items, kind)
+        made.append(Column(getattr(archetype, f"descriptor_{name}")(), _listed(counts, items)))
+    return made
+
+
+def scalars(values: Array) -> list[Column]:
+    """Return the column of series, [n, series]."""
+    return columns(rr.Scalars, scalars=values.astype(np.float64, copy=False))
+
+
+def rows_of(entity: str, rows: Sequence[Row], view: View | None = None) -> Track:
+    """Return a track of one archetype a row, given with its step; all have the same components."""
+    parts = zip(*(archetype.as_component_batches() for _, archetype in rows), strict=True)
+    made = []
+    for batches in parts:
+        items = pa.concat_arrays([batch.as_arrow_array() for batch in batches])
+        array = _listed(np.ones(len(rows), np.int64), items)
+        made.append(Column(batches[0].component_descriptor(), array))
+    return Track(entity, {"step": np.array([step for step, _ in rows])}, made, view=view)
+
+
+def grouped(rows: Iterable[tuple[str, T]], size: int) -> Iterator[tuple[str, list[T]]]:
+    """Yield the rows of each entity together, at most `size` at a time."""
+    waiting: dict[str, list[T]] = {}
+    for entity, row in rows:
+        of_entity = waiting.setdefault(entity, [])
+        of_entity.append(row)
+        if len(of_entity) == size:
+            yield entity, waiting.pop(entity)
+    yield from waiting.items()
+
+
+def cleared(entities: Iterable[str], steps: Sequence[int]) -> Iterator[Track]:
+    """Yield the tracks that clear entities, and all below them, from each of these steps on."""
+    if steps:
+        for entity in entities:
+            columns = rr.Clear.columns(is_recursive=[True] * len(steps))
+            yield Track(entity, {"step": np.array(steps)}, columns)
+
+
+def point(n: int, x: float, y: float) -> NDArray[np.float32]:
+    """Return the same point in each of n rows, [n, 1, 2]."""
+    return np.broadcast_to(np.array([[x, y]], np.float32), (n, 1, 2))
+
+
+def texts(rows: Sequence[str]) -> NDArray[np.object_]:
+    """Return one text per row, [n, 1]."""
+    return np.array(rows, dtype=object)[:, None]
+
+
+def _listed(counts: NDArray[np.int64], items: pa.Array, kind: pa.DataType | None = None) -> pa.Array:
+    offsets = pa.array(np.append(0, np.cumsum(counts)).astype(np.int32))
+    return pa.ListArray.from_arrays(offsets, items, type=kind)
+
+
+def rgba(colour: str, alpha: int = 255) -> tuple[int, int, int, int]:
+    """Return red, green, blue and alpha of a colour "#rrggbb"."""
+    return *palette.rgb(colour), alpha
