@@ -49,7 +49,7 @@ class Labels:
         learners: Sequence[str],
         value_range: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        self.scene = scene
+        self.mdp, self.scene, self.learners = mdp, scene, tuple(learners)
         self.texts: list[str] = []
         self._colours: list[str] = []
         if scene:

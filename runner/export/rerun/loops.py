@@ -6,9 +6,10 @@ Entities of a vector environment are below `train/env_3`, those of a game's agen
 from __future__ import annotations
 
 import io
-import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import reduce
+from operator import getitem
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -39,7 +40,7 @@ from runner.export.rerun.tracks import (
     scalars,
     times_of,
 )
-from runner.export.values import FEW, number_names
+from runner.export.values import FEW, acted, number_names, observed
 from runner.recording import schema
 from runner.recording.messages import frame_place, media_type
 from runner.recording.reader import Recording
@@ -56,8 +57,9 @@ FRAMES_SENT: Final = 64
 """Pictures sent at once."""
 LOG: Final = View("log", "Log", rrb.TextLogView)
 _BATCH_BYTES: Final = 64 << 20
-Part = tuple[tuple[str, ...], int, list[str]]
-"""The path of a field in the record of a step, what is added to its numbers, and their names."""
+OBSERVED: Final = {"observation": observed, "action": acted}
+Part = tuple[list[tuple[str, ...]], list[str]]
+"""Paths into the values of a space, and the names of all numbers there."""
 
 
 class Member(NamedTuple):
@@ -68,7 +70,7 @@ class Member(NamedTuple):
     """`env_3`, or the agent; empty if there is only one."""
     column: int = 0
     """Its column among the rewards."""
-    parts: Mapping[str, list[Part]] = {}
+    parts: Mapping[str, Part] = {}
     """`observation` and `action`, if they are drawn as lines."""
 
 
@@ -93,7 +95,7 @@ class LoopReader:
         """Entities that are lines."""
         self._pictured: dict[str, int] = {}
         """The step of the last picture, by entity."""
-        self._last = 0
+        self.last = 0
         """The last step that was read."""
 
     def overview(self) -> Iterator[Track]:
@@ -141,7 +143,7 @@ class LoopReader:
             grid = None
             if scene and spans:
                 labels = Labels(recording.mdp, scene, recording.agents)
-                grid = StepTracks(root, phase, recording.mdp, labels)
+                grid = StepTracks(f"{root}/{phase}", phase, labels)
                 yield labels.track(root)
                 yield from background(root, scene, grid_view(title, scene))
                 yield from grid.still(title)
@@ -173,7 +175,8 @@ class LoopReader:
 
     def _lines_of(self, phase: str, steps: NDArray[np.void]) -> Iterator[Track]:
         """Yield rewards, observations, actions and extras of steps."""
-        extras = self._recording.extras(phase).at(steps["step"])
+        recording = self._recording
+        extras = recording.extras(phase).at(steps["step"])
         for member in self._members:
             is_own = self._is_of(steps["step"], member)
             if self._is_game:
@@ -183,9 +186,9 @@ class LoopReader:
             own = steps[is_own]
             times = self._times(own, t=own["t"])
             yield self._line(phase, member, "reward", times, own["rewards"][:, [member.column]])
-            for quantity, parts in member.parts.items():
-                numbers = [_numbers_in(own, path) + start for path, start, _ in parts]
-                names = [name for _, _, of_part in parts for name in of_part]
+            for quantity, (paths, names) in member.parts.items():
+                values = OBSERVED[quantity](recording, own)
+                numbers = [reduce(getitem, path, values).reshape(len(own), -1) for path in paths]
                 yield self._line(phase, member, quantity, times, np.concatenate(numbers, axis=1), names)
             for name, values in extras.items():
                 agent, _, own_name = name.partition("/") if self._is_game else (member.name, "", name)
@@ -288,7 +291,7 @@ class LoopReader:
             yield rows_of(entity, rows, self._frame_view(entity))
         for note in notes:
             self._selection.warnings.append(note)
-            yield rows_of(f"{self._root}/log", [(self._last, rr.TextLog(note, level="WARN"))], LOG)
+            yield rows_of(f"{self._root}/log", [(self.last, rr.TextLog(note, level="WARN"))], LOG)
 
     def _is_later(self, entity: str, step: int) -> bool:
         """Return whether a picture is later than the one before.
@@ -338,36 +341,23 @@ class LoopReader:
 
     def _times(self, records: NDArray[np.void], **timelines: Array) -> Times:
         times = times_of(records["log_time"], episode=records["episode"], **timelines)
-        self._last = max(self._last, int(times["step"].max()))
+        self.last = max(self.last, int(times["step"].max()))
         return times
 
 
-def _parts(recording: Recording, agent: str = "") -> dict[str, list[Part]]:
+def _parts(recording: Recording, agent: str = "") -> dict[str, Part]:
     """Return the numbers of a step, of one agent or of all, that are drawn as lines."""
-    spaces = recording.spaces
-    if recording.kind == "step":
-        fields = {"observation": "state", "action": "action"}
-        return {part: [((field,), least_number(spaces[part]), [field])] for part, field in fields.items()}
-    by_part: dict[str, list[Part]] = {}
-    for part, field in (("observation", "next_observation"), ("action", "action")):
+    parts = {}
+    for quantity in OBSERVED if recording.kind != "variable" else ():
         leaves = [
             leaf
-            for leaf in leaves_of(spaces[part], f"the {part} space")
+            for leaf in leaves_of(recording.spaces[quantity], f"the {quantity} space")
             if leaf.dtype is not None and (not agent or leaf.path[0] == agent)
         ]
-        count = sum(math.prod(leaf.dtype.shape) for leaf in leaves if leaf.dtype is not None)
-        if recording.kind != "variable" and 0 < count <= MAX_LINES:
-            names = [list(number_names(leaf, part, skip=1 if agent else 0)) for leaf in leaves]
-            by_part[part] = [((field, *leaf.path), 0, own) for leaf, own in zip(leaves, names, strict=True)]
-    return by_part
-
-
-def _numbers_in(steps: NDArray[np.void], path: tuple[str, ...]) -> NDArray[np.float64]:
-    """Return the numbers of a field, [n, numbers]."""
-    column: NDArray[Any] = steps
-    for name in path:
-        column = column[name]
-    return column.reshape(len(steps), -1).astype(np.float64)
+        names = [name for leaf in leaves for name in number_names(leaf, quantity, skip=bool(agent))]
+        if 0 < len(names) <= MAX_LINES:
+            parts[quantity] = [leaf.path for leaf in leaves], names
+    return parts
 
 
 def entity_name(name: str) -> str:

@@ -113,14 +113,14 @@ class ValueReader:
 class ValueTracks:
     """Makes the table of values of one phase: its numbers as text are rounded, its scalars exact."""
 
-    def __init__(self, path: str, mdp: Mdp, labels: Labels, learners: tuple[str, ...]) -> None:
-        self._path, self._mdp, self._labels = path, mdp, labels
-        self._y = np.concatenate(_bar_rows(mdp))
-        counts = mdp.action_counts
+    def __init__(self, path: str, labels: Labels) -> None:
+        self._entity, self._labels, self._mdp = f"{path}/q", labels, labels.mdp
+        counts = self._mdp.action_counts
+        self._y = np.concatenate(_bar_rows(self._mdp))
         self._agent = np.repeat(np.arange(len(counts)), counts)
         """[values]: the agent of each value."""
         self._first = np.cumsum((0, *counts[:-1]))
-        self._explored_bit = np.arange(len(counts)) * (len(learners) == len(counts))
+        self._explored_bit = np.arange(len(counts)) * (len(labels.learners) == len(counts))
         height = self._y - LABEL_RISE
         marks = [np.stack((np.full_like(height, x), height), axis=1) for x in (NUMBER_X, GREEDY_X, CHOSEN_X)]
         self._points = np.concatenate(marks).astype(np.float32)
@@ -136,7 +136,7 @@ class ValueTracks:
             rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=40.0),
             series_lines([f"{spoken(agent)} {name}" for agent, actions in names for name in actions]),
         ]
-        yield Track(f"{self._path}/q", static=static, view=table_view(self._mdp))
+        yield Track(self._entity, static=static, view=table_view(self._mdp))
 
     def of(self, batch: Batch) -> Iterator[Track]:
         """Yield the values of each step of a batch: as they were before its update."""
@@ -157,41 +157,42 @@ class ValueTracks:
         bars[:, :, 1, 0] = BAR_LEFT + np.ceil((q - low[:, agent]) * scale[:, agent]) / _BAR_FRACTION
         bars[..., 1] = self._y[:, None]
         shown = [*columns(rr.Points2D, class_ids=classes), *columns(rr.LineStrips2D, strips=bars)]
-        yield Track(f"{self._path}/q", batch.times(), [*scalars(q), *shown])
+        yield Track(self._entity, batch.times(), [*scalars(q), *shown])
         rows = np.flatnonzero(batch.has_map)  # the points never change, but are cleared with the rest
         points = np.broadcast_to(self._points, (len(rows), *self._points.shape))
         if len(rows):
-            yield Track(f"{self._path}/q", batch.times(rows), columns(rr.Points2D, positions=points))
+            yield Track(self._entity, batch.times(rows), columns(rr.Points2D, positions=points))
 
 
 class MapTracks:
     """Makes a learner's map in one phase: the greatest value and the greedy moves of every placement."""
 
-    def __init__(self, path: str, scene: Scene, labels: Labels, learners: tuple[str, ...], i: int) -> None:
+    def __init__(self, path: str, labels: Labels, learner: int) -> None:
+        scene, mdp = labels.scene, labels.mdp
+        assert scene is not None
         assert scene.placements is not None
-        mdp, placements = scene.mdp, scene.placements
-        self._learner, self._placements = i, placements
-        self._path, self._name = f"{path}/map/{learners[i]}", learners[i]
-        is_joint = len(learners) != len(mdp.agents)
-        self._agents = list(range(len(mdp.agents))) if is_joint else [i]
+        placements = self._placements = scene.placements
+        self._learner, self._name = learner, labels.learners[learner]
+        self._path = f"{path}/map/{self._name}"
+        is_joint = len(labels.learners) != len(mdp.agents)
+        self._agents = list(range(len(mdp.agents))) if is_joint else [learner]
         names = [mdp.agents[agent] for agent in self._agents]
         movers = [scene.mover_agents.index(name) if name in scene.mover_agents else 0 for name in names]
         self._order = placements.order(movers[0])
         self._pixel = np.argsort(self._order)[placements.pixel]
         """[S]: the pixel of each state."""
-        pixel = np.arange(placements.height * placements.width)
-        centres = np.stack((pixel % placements.width + 0.5, pixel // placements.width + 0.5), axis=1)
-        self._centres = centres.astype(np.float32)
+        row, column = np.divmod(np.arange(len(self._order)), placements.width)
+        self._centres = np.stack((column + 0.5, row + 0.5), axis=1).astype(np.float32)
         x = (np.arange(len(movers)) - (len(movers) - 1) / 2) * 2 * _AGENT_OFFSET
         offsets = np.stack((x, np.zeros(len(movers))), axis=1).astype(np.float32)
         self._origins = self._centres + offsets[:, None]
         """[agents, pixels, 2]."""
-        own, arrows, letters = mdp.own_actions, [], []
+        arrows, letters = [], []
         for agent, mover in zip(self._agents, movers, strict=True):
-            first = [int(np.argmax(own[:, agent] == action)) for action in range(mdp.action_counts[agent])]
-            actions = own[:, agent] if is_joint else np.arange(len(first))
-            arrows.append((scene.moves[first, mover] * np.float32(_ARROW_SCALE))[actions])
-            letters.append(labels.stops[agent][actions])
+            own = mdp.own_actions[:, agent]
+            actions = np.arange(len(own)) if is_joint else np.unique(own, return_index=True)[1]
+            arrows.append(scene.moves[actions, mover] * np.float32(_ARROW_SCALE))
+            letters.append(labels.stops[agent][own[actions]])
         # The last action is that of pixels without a state, -1.
         self._arrows = np.pad(np.stack(arrows), ((0, 0), (0, 1), (0, 0)))
         self._letters = np.pad(np.stack(letters), ((0, 0), (0, 1)), constant_values=-1)
@@ -285,18 +286,18 @@ def table_view(mdp: Mdp) -> View:
 
 def table_words(root: str, mdp: Mdp) -> Track:
     """Return the headings and names around the table of values."""
-    labels: list[tuple[float, float, str, str]] = []  # x, y, text and colour
-    agents = zip(mdp.agents, _bar_rows(mdp), numbered_actions(mdp), strict=True)
-    for i, (agent, rows, names) in enumerate(agents):
-        labels.append((NAME_X, float(rows[0]) - 1.15, spoken(agent).upper(), palette.agent(i)))
-        labels += [(NAME_X, float(y), name, palette.MIDTONE) for y, name in zip(rows, names, strict=True)]
     middle = BAR_LEFT + BAR_LENGTH / 2
     headings = {middle: "worst to best", NUMBER_X: "Q", GREEDY_X: "greedy", CHOSEN_X: "chosen"}
-    labels += [(x, -0.15, heading, palette.MIDTONE) for x, heading in headings.items()]
+    words = []
+    for i, (rows, names) in enumerate(zip(_bar_rows(mdp), numbered_actions(mdp), strict=True)):
+        words.append((NAME_X, rows[0] - 1.15, spoken(mdp.agents[i]).upper(), palette.agent(i)))
+        words += [(NAME_X, y, name, palette.MIDTONE) for y, name in zip(rows, names, strict=True)]
+    words += [(x, -0.15, heading, palette.MIDTONE) for x, heading in headings.items()]
+    x, y, labels, colours = zip(*words, strict=True)
     points = rr.Points2D(
-        [(x, y - LABEL_RISE) for x, y, _, _ in labels],
-        labels=[text for _, _, text, _ in labels],
-        colors=[rgba(colour) for _, _, _, colour in labels],
+        np.stack((x, np.array(y) - LABEL_RISE), axis=1),
+        labels=labels,
+        colors=[rgba(colour) for colour in colours],
         radii=0.0,
         show_labels=True,
     )

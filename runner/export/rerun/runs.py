@@ -50,20 +50,14 @@ class JobReader:
         for snapshot in recording.snapshots() if selection.steps else ():
             low, high = min(low, float(snapshot.values.min())), max(high, float(snapshot.values.max()))
         labels = self._labels = Labels(self._mdp, self._scene, recording.agents, (low, high))
-        learners = recording.agents
         self._phases: dict[str, tuple[StepTracks, list[ValueTracks | MapTracks]]] = {}
         """What makes the tracks of the steps, and of the values at them."""
-        for phase, spans in selection.by_phase.items():
-            if spans:
-                steps_of = StepTracks(source.root, phase, self._mdp, labels)
-                maps = []
-                if self._scene and self._scene.placements:
-                    maps = [
-                        MapTracks(steps_of.path, self._scene, labels, learners, i)
-                        for i in range(len(learners))
-                    ]
-                table = ValueTracks(steps_of.path, self._mdp, labels, learners)
-                self._phases[phase] = steps_of, [table, *maps]
+        maps = range(len(recording.agents) if self._scene and self._scene.placements else 0)
+        for phase in (phase for phase, spans in selection.by_phase.items() if spans):
+            path = f"{source.root}/{phase}"
+            values: list[ValueTracks | MapTracks] = [ValueTracks(path, labels)]
+            values += [MapTracks(path, labels, i) for i in maps]
+            self._phases[phase] = StepTracks(path, phase, labels), values
 
     def overview(self) -> Iterator[Track]:
         """Yield all metrics, and what never changes of the steps."""

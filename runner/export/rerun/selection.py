@@ -131,15 +131,13 @@ def select(recording: Recording, request: Request) -> Selection:
     available = evaluations_with_steps(recording, train, evals)
     numbers = _training_episodes(recording, request, train.lengths)
     selection.train = train.steps_of(numbers)
-    where = str(recording.path)
-    chosen = {evaluation_after(available, after, where) for after in request.evaluations}
-    chosen |= set(available if request.everything else available[-1:] if request.is_default else ())
-    evaluations = sorted(chosen, key=lambda one: one.after)
+    chosen = {*_chosen(recording, request, available)}
+    chosen |= {*(available if request.everything else available[-1:] if request.is_default else ())}
+    evaluations = [one for one in available if one in chosen]
     selection.evaluations = [
         (one, steps) for one in evaluations for steps in evals.steps_of(np.arange(one.start, one.stop))
     ]
-    _describe_training(selection, request, train, numbers)
-    _describe_evaluations(selection, available, evaluations)
+    _describe(selection, request, numbers, train.count, available, evaluations)
     if unknown := _steps_without_values(recording, selection.train):
         selection.warnings.append(
             f"{unknown:,} of these training steps are exported without Q-values: steps before them were "
@@ -200,20 +198,27 @@ def _focus(recording: Recording, request: Request) -> tuple[int, int] | None:
         return None
     train, evals = (episodes_of(recording, phase) for phase in schema.PHASES)
     trials = [np.array(request.trials, np.int64)]
-    if request.evaluations and not request.trials:
-        available, where = evaluations_with_steps(recording, train, evals), str(recording.path)
-        chosen = [evaluation_after(available, after, where) for after in request.evaluations]
+    if not request.trials:
+        chosen = _chosen(recording, request, evaluations_with_steps(recording, train, evals))
         trials += [np.arange(one.start, one.stop) for one in chosen]
+    spans = {
+        "train": train.steps_of(_training_episodes(recording, explicit, train.lengths)),
+        "eval": evals.steps_of(np.concatenate(trials)),
+    }
     times = [
         time_of(recording, phase, step)
-        for phase, spans in (
-            ("train", train.steps_of(_training_episodes(recording, explicit, train.lengths))),
-            ("eval", evals.steps_of(np.concatenate(trials))),
-        )
-        if spans
-        for step in (spans[0].start, spans[-1].stop - 1)
+        for phase, of_phase in spans.items()
+        if of_phase
+        for step in (of_phase[0].start, of_phase[-1].stop - 1)
     ]
     return (min(times), max(times)) if times else None
+
+
+def _chosen(recording: Recording, request: Request, available: Sequence[Evaluation]) -> list[Evaluation]:
+    """Return the evaluations that are asked for by number, in order."""
+    return [
+        evaluation_after(available, after, str(recording.path)) for after in sorted(set(request.evaluations))
+    ]
 
 
 def _training_episodes(
@@ -255,31 +260,28 @@ def _steps_without_values(recording: Recording, ranges: Sequence[range]) -> int:
     return unknown
 
 
-def _describe_training(
-    selection: Selection, request: Request, train: Episodes, numbers: NDArray[np.int64]
+def _describe(
+    selection: Selection,
+    request: Request,
+    numbers: NDArray[np.int64],
+    count: int,
+    available: Sequence[Evaluation],
+    evaluations: Sequence[Evaluation],
 ) -> None:
-    is_spread = request.is_default and len(numbers)
-    spread = f", evenly spread from {numbers[0]} to {numbers[-1]:,}" if is_spread else ""
-    steps = sum(map(len, selection.train))
-    selection.exported.append(
-        f"the {steps:,} steps of {len(numbers):,} of {train.count:,} training episodes{spread}"
-    )
-    if len(numbers) < train.count:
+    """Put in words what is exported of a job, and what is not: training episodes and evaluations."""
+    spread = f", evenly spread from {numbers[0]} to {numbers[-1]:,}" if request.is_default and count else ""
+    named = f" (after {', '.join(f'{one.after:,}' for one in evaluations)} episodes)"
+    trained, tested = (sum(map(len, spans)) for spans in selection.by_phase.values())
+    selection.exported += [
+        f"the {trained:,} steps of {len(numbers):,} of {count:,} training episodes{spread}",
+        f"the {tested:,} steps of {len(evaluations):,} of {len(available):,} evaluations"
+        + (named if 0 < len(evaluations) <= 4 else ""),
+    ]
+    if len(numbers) < count:
         selection.left_out.append(
-            f"the steps of {train.count - len(numbers):,} training episodes "
+            f"the steps of {count - len(numbers):,} training episodes "
             "(--episodes START:STOP or --every N includes them; --all: everything)"
         )
-
-
-def _describe_evaluations(
-    selection: Selection, available: Sequence[Evaluation], evaluations: Sequence[Evaluation]
-) -> None:
-    steps = sum(map(len, selection.by_phase["eval"]))
-    named = f" (after {', '.join(f'{one.after:,}' for one in evaluations)} episodes)"
-    selection.exported.append(
-        f"the {steps:,} steps of {len(evaluations):,} of {len(available):,} evaluations"
-        + (named if 0 < len(evaluations) <= 4 else "")
-    )
     if rest := [one.after for one in available if one not in evaluations]:
         selection.left_out.append(
             f"the trials of {len(rest):,} evaluations (--evaluations {rest[-1]} includes the one "
@@ -306,9 +308,8 @@ def _select_loop(recording: Recording, request: Request, selection: Selection) -
     if request.frames:
         _select_drawn(recording, request, selection)
     first = 0 if request.everything else max(0, tested - DEFAULT_STEPS)
-    evals, where = episodes_of(recording, "eval"), str(recording.path)
-    for after in sorted(set(request.evaluations)):
-        one = evaluation_after(evaluations_of(recording), after, where)
+    evals = episodes_of(recording, "eval")
+    for one in _chosen(recording, request, evaluations_of(recording)) if request.evaluations else ():
         steps = evals.steps_of(np.arange(one.start, one.stop))
         selection.evaluations += [(one, range(each.start, min(each.stop, first))) for each in steps]
     if tested:

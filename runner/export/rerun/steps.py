@@ -58,12 +58,10 @@ class Batch(NamedTuple):
 class StepTracks:
     """Makes the tracks of a phase: the grid, or without a scene states and actions as lines."""
 
-    def __init__(self, root: str, phase: str, mdp: Mdp, labels: Labels) -> None:
-        self.path = f"{root}/{phase}"
-        self._phase, self._mdp = phase, mdp
-        self._scene, self._labels = labels.scene, labels
-        self._states = states_in_words(mdp)
-        self._entry = cache(partial(_entry, mdp))
+    def __init__(self, path: str, phase: str, labels: Labels) -> None:
+        self.path, self._phase, self._labels = path, phase, labels
+        self._states = states_in_words(labels.mdp)
+        self._entry = cache(partial(_entry, labels.mdp))
         self._before: NDArray[np.int64] | None = None
         """The last states of the batch before, as many as a trail may show."""
         self.covered: list[tuple[int, int]] = []
@@ -71,7 +69,7 @@ class StepTracks:
 
     def still(self, title: str) -> Iterator[Track]:
         """Yield what never changes."""
-        phase, scene, path = self._phase, self._scene, self.path
+        phase, scene, path = self._phase, self._labels.scene, self.path
         if scene is None:
             view = View("grid", f"{title}: state and action", has_focus=True)
             for name, colour in zip(("state", "action"), phase_colours(phase, 2), strict=True):
@@ -100,10 +98,10 @@ class StepTracks:
     def of(self, batch: Batch) -> Iterator[Track]:
         """Yield the tracks of a batch of steps."""
         records, times = batch.records, batch.times()
-        events = events_of(self._mdp, records)
+        events = events_of(self._labels.mdp, records)
         yield from self._events(batch, events)
-        if self._scene:
-            yield from self._grid(self._scene, batch, events, times)
+        if scene := self._labels.scene:
+            yield from self._grid(scene, batch, events, times)
         else:
             for name in ("state", "action"):
                 yield Track(f"{self.path}/{name}", times, scalars(records[name][:, None]))
@@ -182,27 +180,24 @@ class StepTracks:
 
     def _events(self, batch: Batch, events: NDArray[np.uint32]) -> Iterator[Track]:
         """Yield the text log: beginnings and ends of episodes, pickups, collisions; not illegal actions."""
-        mdp, records = self._mdp, batch.records
+        mdp, records = self._labels.mdp, batch.records
         names = enumerate(mdp.event_names)
         masks = events & np.uint32(sum(1 << bit for bit, name in names if ".illegal" not in name))
         endings = np.where(records["terminated"], 1, np.where(records["truncated"], 2, 0))
-        begins, happens = np.flatnonzero(records["t"] == 0), np.flatnonzero((masks != 0) | (endings != 0))
         kind = "episode" if self._phase == "train" else "trial"
-        entries = [
-            (f"{kind} {number:,} begins: {self._states[state]}", "INFO")
-            for number, state in zip(batch.number[begins].tolist(), records["state"][begins], strict=True)
-        ]
-        for mask, ending, t in zip(
-            *(part[happens].tolist() for part in (masks, endings, records["t"])), strict=True
-        ):
-            text, level = self._entry(mask, ending)
-            entries.append((f"{text} after {t + 1} steps" if ending else text, level))
-        rows = np.concatenate((begins, happens))
-        order = np.argsort(rows, kind="stable")
-        if len(rows):
-            lines, levels = ([entries[i][part] for i in order] for part in (0, 1))
+        entries: list[tuple[int, str, str]] = []
+        for row in np.flatnonzero((records["t"] == 0) | (masks != 0) | (endings != 0)).tolist():
+            t, ending = int(records["t"][row]), int(endings[row])
+            if t == 0:
+                state = self._states[records["state"][row]]
+                entries.append((row, f"{kind} {batch.number[row]:,} begins: {state}", "INFO"))
+            if masks[row] or ending:
+                text, level = self._entry(int(masks[row]), ending)
+                entries.append((row, f"{text} after {t + 1} steps" if ending else text, level))
+        if entries:
+            rows, lines, levels = zip(*entries, strict=True)
             log = columns(rr.TextLog, text=texts(lines), level=texts(levels))
-            yield Track(f"{self.path}/events", batch.times(rows[order]), log)
+            yield Track(f"{self.path}/events", batch.times(np.array(rows)), log)
 
 
 def _entry(mdp: Mdp, mask: int, ending: int) -> tuple[str, str]:

@@ -32,13 +32,12 @@ def export(
         stream.send_recording_name(" and ".join(source.title for source in sources))
         readers: list[tuple[Writer, JobReader | LoopReader]] = []
         for source, selection in zip(sources, selections, strict=True):
-            writer = Writer(stream, source, selection.focus)
-            if source.recording.has_tables:
-                job = JobReader(source, selection)
-                writer.last = job.last
-                readers.append((writer, job))
-            else:
-                readers.append((writer, LoopReader(source, selection, request.trust, stage)))
+            reader = (
+                JobReader(source, selection)
+                if source.recording.has_tables
+                else LoopReader(source, selection, request.trust, stage)
+            )
+            readers.append((Writer(stream, source, selection.focus, reader.last), reader))
         for writer, reader in readers:
             writer.send(reader.overview())
         are_jobs = all(source.recording.has_tables for source in sources)
