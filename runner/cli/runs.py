@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from runner.archive.places import at_hand
-from runner.cli.output import facts, print_result, say
+from runner.cli.output import draw, facts, print_json, say
 from runner.cli.progress import progress_line, steps_line
 from runner.errors import RecordingError, RunnerError, RunNotFound
 from runner.runs.resolve import find_run, find_runs
@@ -180,6 +180,14 @@ def identity(run: Run) -> dict[str, object]:
     return {"run_id": run.run_id, "name": run.name, "seed": run.seed, "status": run.status, "path": path}
 
 
+def print_run(run: Run, as_json: bool, rows: dict[str, str], **more: object) -> None:
+    """Print a run that is over and its results, with further rows or keys of the JSON object."""
+    if as_json:
+        print_json(run_as_json(run) | more)
+    else:
+        draw(facts(run_facts(run) | rows))
+
+
 def run_as_json(run: Run) -> Json:
     """Return a run that is over and its results as JSON."""
     summary = _summary(run)
@@ -217,8 +225,9 @@ def print_received(run: Run, digest: str, existing: str, as_json: bool, **more: 
     """
     if existing:
         say(f"Run {run.run_id} is there already with {existing}; nothing was written.")
-    value = identity(run) | {"already": bool(existing), "content_digest": digest} | more
+    if as_json:
+        print_json(identity(run) | {"already": bool(existing), "content_digest": digest} | more)
+        return
     file = f"{run.recording}  {size(run.recording.stat().st_size)}"
     title = f"{run.run_id}  {run.title}, {run.status}"
-    rows = {"run": title, "digest": digest, "file": file, "next": command_for(run, "show")}
-    print_result(as_json, value, facts(rows))
+    draw(facts({"run": title, "digest": digest, "file": file, "next": command_for(run, "show")}))

@@ -13,7 +13,7 @@ from runner.cli.options import json_option, recordings_option, runs_argument
 from runner.cli.output import draw, facts, print_json, say
 from runner.cli.parameter_types import RunName
 from runner.cli.progress import stage_line, steps_line
-from runner.cli.runs import compilation_notice, find, print_received, run_as_json, run_facts
+from runner.cli.runs import compilation_notice, find, print_received, print_run
 from runner.errors import RunnerError
 from runner.runs.run import recordings_folder
 from runner.util.humanize import size
@@ -126,10 +126,7 @@ def restore_command(
             run = restore_place(place, recordings_folder(recordings), report)
         else:
             run = restore_run(find(run_name, recordings), report)
-    if as_json:
-        print_json(run_as_json(run))
-    else:
-        draw(facts(run_facts(run)))
+    print_run(run, as_json, {})
 
 
 @click.command("import", cls=Command)

@@ -17,7 +17,7 @@ from runner.cli.options import json_option, recordings_option, run_argument, set
 from runner.cli.output import draw, facts, grid_table, print_json, print_result, say
 from runner.cli.parameter_types import COUNT, INDEX, PLACE
 from runner.cli.progress import steps_line
-from runner.cli.runs import command_for, compilation_notice, find_recorded, run_as_json, run_facts
+from runner.cli.runs import command_for, compilation_notice, find_recorded, print_run, run_facts
 from runner.errors import ExitCode
 from runner.runs.run import Run
 from runner.util.humanize import counted, number
@@ -194,22 +194,20 @@ def _action(actions: tuple[str, ...], run: Run) -> object:
 
 def _print_training(parent: Run, branch: TrainingBranch, as_json: bool) -> None:
     run = branch.run
-    if as_json:
-        print_json(run_as_json(run) | {"origin": asdict(branch.origin), "at": str(branch.at)})
-    else:
-        results = [each.summary.last_evaluation for each in (parent, run)]
-        success = [None if each is None else each.values.get("success_percent") for each in results]
-        rows = run_facts(run) | {"branched": f"run {parent.run_id} {branch.origin} (step {branch.at})"}
-        if None not in success:
-            rows["success"] = (
-                f"{number(success[1])} % in the last evaluation, {number(success[0])} % in the parent"
-            )
-        more = run.file.config["episodes"] - parent.file.config["episodes"]
-        if more:
-            total = counted(run.file.config["episodes"], "episode")
-            compared = "more" if more > 0 else "fewer"
-            rows["trained"] = f"for {total} in all, {abs(more):,} {compared} than the parent"
-        draw(facts(rows | {"next": command_for(parent, "diff", run.run_id)}))
+    results = [each.summary.last_evaluation for each in (parent, run)]
+    success = [None if each is None else each.values.get("success_percent") for each in results]
+    rows = {"branched": f"run {parent.run_id} {branch.origin} (step {branch.at})"}
+    if None not in success:
+        rows["success"] = (
+            f"{number(success[1])} % in the last evaluation, {number(success[0])} % in the parent"
+        )
+    more = run.file.config["episodes"] - parent.file.config["episodes"]
+    if more:
+        total = counted(run.file.config["episodes"], "episode")
+        compared = "more" if more > 0 else "fewer"
+        rows["trained"] = f"for {total} in all, {abs(more):,} {compared} than the parent"
+    rows["next"] = command_for(parent, "diff", run.run_id)
+    print_run(run, as_json, rows, origin=asdict(branch.origin), at=str(branch.at))
     if run.status == "interrupted":
         say(f"Interrupted: what was recorded is kept; `{command_for(run, 'resume')}` trains the rest.")
         raise click.exceptions.Exit(ExitCode.INTERRUPTED)

@@ -25,6 +25,7 @@ from runner.cli.runs import (
     find,
     find_recorded,
     job_progress,
+    print_run,
     require_over,
     run_as_json,
     run_facts,
@@ -64,10 +65,8 @@ def resume_command(
     was_finished = is_finished(run)
     with job_progress("", run.episodes_to_do or 0) as (report, interrupt):
         run = resume(run, accept_changes, report, interrupt, trust)
-    if as_json:
-        print_json(run_as_json(run))
-    elif not was_finished:
-        draw(facts(run_facts(run) | {"next": command_for(run, "show")}))
+    if as_json or not was_finished:
+        print_run(run, as_json, {"next": command_for(run, "show")})
     if was_finished:
         say(f"Run {run.run_id} is finished; there is nothing to do.")
     if interrupt.came and run.status == "interrupted":
@@ -106,11 +105,9 @@ def rerecord_command(
     else:
         with job_progress("", run.episodes_to_do or 0) as (report, interrupt):
             run = rerecord(run, report, interrupt, trust=trust)
-    if as_json:
-        print_json(run_as_json(run))
-    elif not had_steps:
-        proof = {"proof": "the content digest is the one that the run had"}
-        draw(facts(run_facts(run) | proof | {"next": command_for(run, "play")}))
+    if as_json or not had_steps:
+        proof = "the content digest is the one that the run had"
+        print_run(run, as_json, {"proof": proof, "next": command_for(run, "play")})
     if had_steps:
         say(f"Run {run.run_id} leaves no steps out; there is nothing to do.")
 
@@ -234,9 +231,6 @@ def _evaluate_checkpoint(
     with open_recording(run.recording) as recording:
         played = recording.episodes("eval")
     spreads = {"return": spread_of(played["returns"].sum(axis=1)), "length": spread_of(played["length"])}
-    if as_json:
-        print_json(run_as_json(run) | {"origin": origin, "spread": spreads})
-        return
     spread = {
         name: f", standard deviation {number(own['standard_deviation'])}, "
         f"{number(own['lowest'])} to {number(own['highest'])}"
@@ -251,4 +245,4 @@ def _evaluate_checkpoint(
         "mean length": number(means.get("mean_length")) + spread.get("length", ""),
         "next": command_for(run, "show"),
     }
-    draw(facts(run_facts(run) | results))
+    print_run(run, as_json, results, origin=origin, spread=spreads)
