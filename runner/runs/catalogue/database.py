@@ -133,5 +133,11 @@ def transaction(database: sqlite3.Connection, kind: Literal["DEFERRED", "IMMEDIA
 def write_rows(database: sqlite3.Connection, rows: Iterable[Mapping[str, Any]]) -> None:
     """Write whole rows, replacing those of the same folders; within a transaction."""
     places = ", ".join(f":{name}" for name in STORED)
-    shifted = ({**row, "seed": None if row["seed"] is None else row["seed"] - SEED_SHIFT} for row in rows)
-    database.executemany(f"INSERT OR REPLACE INTO runs VALUES ({places})", shifted)
+    database.executemany(f"INSERT OR REPLACE INTO runs VALUES ({places})", map(_storable, rows))
+
+
+def _storable(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row as SQLite takes it: its whole numbers have 64 bits with a sign."""
+    names = [name for name, kind in STORED.items() if kind == "REAL" and row[name] is not None]
+    seed = None if row["seed"] is None else row["seed"] - SEED_SHIFT
+    return {**row, **{name: float(row[name]) for name in names}, "seed": seed}
