@@ -180,7 +180,7 @@ def logged_columns(recording: Recording) -> dict[str, Sequence[object]]:
     """Return the columns of `logged`, a list each."""
     names = ("phase", "step", "episode", "name", "value")
     columns: dict[str, list[object]] = {name: [] for name in names}
-    for scalar in () if recording.has_reports else recording.decoded(SCALAR_TOPIC):
+    for scalar in recording.decoded(SCALAR_TOPIC):
         for name in names:
             columns[name].append(scalar[name])
     return dict(columns)
@@ -199,15 +199,15 @@ def step_columns(
     Raises:
         RecordingError: the recording cannot be read, or has no such episode.
     """
-    topic = recording.topic(f"/{phase}/step")
-    if topic not in recording.dtypes:
+    steps = recording.phase(phase).steps
+    if steps.dtype is None:
         raise RecordingError(
             f"{recording.path}: its observations vary in size, so its steps are no columns; "
             "`Recording.transitions` reads them one by one."
         )
     if episode is None:
-        blocks = [block.copy() for block in recording.blocks(topic, start, stop)]
-        records = np.concatenate(blocks) if blocks else np.empty(0, recording.dtypes[topic])
+        blocks = [block.copy() for block in steps.blocks(start, stop)]
+        records = np.concatenate([np.empty(0, steps.dtype), *blocks])
     else:
         records = steps_of(recording, phase, episode)
     names = records.dtype.names or ()

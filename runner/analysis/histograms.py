@@ -179,12 +179,12 @@ def _steps(
     recording: Recording, places: Positions, columns: dict[tuple[str, str], _Column], notes: list[str]
 ) -> Iterator[Block]:
     lines = recording.agents[:_MAX_PARTS] if len(recording.agents) > 1 else [""]
-    if recording.has_messages("/train/step"):
+    if recording.phase("train").steps:
         for line in lines:
             columns.setdefault(("reward", line), _Column("reward", line, "reward of a step", _number))
     else:
         notes.append("Rewards have no histogram, as no whole steps of training were recorded.")
-    for block in recording.rows("/train/step"):
+    for block in recording.rows(recording.phase("train").steps):
         taken = block["t"] != RESET_ONLY
         values: dict[tuple[str, str], Values] = {}
         for part, own in _parts(recording, _uniform(recording, block["action"][taken]), notes).items():
@@ -244,7 +244,7 @@ def _action_name(recording: Recording, part: str) -> Callable[[float], str]:
         agent = part if part in recording.agents else ""
         names = recording.action_names("train", agent) if agent or not part else ()
         space = recording.spaces["action"]
-        start = int(space.get("start", 0)) if recording.kind != "step" else 0
+        start = int(space.get("start", 0)) if not recording.has_states else 0
     names_by_number = {float(start + i): spoken(name) for i, name in enumerate(names)}
     return lambda value: names_by_number.get(value, _number(value))
 

@@ -382,7 +382,7 @@ def _unfinished_episodes(recording: Recording) -> Readings:
     if not recording.count(schema.TRAIN_STEP) or recording.has_actions_alone("train"):
         return {}
     agents, steps, total = recording.agents, 0, 0.0
-    for block in recording.rows("/train/step"):
+    for block in recording.rows(recording.phase("train").steps):
         steps += len(block)
         total = total + block["rewards"].sum(axis=0, dtype=np.float64)
     returns = np.broadcast_to(total, len(agents)) / recording.environments
@@ -433,7 +433,7 @@ def _mean_scalars(
             own = rows[evaluated]
             steps[evaluated] = (own["log_time"] // schema.STEP_NANOSECONDS).astype(np.int64) - own["step"]
             moments, at = np.unique(steps[evaluated], return_inverse=True)
-            ended = [recording.first_from(schema.TRAIN_EPISODE, "last_step", k) for k in moments.tolist()]
+            ended = [recording.phase("train").episodes.first_from("last_step", k) for k in moments.tolist()]
             episodes[evaluated] = np.array(ended)[at]
         reached = places.at(episodes + 1, steps)
         stretches = np.searchsorted(ends, np.trunc(reached) if places.axis.whole else reached)

@@ -137,5 +137,5 @@ def training_step(recording: Recording, at: int | StepRef) -> int:
 
 def reference_to(recording: Recording, step: int) -> StepRef:
     """Return the reference to a training step of a job, by its episode and its place in it."""
-    episode = recording.first_from(schema.TRAIN_EPISODE, "last_step", step)
+    episode = recording.phase("train").episodes.first_from("last_step", step)
     return StepRef(episode, step - step_of_episode(recording, episode))

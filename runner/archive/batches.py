@@ -32,7 +32,7 @@ class Batches:
         self._recording = recording
         self._where = str(recording.path)
         mdp = recording.mdp if recording.tabular else None
-        extras = () if recording.is_job else tuple(recording.extra_layouts)
+        extras = tuple(recording.extra_layouts)
         self.shape: Shape = shape_of(recording.run, mdp, self._where, extras)
         self._hashes = {topic.name: blake3() for topic in recording.topics}
         self._counts = dict.fromkeys(self._hashes, 0)

@@ -128,7 +128,7 @@ class Archive(RunDescription):
 
     def _extra_layouts(self) -> list[ExtraLayout]:
         count = self.count(schema.EXTRA_COLUMNS_TOPIC)
-        if not count or self.is_job:
+        if not count or self.can_train_again:
             return []
         name = layout.EXTRA_COLUMNS
         rows = [

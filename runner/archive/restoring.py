@@ -109,7 +109,7 @@ class _Restorer:
             return
         if table.topics[0] not in self._shape.dtypes:
             self._restore_messages(table)
-        elif self._archive.is_job and table.name == layout.STEPS:
+        elif self._archive.can_train_again and table.name == layout.STEPS:
             self._restore_learning(table)
         else:
             for topic, records in self._records(table):
@@ -168,7 +168,7 @@ class _Restorer:
         if not topic.digested:
             self._undigested[topic].update(message_record(topic, time, payload))
         self._batches.extend(topic, [time], [payload])
-        if topic.message is schema.IMAGE or self._archive.is_job:
+        if topic.message is schema.IMAGE or self._archive.can_train_again:
             self._batches.flush()
 
     def _send(

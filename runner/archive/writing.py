@@ -125,7 +125,7 @@ class _ArchiveWriter:
             if table.name in layout.LEFT_OUT_IF_EMPTY and not any(map(self._recording.count, table.topics)):
                 continue
             with TableWriter(self._folder / table.name, table.columns) as writer:
-                if self._recording.is_job and table.name == layout.STEPS:
+                if self._recording.can_train_again and table.name == layout.STEPS:
                     self._write_learning(table, writer)
                     continue
                 for batch in self._batches.of(table):

@@ -180,10 +180,7 @@ class _Branches:
         limit = self._mdp.step_limit - t if self._mdp.step_limit else MAX_STEPS
         blocks = [
             blank_records(topic, recording.dtypes[topic], count).view(np.recarray)
-            for topic, count in (
-                (recording.topic(f"/{place.phase}/step"), limit),
-                (recording.topic(f"/{place.phase}/episode"), 1),
-            )
+            for topic, count in zip(schema.PHASES[place.phase], (limit, 1), strict=True)
         ]
         steps: NDArray[np.void] = blocks[0][: self._playing.play(action, *blocks)]
         times = self._step["log_time"] + np.arange(len(steps), dtype=np.uint64) * schema.STEP_NANOSECONDS

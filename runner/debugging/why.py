@@ -191,7 +191,7 @@ def _step_at(recording: Recording, at: StepRef | None) -> NDArray[np.void]:
     span = recording.episode_span(place.phase, place.number)
     if at.t >= len(span):
         raise no_step(recording, place.title, len(span), at.t)
-    (block,) = recording.blocks(recording.topic(f"/{place.phase}/step"), span[at.t], span[at.t] + 1)
+    (block,) = recording.phase(place.phase).steps.blocks(span[at.t], span[at.t] + 1)
     check_steps(block, recording.mdp, str(recording.path), schema.PHASE_NAMES[place.phase])
     step: NDArray[np.void] = block[0]
     return step

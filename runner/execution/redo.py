@@ -116,7 +116,7 @@ def _rerun_all(recording: Recording, found: Verification, trust: bool) -> Verifi
                 steps=found.steps + len(steps),
                 difference=steps.difference,
             )
-        ended = sum(recording.count(recording.topic(f"/{phase}/episode")) for phase in schema.PHASES)
+        ended = sum(recording.phase(phase).episodes.count() for phase in schema.PHASES)
         found = replace(found, left_out=replay.skipped, unfinished=max(0, found.episodes - ended))
     if found.difference is None and "content_digest" not in recording.result:
         found = replace(found, cut_off=sum(left.values()))
@@ -130,7 +130,7 @@ def _rerun_sample(recording: Recording, found: Verification, sample: int, trust:
     ended = [
         (phase, number)
         for phase in schema.PHASES
-        for number in range(recording.count(recording.topic(f"/{phase}/episode")))
+        for number in range(recording.phase(phase).episodes.count())
     ]
     places = np.unique(np.linspace(0, len(ended) - 1, min(sample, len(ended))).round().astype(int))
     found = replace(found, of_episodes=len(ended))

@@ -281,8 +281,8 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
     Raises:
         Diverged: they differ from the recorded ones.
     """
-    names = {recording.topic(f"/{phase}/step").name for phase in schema.PHASES}
-    dtypes = {topic: dtype for topic, dtype in recording.dtypes.items() if topic.name in names}
+    topics = {phase: recording.phase(phase).steps.topic for phase in schema.PHASES}
+    dtypes = {topic: recording.dtypes[topic] for topic in topics.values()}
     packing = recorded_packing(recording.config)
     recorder = Recorder(file, dtypes, packing)
     try:
@@ -290,8 +290,8 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
             states = {phase: np.full(recording.environments, -1, np.int64) for phase in schema.PHASES}
             for piece in pieces(recording, schema.PHASES):
                 records = _whole_records(recording, replay, piece, states[piece.phase])
-                topic, times = recording.topic(f"/{piece.phase}/step"), records["log_time"]
-                for block, part in recorder.fill(topic, times // schema.STEP_NANOSECONDS):
+                positions = records["log_time"] // schema.STEP_NANOSECONDS
+                for block, part in recorder.fill(topics[piece.phase], positions):
                     block[:] = records[part]
                 report_progress(replay.taken)
         if replay.skipped:
@@ -300,7 +300,7 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
     except BaseException:
         recorder.abandon()
         raise
-    for name in sorted(names):
+    for name in sorted(topic.name for topic in topics.values()):
         expected = recording.result.topic_digests.get(name)
         if digests.get(name) != expected:
             raise Diverged(name, "digest", digests.get(name), expected)
@@ -315,12 +315,12 @@ def _whole_records(
         for steps in replay.steps(piece, environment, draws=False):
             fill_in(records, steps.step - piece.first, steps)
     after = after_step(records.dtype)
-    start = least_number(recording.spaces["observation"]) if recording.kind == "step" else 0
+    start = least_number(recording.spaces["observation"]) if recording.has_states else 0
     for reset in piece.resets:
         row = reset.step - piece.first + reset.environment
         if row < len(rows) and rows["t"][row] == schema.RESET_ONLY:
             records[after][row] = reset.observation - start if start else reset.observation
-    if recording.kind == "step":
+    if recording.has_states:
         _fill_states(records, piece, states, start)
     return records
 

@@ -269,7 +269,7 @@ class Session:
             self.recorder.message(schema.Q_TABLE_TOPIC, encode_q_table(table))
 
     def _log(self, text: str, level: str = "INFO") -> None:
-        steps = sum(self.recorder.steps.values())
+        steps = self.recorder.position
         message = encode_log(text, steps * schema.STEP_NANOSECONDS / 1e9, level)
         if self.recorder.message(schema.LOG_TOPIC, message):
             self._progress.log.append(text)

@@ -153,14 +153,15 @@ def _unusual(recording: Recording, phase: str, findings: Findings) -> Iterator[s
     Raises:
         Inconsistent: the environment cannot have done it.
     """
+    topic = schema.PHASES[phase][0]  # whose name is that of every kind's steps
     if findings.rewards_off_table:
-        where = f"/{phase}/step, step {findings.first_off_table}: rewards"
+        where = f"{topic.name}, step {findings.first_off_table}: rewards"
         if recording.result.rewards_off_table == 0:
             raise Inconsistent(f"{where}: found one that the environment's table excludes for this step")
         count = findings.rewards_off_table
         yield f"{where}: {count:,} steps have rewards that are not in the environment's table"
     if findings.begun_without:
-        where = f"/{phase}/step, step {findings.first_without}"
+        where = f"{topic.name}, step {findings.first_without}"
         if findings.begun_by_reset >= findings.begun_without:
             raise Inconsistent(f"{where}: found an episode without a reset before it, as others have")
         yield f"{where}: {findings.begun_without:,} episodes began without a reset"

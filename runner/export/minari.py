@@ -71,7 +71,7 @@ def write_dataset(
     from minari.dataset.minari_storage import MinariStorage
 
     folder = folder.absolute()  # Minari takes a relative one as relative to itself
-    ended = recording.count(recording.topic(f"/{phase}/episode"))
+    ended = recording.phase(phase).episodes.count()
     whole = tuple(whole_ranges(ranges, ended, phase, str(recording.path))) or ((0, None),)
     observations, actions = _spaces(recording)
     spec, notes = _environment_spec(recording, observations, actions)
@@ -110,7 +110,7 @@ def write_dataset(
 def _missing(recording: Recording, phase: str, is_all: bool, written: Written) -> list[str]:
     """Return what a dataset lacks or has otherwise than recorded, a sentence each."""
     notes = []
-    ended, steps = (recording.count(recording.topic(f"/{phase}/{name}")) for name in ("episode", "step"))
+    ended, steps = (own.count() for own in (recording.phase(phase).episodes, recording.phase(phase).steps))
     if written.abandoned:
         notes.append(
             f"{written.abandoned:,} episodes were reset before their end; "
@@ -156,7 +156,9 @@ def _with_reset(values: Array) -> Array:
 def _description(recording: Recording, phase: str) -> dict[str, str]:
     digest = recording.result.content_digest or f"none ({recording.status})"
     meaning = (
-        "Recorded from a loop." if recording.has_spaces else "Observations are states, actions joint actions."
+        "Observations are states, actions joint actions."
+        if recording.can_train_again
+        else "Recorded from a loop."
     )
     text = (
         f"The {phase} episodes of the dualtaxi run {recording.run_id} ({recording.title}), "
@@ -183,7 +185,7 @@ def _environment_spec(
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            maker = environment_of_job(recording.config) if recording.is_job else recording.maker
+            maker = environment_of_job(recording.config) if recording.can_train_again else recording.maker
             with trusting(recording.path, maker) as is_trusted:
                 if not is_trusted:
                     require_listed(env_id, kwargs)

@@ -54,7 +54,7 @@ def episodes_in(recording: Recording, phase: str, ranges: Ranges) -> Iterator[Ep
     lengths: dict[int, int] = {}
     """The lengths of the episodes, by the number of their last step."""
     for start, stop in ranges:
-        for block in recording.blocks(recording.topic(f"/{phase}/episode"), start, stop):
+        for block in recording.phase(phase).episodes.blocks(start, stop):
             lengths |= zip(block["last_step"].tolist(), block["length"].tolist(), strict=True)
     if not lengths:
         return
@@ -72,7 +72,7 @@ class _Resets:
     def __init__(self, recording: Recording, phase: str) -> None:
         self._recording = recording
         self._environments = recording.environments
-        self._remaining = recording.resets(phase) if recording.has_spaces else iter(())
+        self._remaining = recording.resets(phase)
         self._next = next(self._remaining, None)
         self._read: dict[tuple[int, int], tuple[int | None, Value]] = {}
         """By environment and episode."""
@@ -104,12 +104,11 @@ def _copy(value: Value) -> Value:
 
 def _steps(recording: Recording, phase: str, lengths: Mapping[int, int]) -> Iterator[tuple[int, Records]]:
     """Yield environment and steps of each episode; the last one of an environment may not have ended."""
-    name, n = f"/{phase}/step", recording.environments
-    topic = recording.topic(name)
+    table, n = recording.phase(phase).steps, recording.environments
     first = max(min(last - (length - 1) * n for last, length in lengths.items()), 0)
     open_parts: dict[int, list[Records]] = {environment: [] for environment in range(n)}
-    is_fixed = topic in recording.dtypes
-    for block in recording.blocks(topic, first, max(lengths) + 1) if is_fixed else recording.rows(name):
+    is_fixed = table.dtype is not None
+    for block in table.blocks(first, max(lengths) + 1) if is_fixed else recording.rows(table):
         if block["step"][0] > max(lengths):
             break
         ended: list[tuple[int, Records]] = []

@@ -78,12 +78,11 @@ def measures(recording: Recording) -> Iterator[Measures]:
             yield _measures(phase, row, values)
     for row in recording.optimality():
         yield _measures("eval", row, _named(row, exact_values, agents))
-    if not recording.has_reports:
-        for scalar in recording.decoded(SCALAR_TOPIC):
-            if math.isfinite(scalar["value"]):
-                position, step = scalar["log_time"] // STEP_NANOSECONDS, training_step(scalar)
-                values = {f"logged/{scalar['name']}": scalar["value"]}
-                yield Measures(scalar["phase"], position, step, scalar["episode"], values)
+    for scalar in recording.decoded(SCALAR_TOPIC):
+        if math.isfinite(scalar["value"]):
+            position, step = scalar["log_time"] // STEP_NANOSECONDS, training_step(scalar)
+            values = {f"logged/{scalar['name']}": scalar["value"]}
+            yield Measures(scalar["phase"], position, step, scalar["episode"], values)
 
 
 def episodes(recording: Recording, phase: str) -> Iterator[Measures]:

@@ -95,9 +95,9 @@ def left_out(recording: Recording) -> list[str]:
 
 def _episode_count(recording: Recording, phase: str) -> int:
     """Return the number of episodes with steps, including one that did not end."""
-    ended = recording.count(recording.topic(f"/{phase}/episode"))
+    ended = recording.phase(phase).episodes.count()
     steps = int(recording.episodes(phase, ended - 1, ended)[0]["last_step"]) + 1 if ended else 0
-    return ended + (recording.count(recording.topic(f"/{phase}/step")) > steps)
+    return ended + (recording.phase(phase).steps.count() > steps)
 
 
 def _metrics(recording: Recording) -> Iterator[pa.RecordBatch]:

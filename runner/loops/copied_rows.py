@@ -72,8 +72,8 @@ class CopiedRows(_Copies):
                 self.open()
 
     def _open_steps(self) -> tuple[int, int]:
-        self._block = self._recorder.block(self._steps)
-        self._reset_block = self._recorder.block(self._resets)
+        self._block = self._recorder.block(self._topics.steps)
+        self._reset_block = self._recorder.block(self._topics.resets)
         return len(self._block), len(self._reset_block)
 
     def _put_reset(self, observation: object, seed: int | None) -> None:  # noqa: ARG002
@@ -96,7 +96,7 @@ class CopiedRows(_Copies):
         block = self._block[:n]
         block["step"] = self._recorder.steps[self._phase] + np.arange(n)
         block["episode"], block["t"] = episode, t
-        self._recorder.take(self._steps, np.arange(before + 1, before + n + 1, dtype=np.uint64))
+        self._recorder.take(self._topics.steps, np.arange(before + 1, before + n + 1, dtype=np.uint64))
 
 
 class CopiedMessages(_Copies, VariableRows):

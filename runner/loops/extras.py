@@ -251,7 +251,7 @@ class Extras:
         """Hand the values with these steps, and whether each was given, to the recorder."""
         topic, recorder = TOPICS[self._phase], self._recorder
         # The steps of the other phase came before all of these.
-        first = sum(recorder.steps.values()) - recorder.steps[self._phase] + 1
+        first = recorder.position - recorder.steps[self._phase] + 1
         if not self._is_described:
             layout = ExtraLayout(0, np.dtype(list(self._dtypes.items())))
             begin_layout(recorder, layout, first + int(steps[0]))

@@ -231,7 +231,7 @@ class _Fold:
         """Return the description of the spaces, with the widest actions that a process recorded."""
 
         def width(source: Source) -> int:
-            topic = source.recording.topic("/train/step")
+            topic = source.recording.phase("train").steps.topic
             dtype = source.recording.dtypes.get(topic)
             return dtype["action"].itemsize if dtype is not None else 0
 
@@ -304,22 +304,23 @@ class _Fold:
         for unit in self._units:
             phase, source = PHASES[unit["phase"]], self._sources[unit["source"]]
             own: Any = rows[phase]
+            topics = schema.topics_of(copied.kind, phase)
             if own is not active:
                 active.commit()
                 own.open()
                 active = own
             unit["new_reset"] = own.resets
             unit["new_step"] = own.place[0]
-            unit["new_position"] = sum(recorder.steps.values()) + own.filled
+            unit["new_position"] = recorder.position + own.filled
             reset, read = source.reset(phase, unit), self._read[source.number]
             own.put_reset(reset, source.environment + int(unit["environment"]))
-            self.content.take(first.topic(f"/{phase}/reset"), reset)
-            read[f"/{phase}/reset"] += 1
+            self.content.take(topics.resets, reset)
+            read[topics.resets.name] += 1
             unit["new_episode"] = own.begun + 1
             for steps, numbers in source.steps(phase, unit):
-                self.content.take(first.topic(f"/{phase}/step"), steps)
-                position = sum(recorder.steps.values()) + own.filled
-                read[f"/{phase}/extra"] += extras.copy(source, phase, numbers, own.place[0], position)
+                self.content.take(topics.steps, steps)
+                position = recorder.position + own.filled
+                read[topics.extras.name] += extras.copy(source, phase, numbers, own.place[0], position)
                 own.put(steps)
                 copied_steps += len(numbers)
                 self._report(copied_steps, total)

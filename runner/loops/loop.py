@@ -6,6 +6,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Final, Generic, TypeVar
 
 from runner.errors import ConfigError, RunnerError, StorageError, truncated_message
@@ -100,7 +101,7 @@ class Loop(Generic[R]):
             self._recorder,
             self._loop_run.outcomes,
             options,
-            {topic.name: topic for topic in schema.KINDS[described.kind]},
+            partial(schema.topics_of, described.kind),
             options.join.folder if options.join else self.run.folder,
         )
         FLUSHER.add(self)
@@ -187,7 +188,7 @@ class Loop(Generic[R]):
         """
         if self.closed:
             raise RunnerError(f"run {self.run.run_id} is closed: nothing more can be recorded in it.")
-        return sum(self._recorder.steps.values()) + (self.active.filled if self.active else 0)
+        return self._recorder.position + (self.active.filled if self.active else 0)
 
     def moment(self, rows: PhaseRows) -> tuple[int, int, int]:
         """Return `position`, and the steps and the episode of a phase."""

@@ -24,7 +24,7 @@ from runner.recording import schema
 from runner.recording.messages import encode, encode_image, encode_log, frame_id, scalar_encoder
 from runner.recording.recorder import Recorder
 from runner.recording.reset_states import ResetState
-from runner.recording.schema import STEP_NANOSECONDS, Topic
+from runner.recording.schema import STEP_NANOSECONDS, PhaseTopics, Topic
 from runner.runs.checkpoints import MAX_CHECKPOINTS
 from runner.runs.store import Store
 from runner.util.jsonable import as_json, is_packed, packed
@@ -96,7 +96,7 @@ class Messages:
         recorder: Recorder,
         outcomes: Outcomes,
         options: Options,
-        topics: Mapping[str, Topic],
+        topics: Callable[[str], PhaseTopics],
         run_folder: Path,
     ) -> None:
         self._run_folder = run_folder
@@ -222,8 +222,7 @@ class Messages:
             step, _ = self._loop.rows(phase).place
             is_reset = reset is not None
             fields = {"step": step if is_reset else step - 1, "reset": is_reset, "json": text}
-            topic = self._topics[f"/{phase}/info"]
-            self._recorder.append(topic, encode(schema.INFO, fields), self._loop.position)
+            self._recorder.append(self._topics(phase).infos, encode(schema.INFO, fields), self._loop.position)
 
     def reset_info(
         self, phase: str, info: Mapping[str, object], options: Mapping[str, object] | None, seed: object
@@ -253,7 +252,7 @@ class Messages:
     def reset_state(self, phase: str, state: ResetState) -> None:
         """Record what a reset depended on, of the reset that was just put down. The caller holds the lock."""
         if self._loop.records():
-            self._states.append((self._topics[f"/{phase}/reset_state"], state, self._loop.position))
+            self._states.append((self._topics(phase).reset_states, state, self._loop.position))
             if len(self._states) == _MAX_WAITING:
                 self.commit()
 
@@ -281,7 +280,7 @@ class Messages:
             def make() -> bytes:
                 return encode_image(image_bytes(pixels, kind), kind, position, place)
 
-            self._recorder.submit(self._topics[f"/{phase}/frame"], make, position)
+            self._recorder.submit(self._topics(phase).frames, make, position)
 
     def picture(self, name: str, picture: Picture) -> None:
         """Record a picture or a film under a name, at this moment; another thread encodes it."""

@@ -40,14 +40,13 @@ class Rows:
     ) -> None:
         self._first_action = first_action
         self._set_leaves(described)
-        topics = {topic.name: topic for topic in schema.KINDS[described.kind]}
+        self._topics = schema.topics_of(described.kind, phase)
         self._recorder = recorder
         self._phase = phase
-        self._steps = topics[f"/{phase}/step"]
-        self._episodes = topics[f"/{phase}/episode"]
-        self._resets = topics[f"/{phase}/reset"]
         self._mdp = described.mdp
-        self._log = EpisodeLog(1, recorder.dtype(self._episodes)["returns"].shape[0], self._mdp, zero=-0.0)
+        self._log = EpisodeLog(
+            1, recorder.dtype(self._topics.episodes)["returns"].shape[0], self._mdp, zero=-0.0
+        )
         self.off_table = 0
         """Committed steps whose reward the environment's table excludes; 0 without a table."""
         self.filled = 0
@@ -126,7 +125,7 @@ class Rows:
 
     def commit(self) -> None:
         """Complete what was put down and hand it to the recorder; then `open` again."""
-        n, before, first = self.filled, sum(self._recorder.steps.values()), self._recorder.steps[self._phase]
+        n, before, first = self.filled, self._recorder.position, self._recorder.steps[self._phase]
         if not (n or self._reset_rows):
             return
         resets, transitions = np.array(self._reset_rows, np.int64), self._transitions(n)
@@ -163,17 +162,19 @@ class Rows:
     def _put_ends(self, ended: Columns, first: int, before: int) -> None:
         """Record the ends of episodes, each at the time of its last step, which may be committed already."""
         rows = ended["last_step"].astype(np.int64) - first
-        self._recorder.put(self._episodes, ended, np.where(rows < 0, self._last_position, before + rows + 1))
+        self._recorder.put(
+            self._topics.episodes, ended, np.where(rows < 0, self._last_position, before + rows + 1)
+        )
 
     def _finish_resets(self, episode: Ints, step: Ints, other: int) -> None:
         """Complete the records of resets; `other` are the steps of the other phase before them."""
         n = len(step)
-        block = self._recorder.block(self._resets)[:n]
+        block = self._recorder.block(self._topics.resets)[:n]
         block["reset"] = self._reset_count + np.arange(n)
         block["episode"], block["step"] = episode, step
         block["seed"] = [seed or 0 for seed in self._seeds]
         block["seeded"] = [seed is not None for seed in self._seeds]
-        self._recorder.take(self._resets, (step + other).astype(np.uint64))
+        self._recorder.take(self._topics.resets, (step + other).astype(np.uint64))
 
     # --- what differs by the kind of spaces -----------------------------------------------------------
 

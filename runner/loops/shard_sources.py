@@ -23,6 +23,7 @@ from runner.recording.reader import Recording, open_recording
 from runner.recording.repair import can_be_repaired
 from runner.recording.row_reader import FOREVER
 from runner.recording.schema import STEP_NANOSECONDS
+from runner.recording.topic_chunks import TopicChunks
 from runner.runs.listing import run_in
 from runner.runs.run import RECORDING_FILE, RUN_FILE, Run
 from runner.runs.shards import shard_folders
@@ -84,34 +85,32 @@ class Source:
         """The numbers of those at which an environment was only reset."""
         self.taken = {phase: self.stops[phase] - len(self.only_resets[phase]) for phase in PHASES}
         self.units = {phase: self._units(phase) for phase in PHASES}
-        self._messages: dict[str, Iterator[Message]] = {}
+        self._messages: dict[TopicChunks, Iterator[Message]] = {}
         self.times = {phase: self._times(phase) for phase in PHASES}
         """`log_time` of each step where values vary in size; else empty."""
 
-    def _topic(self, phase: str, name: str) -> schema.Topic:
-        return self.recording.topic(f"/{phase}/{name}")
-
     @property
     def _is_fixed(self) -> bool:
-        return self.recording.kind != "variable"
+        return self.recording.phase("train").steps.dtype is not None
 
     def _stop(self, phase: str) -> int:
         """Return the steps of a phase, up to the first that is lost or may lack its reset."""
-        (step, _), (reset, last_reset) = (self._first_gap(phase, name) for name in ("step", "reset"))
+        own = self.recording.phase(phase)
+        (step, _), (reset, last_reset) = map(self._first_gap, (own.steps, own.resets))
         stop = min(self.recording.whole_steps(phase), step)
         return (stop if reset == FOREVER else min(stop, last_reset)) // self.n * self.n
 
-    def _first_gap(self, phase: str, name: str) -> tuple[int, int]:
+    def _first_gap(self, table: TopicChunks) -> tuple[int, int]:
         """Return the number of the first message that a repair lost, `FOREVER` without one.
 
         And the `step` of the last message before it.
         """
-        topic, number, last = self._topic(phase, name), 0, 0
-        lost = self.recording.lost.get(topic.name)
+        number, last = 0, 0
+        lost = self.recording.lost.get(table.topic.name)
         if self._is_fixed and not lost:
             return FOREVER, 0
-        for rows in self.recording.rows(topic.name):
-            numbers = rows[schema.NUMBERED_BY[topic.message]]
+        for rows in self.recording.rows(table):
+            numbers = rows[schema.NUMBERED_BY[table.topic.message]]
             after = np.flatnonzero(numbers != number + np.arange(len(rows)))
             before = rows[: after[0]] if after.size else rows
             number, last = number + len(before), int(before["step"][-1]) if len(before) else last
@@ -123,30 +122,30 @@ class Source:
         maker = self.recording.maker
         if self.n == 1 and (maker is None or maker.kind != "vector"):
             return np.empty(0, np.int64)
-        blocks = self.recording.blocks(self._topic(phase, "step"), 0, self.stops[phase])
+        blocks = self.recording.phase(phase).steps.blocks(0, self.stops[phase])
         parts = [block["step"][block["t"] == schema.RESET_ONLY] for block in blocks]
         return np.concatenate([np.empty(0, np.int64), *parts])
 
     def _times(self, phase: str) -> NDArray[np.int64]:
         if self._is_fixed:
             return np.empty(0, np.int64)
-        steps = self.recording.decoded(self._topic(phase, "step"))
+        steps = self.recording.phase(phase).steps.decoded()
         return np.array([step["log_time"] for step in steps], np.int64)[: self.stops[phase]]
 
     def _units(self, phase: str) -> NDArray[np.void]:
         """Return the units of a phase, ordered by environment, without key and new numbers."""
-        topic, stop = self._topic(phase, "reset"), self.stops[phase]
+        table, stop = self.recording.phase(phase).resets, self.stops[phase]
         if self._is_fixed:
             dtype = np.dtype([(name, "i8") for name in _RESET])
             parts = [np.empty(0, dtype)]
-            for block in self.recording.blocks(topic):
+            for block in table.blocks():
                 part = np.empty(len(block), dtype)
                 for name in _RESET:
                     part[name] = block[name]
                 parts.append(part)
             resets = np.concatenate(parts)
         else:
-            rows = [tuple(each[name] for name in _RESET) for each in self.recording.decoded(topic)]
+            rows = [tuple(each[name] for name in _RESET) for each in table.decoded()]
             resets = np.array(rows, [(name, "i8") for name in _RESET])
         resets = resets[(resets["step"] <= stop) & (resets["environment"] < self.n)]
         resets = resets[np.lexsort((resets["reset"], resets["environment"]))]
@@ -172,41 +171,39 @@ class Source:
         time = position * STEP_NANOSECONDS + 1
         if not self._is_fixed:
             return int(np.searchsorted(self.times[phase], time))
-        first = self.recording.first_from(self._topic(phase, "step"), "log_time", time)
+        first = self.recording.phase(phase).steps.first_from("log_time", time)
         return min(first, self.stops[phase])
 
     # --- what a unit holds, read in the order of the run ----------------------------------------------
 
     def reset(self, phase: str, unit: np.void) -> np.void | Message:
         """Return the reset of a unit."""
-        topic, number = self._topic(phase, "reset"), int(unit["reset"])
+        table, number = self.recording.phase(phase).resets, int(unit["reset"])
         if self._is_fixed:
-            record: np.void = next(self.recording.blocks(topic, number, number + 1))[0]
+            record: np.void = next(table.blocks(number, number + 1))[0]
             return record
-        return next(self._stream(f"/{phase}/reset"))
+        return next(self._stream(table))
 
     def steps(self, phase: str, unit: np.void) -> Iterator[tuple[Records | list[Message], Ints]]:
         """Yield the steps of a unit in pieces, with their numbers in the phase of its process."""
-        first, stop = int(unit["first"]), int(unit["stop"])
+        table, first, stop = self.recording.phase(phase).steps, int(unit["first"]), int(unit["stop"])
         if first >= stop:
             return
         if not self._is_fixed:
-            stream = self._stream(f"/{phase}/step")
+            stream = self._stream(table)
             for begin in range(first, stop, 1024):
                 numbers = np.arange(begin, min(begin + 1024, stop))
                 yield [next(stream) for _ in numbers], numbers
             return
-        for block in self.recording.blocks(self._topic(phase, "step"), first, stop):
+        for block in table.blocks(first, stop):
             rows = block[(first - int(block["step"][0])) % self.n :: self.n]
             rows = rows[rows["t"] != schema.RESET_ONLY]
             if len(rows):
                 yield rows, rows["step"].astype(np.int64)
 
-    def _stream(self, name: str) -> Iterator[Message]:
+    def _stream(self, table: TopicChunks) -> Iterator[Message]:
         """Return the messages of a topic of varying size; units of one environment come in their order."""
-        if name not in self._messages:
-            self._messages[name] = self.recording.decoded(self.recording.topic(name))
-        return self._messages[name]
+        return self._messages.setdefault(table, table.decoded())
 
     # --- where messages go ----------------------------------------------------------------------------
 
@@ -257,9 +254,7 @@ def open_sources(run: Run, stack: ExitStack) -> tuple[list[Source], dict[str, st
         if sources and (other := _difference(recording, sources[0].recording)):
             left_out[name] = other
             continue
-        if name and not any(
-            recording.has_messages(topic.name) for topic in recording.topics if topic.digested
-        ):
+        if name and not any(recording.table(topic) for topic in recording.topics if topic.digested):
             if any(stated.values()):
                 left_out[name] = f"found no messages, expected {sum(stated.values()):,}."
             continue

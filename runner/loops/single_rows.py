@@ -38,8 +38,8 @@ class BlockRows(Rows):
     _scratch: NDArray[np.void] = np.zeros(0, "V1")
 
     def _open_steps(self) -> tuple[int, int]:
-        self._block = self._recorder.block(self._steps)
-        self._reset_block = self._recorder.block(self._resets)
+        self._block = self._recorder.block(self._topics.steps)
+        self._reset_block = self._recorder.block(self._topics.resets)
         room = len(self._block)
         if len(self._scratch) < room:
             self._scratch = np.zeros(room, self._scratch_dtype)
@@ -53,7 +53,7 @@ class BlockRows(Rows):
         block["step"] = self._recorder.steps[self._phase] + np.arange(n)
         block["episode"] = episode
         block["t"] = t
-        self._recorder.take(self._steps, np.arange(before + 1, before + n + 1, dtype=np.uint64))
+        self._recorder.take(self._topics.steps, np.arange(before + 1, before + n + 1, dtype=np.uint64))
 
 
 class DiscreteRows(BlockRows):
@@ -281,8 +281,8 @@ class VariableRows(Rows):
     def _put_message(self, fields: Json) -> None:
         """Record a step, given by its fields but its number and that of its episode."""
         fields |= {"step": self.place[0], "episode": self._begun - (not self._fresh)}
-        position = sum(self._recorder.steps.values()) + self.filled + 1
-        self._recorder.append(self._steps, encode(schema.TRANSITION, fields), position)
+        position = self._recorder.position + self.filled + 1
+        self._recorder.append(self._topics.steps, encode(schema.TRANSITION, fields), position)
         self._t, ends = fields["t"], (fields["terminated"], fields["truncated"])
         self._scratch[self.filled] = (fields["rewards"][0], *ends)
         self._count(any(ends))
@@ -294,8 +294,8 @@ class VariableRows(Rows):
     def _put_reset_message(self, fields: Json) -> None:
         """Record a reset, given by its fields but the numbers of reset, episode and step."""
         fields |= {"reset": self.resets, "episode": self._begun, "step": self.place[0]}
-        position = sum(self._recorder.steps.values()) + self.filled
-        self._recorder.append(self._resets, encode(schema.RESET, fields), position)
+        position = self._recorder.position + self.filled
+        self._recorder.append(self._topics.resets, encode(schema.RESET, fields), position)
 
     def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
         """Do nothing: the messages are complete."""

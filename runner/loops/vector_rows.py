@@ -64,10 +64,7 @@ class VectorRows:
         next_step: bool,
     ) -> None:
         self._recorder, self._phase, self._first_action = recorder, phase, first_action
-        topics = {topic.name: topic for topic in schema.KINDS[described.kind]}
-        self._steps, self._episodes, self._resets, self._reset_states = (
-            topics[f"/{phase}/{name}"] for name in ("step", "episode", "reset", "reset_state")
-        )
+        self._topics = schema.topics_of(described.kind, phase)
         self._discrete = described.kind == "step"
         self._next_step = next_step
         self._state_start, self._action_start = (
@@ -78,7 +75,7 @@ class VectorRows:
         self._n = n
         self._log = EpisodeLog(n, 1, None)
         self._reset_count = 0
-        self._observation_dtype = recorder.dtype(self._resets)["observation"]
+        self._observation_dtype = recorder.dtype(self._topics.resets)["observation"]
         self._current = np.zeros(n, self._observation_dtype)
         """The observations before the first row of the block."""
         self._room = 0
@@ -109,9 +106,9 @@ class VectorRows:
     def _make_room(self) -> None:
         """Allocate the block; the dtype of actions is known."""
         n = self._n
-        rows = max(1, min(_MAX_STEPS, self._recorder.capacity(self._steps) // n))
+        rows = max(1, min(_MAX_STEPS, self._recorder.capacity(self._topics.steps) // n))
         self._room = rows
-        records = self._recorder.dtype(self._steps)
+        records = self._recorder.dtype(self._topics.steps)
         action = self._action_leaves[0].base if self._discrete else records["action"]
         self._actions = np.empty((rows, n), action)
         self._observations = np.empty((rows, n), self._observation_dtype)
@@ -317,7 +314,7 @@ class VectorRows:
             columns["acted"] = np.ones((rows, n), np.uint32)
             columns["agents_terminated"], columns["agents_truncated"] = terminated, truncated
         flat = {name: values.reshape(rows * n, *values.shape[2:]) for name, values in columns.items()}
-        self._record(self._steps, flat, first + np.arange(1, rows * n + 1))
+        self._record(self._topics.steps, flat, first + np.arange(1, rows * n + 1))
 
     def _put_block_resets(self, episode: Ints, only_reset: Flags, first: int) -> None:
         """Record the resets between and within the steps of the block, in their order.
@@ -347,7 +344,7 @@ class VectorRows:
 
     def _put_ends(self, ended: Columns) -> None:
         """Record the ends of episodes, in the order in which they ended."""
-        self._record(self._episodes, ended, ended["last_step"] + 1)
+        self._record(self._topics.episodes, ended, ended["last_step"] + 1)
 
     def _put_resets(
         self,
@@ -369,17 +366,17 @@ class VectorRows:
             "seed": np.array([seed or 0 for seed in valid], np.uint64),
             "seeded": np.array([seed is not None for seed in valid], np.bool_),
         }
-        self._record(self._resets, columns, steps)
-        other = sum(self._recorder.steps.values()) - self._recorder.steps[self._phase]
+        self._record(self._topics.resets, columns, steps)
+        other = self._recorder.position - self._recorder.steps[self._phase]
         for k, state in enumerate(states):
             if state is not None:
                 payload = state._replace(reset=self._reset_count + k).to_payload()
-                self._recorder.append(self._reset_states, payload, other + int(steps[k]))
+                self._recorder.append(self._topics.reset_states, payload, other + int(steps[k]))
         self._reset_count += len(which)
 
     def _record(self, topic: Topic, columns: Columns, steps: Array) -> None:
         """Hand records, given by field, to the recorder; `steps` are the steps of the phase at each."""
-        other = sum(self._recorder.steps.values()) - self._recorder.steps[self._phase]
+        other = self._recorder.position - self._recorder.steps[self._phase]
         self._recorder.put(topic, columns, steps + other)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from runner.recording import schema
-from runner.recording.actions import ACTION_TOPICS, EpisodeDigests, Rows, after_step, kept_dtype, packed
+from runner.recording.actions import EpisodeDigests, Rows, after_step, kept_dtype, packed
 from runner.recording.messages import encode
 from runner.recording.recorder import BLOCK_BYTES, Recorder
 from runner.recording.schema import RESET_ONLY, Topic
@@ -26,7 +26,7 @@ class ActionRecorder:
 
     def take_records(self, topic: Topic, records: Rows) -> None:
         """Take the steps among the records that the recorder gets."""
-        if topic.name not in ACTION_TOPICS:
+        if topic.message not in schema.STEP_MESSAGES:
             return
         if topic.phase != self._phase:
             self.commit()
@@ -57,5 +57,5 @@ class ActionRecorder:
         if self._rows:
             rows, self._rows = np.concatenate(self._rows), []
             position = int(rows["log_time"][-1]) // schema.STEP_NANOSECONDS
-            topic = ACTION_TOPICS[f"/{self._phase}/step"]
+            topic = schema.topics_of("step", self._phase).actions
             self._recorder.append(topic, encode(schema.ACTIONS, packed(rows, self._n)), position)

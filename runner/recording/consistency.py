@@ -67,7 +67,7 @@ def check_extras(recording: Recording, phase: str, complete: bool, on_block: OnB
         Inconsistent: one does not.
     """
     extras, last = recording.extras(phase), -1
-    steps, topic = recording.topic(f"/{phase}/step"), recording.topic(f"/{phase}/extra")
+    steps, topic = recording.phase(phase).steps, schema.topics_of(recording.kind, phase).extras
     # Steps of varying size are not looked up: their extras are only counted, and compared with one another.
     total = recording.step_count(phase) if extras else 0
     if recording.leaves_out_steps and not recording.has_actions_of(phase):
@@ -82,8 +82,8 @@ def check_extras(recording: Recording, phase: str, complete: bool, on_block: OnB
             given, values = block["given"][name], block["values"][name].reshape(len(block), -1)
             if (given.view(np.uint8) > 1).any() or values[~given].any():
                 raise Inconsistent(f"{where}: {name}: found values where none were given")
-        if steps in recording.dtypes and recording.has_messages(steps.name):
-            parts = recording.blocks(steps, int(numbers[0]), last + 1)
+        if steps and steps.dtype is not None:
+            parts = steps.blocks(int(numbers[0]), last + 1)
             times = np.concatenate([part["log_time"][np.isin(part["step"], numbers)] for part in parts])
             if len(times) != len(block) or (times != block["log_time"]).any():
                 raise Inconsistent(f"{where}: found other times than those of the steps")
@@ -104,7 +104,7 @@ class _Phase:
         self._observed = np.full(n, -1, np.int64)
         """The state after that step, -1 before any."""
         self._findings = Findings()
-        self._has_states = recording.kind == "step"
+        self._has_states = recording.has_states
         self._start = least_number(recording.spaces["observation"]) if self._has_states else 0
         self._blocks = Blocks(recording, phase, complete, on_block)
 

@@ -205,18 +205,13 @@ class RunDescription(ABC):
         return self.kind == "job"
 
     @property
-    def has_spaces(self) -> bool:
-        """Whether the spaces of the environment are described; else it has states and joint actions alone."""
-        return self.kind != "job"
+    def has_varying_values(self) -> bool:
+        """Whether observations or actions vary in size, so that steps are read one by one."""
+        return self.kind == "variable"
 
     @property
     def can_train_again(self) -> bool:
         """Whether training the configuration again gives the same content."""
-        return self.kind == "job"
-
-    @property
-    def is_job(self) -> bool:
-        """Whether the runner itself learned it, from a configuration; else it was recorded from a loop."""
         return self.kind == "job"
 
     def require_job(self, purpose: str, instead: str) -> None:
@@ -225,7 +220,7 @@ class RunDescription(ABC):
         Raises:
             RunnerError: it is one; `purpose` says what it cannot be used for, `instead` what can be done.
         """
-        if not self.is_job:
+        if not self.can_train_again:
             raise RunnerError(
                 f"{self.path}: was recorded from somebody's own loop, by {self.config.get('made_by')}; "
                 f"{purpose} is for runs that were trained here. {instead}"
@@ -327,7 +322,7 @@ class RunDescription(ABC):
     @cached_property
     def spaces(self) -> Json:
         """The descriptions of the `observation` and the `action` space; of a job those of its tables."""
-        if self.has_spaces:
+        if not self.can_train_again:
             return spaces_of(self.run, str(self.path))
         number = {"type": "Discrete", "start": 0, "dtype": "<i8", "shape": []}
         sizes = {"observation": self.mdp.states, "action": self.mdp.joint_actions}

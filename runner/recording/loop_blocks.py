@@ -12,6 +12,7 @@ from runner.recording import schema
 from runner.recording.episode_log import Flags
 from runner.recording.reader import Recording
 from runner.recording.schema import Topic
+from runner.recording.topic_chunks import TopicChunks
 from runner.util.arrays import Ints
 
 OnBlock = Callable[[Topic, NDArray[np.void]], None]
@@ -67,18 +68,18 @@ class Blocks:
     """
 
     def __init__(self, recording: Recording, phase: str, complete: bool, on_block: OnBlock) -> None:
-        self._recording, self._phase, self._complete = recording, phase, complete
+        self._recording, self._phase, self._complete = recording, recording.phase(phase), complete
         self._n = recording.environments
-        self._steps = records_of(recording, f"/{phase}/step", on_block)
-        self.resets = Queue(records_of(recording, f"/{phase}/reset", on_block))
-        self.episodes = Queue(records_of(recording, f"/{phase}/episode", on_block))
+        self.resets = Queue(records_of(recording, self._phase.resets, on_block))
+        self.episodes = Queue(records_of(recording, self._phase.episodes, on_block))
+        self._steps = records_of(recording, self._phase.steps, on_block)
         self.steps = 0
         """Steps in the blocks so far."""
 
     def __iter__(self) -> Iterator[Block]:
         stop = None
         if not self._complete:  # the number of the step after the last recorded reset
-            blocks = records_of(self._recording, f"/{self._phase}/reset")
+            blocks = records_of(self._recording, self._phase.resets)
             stop = max((int(block["step"][-1]) for block in blocks), default=0)
         left = 0
         for rows, waiting in aligned(self._steps, self._n, stop):
@@ -88,8 +89,8 @@ class Blocks:
                 self.steps += len(rows)
         if left and self._complete:
             raise Inconsistent(
-                f"/{self._phase}/step: found {self.steps + left} steps, expected as many of each of the "
-                f"{self._n} environments"
+                f"{self._phase.steps.topic.name}: found {self.steps + left} steps, expected as many of each "
+                f"of the {self._n} environments"
             )
 
     def _block(self, first: int, rows: NDArray[np.void]) -> Block:
@@ -103,7 +104,8 @@ class Blocks:
         if resets is not None and len(resets):
             step, environment = resets["step"], resets["environment"].astype(np.int64)
             if ((environment >= self._recording.own_environments) | (step % n != 0) | (step < first)).any():
-                raise Inconsistent(f"/{self._phase}/reset: found resets out of order, or of no environment")
+                where = self._phase.resets.topic.name
+                raise Inconsistent(f"{where}: found resets out of order, or of no environment")
             at = (step - first) // n, environment % n
         return Block(first, rows.reshape(-1, n), resets, at, is_over.reshape(-1, n))
 
@@ -116,14 +118,17 @@ def check_without_steps(recording: Recording, phase: str, on_block: OnBlock) -> 
     Raises:
         Inconsistent: they are not numbered consecutively.
     """
-    for name in ("reset", "episode"):
-        for _ in records_of(recording, f"/{phase}/{name}", on_block):
+    own = recording.phase(phase)
+    for table in (own.resets, own.episodes):
+        for _ in records_of(recording, table, on_block):
             pass
     expected = 0
     last = 0
     for rows in recording.actions(phase):
         if rows["step"][0] != expected or (np.diff(rows["log_time"].astype(np.int64)) <= 0).any():
-            raise Inconsistent(f"/{phase}/actions: found step {rows['step'][0]:,}, expected {expected:,}")
+            raise Inconsistent(
+                f"{own.actions.topic.name}: found step {rows['step'][0]:,}, expected {expected:,}"
+            )
         expected, last = expected + len(rows), int(rows["log_time"][-1])
     return last
 
@@ -175,22 +180,22 @@ class Queue:
 
 
 def records_of(
-    recording: Recording, name: str, on_block: OnBlock = lambda *_: None
+    recording: Recording, table: TopicChunks, on_block: OnBlock = lambda *_: None
 ) -> Iterator[NDArray[np.void]]:
     """Yield the records of a topic in blocks, as `Recording.rows` does.
 
     Raises:
         Inconsistent: messages are not numbered consecutively, or are of actions without their steps.
     """
-    topic, first = recording.topic(name), 0
+    topic, first = table.topic, 0
     number = schema.NUMBERED_BY[topic.message]
     if topic.message in schema.STEP_MESSAGES and recording.has_actions_alone(topic.phase):
-        raise Inconsistent(f"{name}: found actions alone, expected whole steps as in the configuration")
-    for block in recording.rows(name):
-        if topic in recording.dtypes:
+        raise Inconsistent(f"{topic.name}: found actions alone, expected whole steps as in the configuration")
+    for block in recording.rows(table):
+        if table.dtype is not None:
             on_block(topic, block)
         if (wrong := np.flatnonzero(block[number] != first + np.arange(len(block)))).size:
             found, expected = block[number][wrong[0]], first + wrong[0]
-            raise Inconsistent(f"{name}: found {number} {found}, expected {expected}")
+            raise Inconsistent(f"{topic.name}: found {number} {found}, expected {expected}")
         yield block
         first += len(block)

@@ -110,19 +110,18 @@ class Recording(RowReader):
         """
         if topic.message is schema.EXTRA:
             return self.extras(topic.phase).count
-        return self._chunks(topic).count()
+        return self.table(topic).count()
 
     def blocks_of_episodes(self, phase: str, start: int, stop: int | None) -> Iterator[NDArray[np.void]]:
         """Yield the steps of the episodes number `start` up to `stop`; None for all that follow."""
-        steps = self.topic(f"/{phase}/step")
-        end = None if stop is None else self.first_from(steps, "episode", stop)
-        return self.blocks(steps, self.first_from(steps, "episode", start), end)
+        steps = self.phase(phase).steps
+        end = None if stop is None else steps.first_from("episode", stop)
+        return steps.blocks(steps.first_from("episode", start), end)
 
     def episodes(self, phase: str, start: int = 0, stop: int | None = None) -> NDArray[np.void]:
         """Return the episode records of a phase (`train` or `eval`) as one array."""
-        topic = self.topic(f"/{phase}/episode")
-        blocks = list(self.blocks(topic, start, stop))
-        return np.concatenate(blocks) if blocks else np.empty(0, self.dtypes[topic])
+        episodes = self.phase(phase).episodes
+        return np.concatenate([np.empty(0, episodes.dtype), *episodes.blocks(start, stop)])
 
     def episode_span(self, phase: str, episode: int) -> range:
         """Return the numbers of the steps of one episode, also of one that never ended.
@@ -133,11 +132,10 @@ class Recording(RowReader):
         Raises:
             RecordingError: the recording has no such episode, or no steps.
         """
-        episodes = self.topic(f"/{phase}/episode")
-        stride, phase_name = self.environments, schema.PHASE_NAMES[phase]
-        total, ended = self.step_count(phase), self.count(episodes)
+        own, stride = self.phase(phase), self.environments
+        total, ended = self.step_count(phase), own.episodes.count()
         if not total:
-            raise RecordingError(f"{self.path}: has no {phase_name} steps.")
+            raise RecordingError(f"{self.path}: has no {own.title} steps.")
         start = 0
         stop = 0
         if 0 <= episode < ended and len(records := self.episodes(phase, episode, episode + 1)):
@@ -146,13 +144,12 @@ class Recording(RowReader):
         elif episode == ended and stride == 1:
             last = self.episodes(phase, ended - 1, ended)
             start, stop = int(last[0]["last_step"]) + 1 if len(last) else 0, total
-            steps = self.topic(f"/{phase}/step")
-            for first in self.blocks(steps, start, start + 1) if steps in self.dtypes else ():
+            for first in own.steps.blocks(start, start + 1) if own.steps.dtype is not None else ():
                 # A vector of one environment may have only reset it at first.
                 start += int(np.count_nonzero(first["t"] == schema.RESET_ONLY))
         if not 0 <= start < stop <= total:
             raise NotInRecording(
-                f"{self.path}: has no {phase_name} episode {episode:,}; there are {ended:,}, from 0."
+                f"{self.path}: has no {own.title} episode {episode:,}; there are {ended:,}, from 0."
             )
         return range(start, stop, stride)
 
@@ -162,16 +159,15 @@ class Recording(RowReader):
         Raises:
             RecordingError: the recording has no such episode or steps, or they are too large for an array.
         """
-        span, topic = self.episode_span(phase, episode), self.topic(f"/{phase}/step")
-        phase_name = schema.PHASE_NAMES[phase]
-        if (span.stop - span.start) * self.dtypes[topic].itemsize > MAX_EPISODE_BYTES:
+        span, own = self.episode_span(phase, episode), self.phase(phase)
+        if (span.stop - span.start) * self.dtypes[own.steps.topic].itemsize > MAX_EPISODE_BYTES:
             raise RecordingError(
-                f"{self.path}: {phase_name} episode {episode} has {span.stop - span.start:,} steps, too many "
+                f"{self.path}: {own.title} episode {episode} has {span.stop - span.start:,} steps, too many "
                 f"for an array; read them in blocks, from {span.start}."
             )
-        blocks = list(self.blocks(topic, span.start, span.stop))
+        blocks = list(own.steps.blocks(span.start, span.stop))
         if not blocks:
-            raise RecordingError(f"{self.path}: the steps of {phase_name} episode {episode} were lost.")
+            raise RecordingError(f"{self.path}: the steps of {own.title} episode {episode} were lost.")
         return np.concatenate(blocks)[:: span.step]
 
     def extras(self, phase: str) -> Extras:
@@ -182,10 +178,10 @@ class Recording(RowReader):
         Raises:
             RecordingError: they are damaged.
         """
-        places, start_times = np.empty(0, np.intp), np.empty(0, np.uint64)
-        topic = schema.TRAIN_EXTRA if phase == "train" else schema.EVAL_EXTRA
+        start_times = np.empty(0, np.uint64)
+        topic = schema.topics_of(self.kind, phase).extras
         layouts: list[ExtraLayout] = []
-        if not self.is_job and len(places := self._chunk_numbers[topic]):
+        if len(places := self._chunk_numbers[topic]):
             layouts = self.extra_layouts
             start_times = self._index.chunks.columns["start_time"][places]
         # As Python's numbers: a forged chunk may begin at any time
@@ -225,12 +221,11 @@ class Recording(RowReader):
         Those of the kind `step` have `state`, `action` and `next_state`, counted from 0. They are NumPy
         records where values have one size (`blocks` yields many at once), else dictionaries.
         """
-        topic = self.topic(f"/{phase}/step")
-        yield from self._values(topic, action="action", next_observation="observation")
+        yield from self._values(self.phase(phase).steps, action="action", next_observation="observation")
 
     def resets(self, phase: str) -> Iterator[Any]:
         """Yield the resets of a phase one by one, as `transitions` yields steps."""
-        yield from self._values(self.topic(f"/{phase}/reset"), observation="observation")
+        yield from self._values(self.phase(phase).resets, observation="observation")
 
     def reset_states(self, phase: str, times: range | None = None) -> Iterator[ResetState]:
         """Yield what resets of a loop's phase without a seed depend on, in the order of the resets.
@@ -240,19 +235,17 @@ class Recording(RowReader):
         Raises:
             RecordingError: one is damaged.
         """
-        if not self.is_job:
-            topic = self.topic(f"/{phase}/reset_state")
-            for _, state in self._parsed(topic, decode_reset_state, times=times):
-                yield state
+        for _, state in self.phase(phase).reset_states.parsed(decode_reset_state, times=times):
+            yield state
 
-    def _values(self, topic: Topic, **spaces: str) -> Iterator[Any]:
-        """Yield a topic's messages one by one; `spaces` names the space of each field that is a value."""
-        if topic in self.dtypes:
-            for block in self.blocks(topic):
+    def _values(self, table: TopicChunks, **spaces: str) -> Iterator[Any]:
+        """Yield messages one by one; `spaces` names the space of each field that is a value."""
+        if table.dtype is not None:
+            for block in table.blocks():
                 yield from block
             return
-        for fields in self.decoded(topic):
-            where = f"{self.path}: {topic.name} at {fields['log_time']} ns"
+        for fields in table.decoded():
+            where = f"{self.path}: {table.topic.name} at {fields['log_time']} ns"
             for name, space in spaces.items():
                 fields[name] = decode_value(self.spaces[space], fields[name], where)
             if "rewards" in fields:
@@ -261,7 +254,7 @@ class Recording(RowReader):
 
     def arrays(self) -> Iterator[Snapshot]:
         """Yield the arrays that a loop recorded by `snapshot`, in order."""
-        return (array for _, array in self._parsed(schema.ARRAY_TOPIC, decode_array))
+        return (array for _, array in self.table(schema.ARRAY_TOPIC).parsed(decode_array))
 
     def metrics(self, phase: str) -> list[Message]:
         """Return the metrics of a phase, in order.
@@ -286,8 +279,7 @@ class Recording(RowReader):
         """
         if phase not in schema.PHASES:
             raise ValueError(f"found phase {phase!r}, expected one of: {', '.join(schema.PHASES)}.")
-        topic = schema.TRAIN_METRICS_TOPIC if phase == "train" else schema.EVAL_METRICS_TOPIC
-        yield from self._measures(topic)
+        yield from self._measures(self.phase(phase).metrics.topic)
 
     def optimality(self) -> Iterator[Message]:
         """Yield the exact measures of the evaluations, in order; none unless `evaluation.exact` was set."""
@@ -312,7 +304,7 @@ class Recording(RowReader):
                 what else their algorithm keeps.
         """
         learners = len(self.agents)
-        first, chunks = 0, range(len(self._chunks(schema.Q_TABLE_TOPIC)))
+        first, chunks = 0, range(len(self.table(schema.Q_TABLE_TOPIC)))
         if step:
             after = bisect_right(chunks, step, key=lambda k: next(self._snapshots(k)).step)
             first = max(0, after - 2 * (tables or learners))
@@ -321,4 +313,4 @@ class Recording(RowReader):
                 yield snapshot
 
     def _snapshots(self, first_chunk: int) -> Iterator[QTable]:
-        return (table for _, table in self._parsed(schema.Q_TABLE_TOPIC, decode_q_table, first_chunk))
+        return (table for _, table in self.table(schema.Q_TABLE_TOPIC).parsed(decode_q_table, first_chunk))

@@ -163,6 +163,11 @@ class Recorder:
                     self._send_block(lane)
                 self._lanes[topic] = self._lane(topic, own, lane.write)
 
+    @property
+    def position(self) -> int:
+        """The number of steps executed so far."""
+        return sum(self.steps.values())
+
     def release(self) -> None:
         """Write what was held back, and hold nothing back from now on."""
         self._pipeline.release()
@@ -218,9 +223,9 @@ class Recorder:
         """
         self._pipeline.raise_failure()
         step_topic, episode_topic = schema.PHASES[phase]
-        other = self.steps["eval" if phase == "train" else "train"]
+        other = self.position - self.steps[phase]
         if steps:
-            first = self.steps[phase] + other + 1
+            first = self.position + 1
             self.take(step_topic, np.arange(first, first + steps, dtype=np.uint64))
             self.steps[phase] += steps
         if episodes:
@@ -241,7 +246,7 @@ class Recorder:
         Returns whether it is new: not in the recording already.
         """
         self._pipeline.raise_failure()
-        log_time = sum(self.steps.values()) * STEP_NANOSECONDS
+        log_time = self.position * STEP_NANOSECONDS
         self.counts[topic.name] += 1
         is_recorded = self._reference.compare_message(topic, log_time, payload)
         records = memoryview(message_record(topic, log_time, payload))
@@ -331,7 +336,7 @@ class Recorder:
         messages = [] if self._observer is None else self._observer.take(is_last)
         if watch.begin() or is_last or watch.is_due():
             messages.append((schema.CLOCK_TOPIC, watch.sample()))
-        position = sum(self.steps.values()) * STEP_NANOSECONDS
+        position = self.position * STEP_NANOSECONDS
         for topic, message in messages:
             self._batches.extend(topic, [position], [message])
 

@@ -36,7 +36,7 @@ class PackedChunks:
         try:
             steps = recording.count(schema.TRAIN_STEP)
             for topic in schema.BLOCK_TOPICS:
-                recording.chunk_holding(topic, 0)
+                recording.table(topic).holding(0)
             after = [block["log_time"][0] for block in recording.blocks(schema.TRAIN_STEP, step, step + 1)]
         except (RecordingError, OSError):
             return None
@@ -44,7 +44,7 @@ class PackedChunks:
 
     def span(self, topic: Topic, number: int) -> ChunkSpan | None:
         """Return the chunk that holds a message of a fixed-width topic; None if there is none to use."""
-        span = self.recording.chunk_holding(topic, number)
+        span = self.recording.table(topic).holding(number)
         return None if span is None or span.entry.end_time >= self.until else span
 
     def data(self, entry: ChunkEntry, compression: str, records: bytes | memoryview) -> memoryview | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -13,8 +12,8 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.actions import kept_dtype, unpacked
 from runner.recording.blocks import topic_dtype
-from runner.recording.messages import Message, decode
-from runner.recording.schema import Topic
+from runner.recording.messages import Message
+from runner.recording.topic_chunks import TopicChunks
 from runner.recording.topic_reader import TopicReader
 
 FOREVER: Final = 2**63 - 1
@@ -31,7 +30,7 @@ class RowReader(TopicReader):
     @property
     def has_steps(self) -> bool:
         """Whether any whole step was recorded."""
-        return any(self.has_messages(f"/{phase}/step") for phase in schema.PHASES)
+        return any(self.phase(phase).steps for phase in schema.PHASES)
 
     @property
     def has_actions(self) -> bool:
@@ -40,23 +39,18 @@ class RowReader(TopicReader):
 
     def has_actions_of(self, phase: str) -> bool:
         """Return whether any action of a phase was recorded."""
-        return self.has_messages(f"/{phase}/step") or self.has_actions_alone(phase)
+        return bool(self.phase(phase).steps) or self.has_actions_alone(phase)
 
     def has_actions_alone(self, phase: str) -> bool:
         """Return whether actions of a phase were recorded without their steps."""
-        name = f"/{phase}/actions"
-        return name in self._topics_by_name and self.has_messages(name)
+        return bool(self.phase(phase).actions)
 
     def step_count(self, phase: str) -> int:
         """Return how many steps of a phase were recorded, whole or their actions alone."""
         if not self.has_actions_alone(phase):
-            return self._chunks(self.topic(f"/{phase}/step")).count()
-        topic = self.topic(f"/{phase}/actions")
-        last = len(self._chunks(topic)) - 1
-        return max(
-            int(one["step"] + one["count"])
-            for _, one in self._parsed(topic, partial(decode, topic.message), last)
-        )
+            return self.phase(phase).steps.count()
+        actions = self.phase(phase).actions
+        return max(int(one["step"] + one["count"]) for one in actions.decoded(first_chunk=len(actions) - 1))
 
     def actions(self, phase: str, times: range | None = None) -> Iterator[NDArray[np.void]]:
         """Yield the steps of a loop's phase of which only the actions were recorded, in blocks.
@@ -66,10 +60,10 @@ class RowReader(TopicReader):
         Raises:
             RecordingError: they are damaged.
         """
-        topic = self.topic(f"/{phase}/actions")
-        dtype, where = self.row_dtype(f"/{phase}/step"), f"{self.path}: {topic.name}"
+        own = self.phase(phase)
+        dtype, where = self.row_dtype(own.steps), f"{self.path}: {own.actions.topic.name}"
         # A message has the time of its last step.
-        for fields in self.decoded(topic, times=times and range(times.start, FOREVER)):
+        for fields in own.actions.decoded(times=times and range(times.start, FOREVER)):
             block = unpacked(fields, dtype, self.environments, where)
             if times is not None:
                 if block["log_time"][0] >= times.stop:
@@ -77,47 +71,46 @@ class RowReader(TopicReader):
                 block = block[(block["log_time"] >= times.start) & (block["log_time"] < times.stop)]
             yield block
 
-    def rows(self, name: str, times: range | None = None) -> Iterator[NDArray[np.void]]:
+    def rows(self, table: TopicChunks, times: range | None = None) -> Iterator[NDArray[np.void]]:
         """Yield the steps, resets or episodes of a loop as records in blocks, however they are recorded.
 
         Values of varying size are objects: the bytes that `spaces.decode` takes. Steps whose actions alone
         were recorded have the fields of `kept_dtype`.
 
         Args:
-            name: of the topic.
+            table: the steps, resets or episodes of a phase.
             times: their `log_time` in ns, from the first to before the last; None for all.
 
         Raises:
             RecordingError: they are damaged.
         """
-        topic = self.topic(name)
-        if topic.message in schema.STEP_MESSAGES and self.has_actions_alone(topic.phase):
-            yield from self.actions(topic.phase, times)
-        elif topic not in self.dtypes:
-            yield from self._decoded_rows(topic, times)
-        elif times is None:
-            yield from self.blocks(topic)
+        if self._are_alone(table):
+            yield from self.actions(table.topic.phase, times)
+        elif table.dtype is None:
+            yield from self._decoded_rows(table, times)
         else:
-            yield from self.blocks_between(topic, times.start, times.stop)
+            yield from table.blocks() if times is None else table.blocks_between(times)
 
-    def row_dtype(self, name: str) -> np.dtype[np.void]:
+    def row_dtype(self, table: TopicChunks) -> np.dtype[np.void]:
         """Return the dtype of `rows`."""
-        topic = self.topic(name)
-        if topic not in self.dtypes:
-            return topic_dtype(topic, len(self.agents), 0, _OBJECT, _OBJECT)
-        is_alone = topic.message in schema.STEP_MESSAGES and self.has_actions_alone(topic.phase)
-        return kept_dtype(self.dtypes[topic]) if is_alone else self.dtypes[topic]
+        if table.dtype is None:
+            return topic_dtype(table.topic, len(self.agents), 0, _OBJECT, _OBJECT)
+        return kept_dtype(table.dtype) if self._are_alone(table) else table.dtype
 
-    def _decoded_rows(self, topic: Topic, times: range | None) -> Iterator[NDArray[np.void]]:
+    def _are_alone(self, table: TopicChunks) -> bool:
+        """Return whether a table holds steps, of which only the actions were recorded."""
+        return table.topic.message in schema.STEP_MESSAGES and self.has_actions_alone(table.topic.phase)
+
+    def _decoded_rows(self, table: TopicChunks, times: range | None) -> Iterator[NDArray[np.void]]:
         """Yield messages of varying size as records, their values of spaces as bytes."""
-        learners, number = len(self.agents), schema.NUMBERED_BY[topic.message]
-        dtype, size = self.row_dtype(topic.name), 0
+        learners, number = len(self.agents), schema.NUMBERED_BY[table.topic.message]
+        dtype, size = self.row_dtype(table), 0
         messages: list[Message] = []
-        for message in self.decoded(topic, times=times):
+        for message in table.decoded(times=times):
             if len(rewards := message.get("rewards", [0.0] * learners)) != learners:
                 raise RecordingError(
-                    f"{self.path}: {topic.name}, {number} {message[number]}: found {len(rewards)} rewards, "
-                    f"expected {learners}."
+                    f"{self.path}: {table.topic.name}, {number} {message[number]}: found {len(rewards)} "
+                    f"rewards, expected {learners}."
                 )
             messages.append(message)
             size += sum(len(value) for value in message.values() if isinstance(value, bytes))
@@ -126,10 +119,6 @@ class RowReader(TopicReader):
                 messages, size = [], 0
         if messages:
             yield _records_of(messages, dtype)
-
-    def has_messages(self, name: str) -> bool:
-        """Return whether the topic of that name has any message."""
-        return len(self._chunks(self.topic(name))) > 0
 
     def whole_steps(self, phase: str) -> int:
         """Return how many steps of a loop's phase are known to have their resets.
@@ -140,14 +129,13 @@ class RowReader(TopicReader):
         n, total = self.environments, self.step_count(phase)
         if "content_digest" in self.result:
             return total
-        name = f"/{phase}/reset"
-        chunks, last = self._chunks(self.topic(name)), None
-        start = chunks.entry(len(chunks) - 1).start_time if len(chunks) else FOREVER
-        for resets in self.rows(name, range(start, FOREVER)):
+        own, last = self.phase(phase), None
+        start = own.resets.entry(len(own.resets) - 1).start_time if own.resets else FOREVER
+        for resets in self.rows(own.resets, range(start, FOREVER)):
             last = resets[-1]
         if last is None:
             return 0
-        for block in self.rows(f"/{phase}/step", range(int(last["log_time"]), FOREVER)):
+        for block in self.rows(own.steps, range(int(last["log_time"]), FOREVER)):
             over = (block["terminated"] | block["truncated"]) & (block["step"] >= last["step"])
             if over.any():
                 return min(int(block["step"][np.argmax(over)]) // n * n + n, total // n * n)
@@ -158,8 +146,8 @@ class RowReader(TopicReader):
         """The `log_time` of the last step in a recording that was cut: later resets lost their steps."""
         if "content_digest" in self.result or any(map(self.has_actions_alone, schema.PHASES)):
             return FOREVER
-        chunks = [self._chunks(self.topic(f"/{phase}/step")) for phase in schema.PHASES]
-        return max((own.entry(len(own) - 1).end_time for own in chunks if len(own)), default=0)
+        chunks = [self.phase(phase).steps for phase in schema.PHASES]
+        return max((own.entry(len(own) - 1).end_time for own in chunks if own), default=0)
 
 
 def _records_of(messages: Sequence[Message], dtype: np.dtype[np.void]) -> NDArray[np.void]:

@@ -6,6 +6,7 @@ Every message is protobuf; `blocks` defines how the most frequent ones are laid 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Final
 
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
@@ -426,6 +427,31 @@ PHASES: Final = {"train": (TRAIN_STEP, TRAIN_EPISODE), "eval": (EVAL_STEP, EVAL_
 """The step and the episode topic of each phase of a job."""
 PHASE_NAMES: Final = {"train": "training", "eval": "evaluation"}
 """The phases as texts name them."""
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseTopics:
+    """The topics of a phase; those that a kind of recording does not have are empty."""
+
+    steps: Topic
+    actions: Topic
+    episodes: Topic
+    resets: Topic
+    reset_states: Topic
+    infos: Topic
+    frames: Topic
+    extras: Topic
+    metrics: Topic
+
+
+@cache
+def topics_of(kind: str, phase: str) -> PhaseTopics:
+    """Return the topics of a phase in a kind of recording."""
+    every = (*KINDS["transition"], *KINDS["job"], *KINDS[kind])
+    own = {topic.name.rpartition("/")[2]: topic for topic in every if topic.phase == phase}
+    names = ("step", "actions", "episode", "reset", "reset_state", "info", "frame", "extra", "metrics")
+    return PhaseTopics(*(own[name] for name in names))
+
 
 NUMBERED_BY: Final = {STEP: "step", EPISODE: "episode", TRANSITION: "step", RESET: "reset"}
 """The field that numbers the messages of a fixed-width topic, from 0."""

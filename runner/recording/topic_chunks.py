@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property
-from typing import Final, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property, partial
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,13 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.index import ChunkEntry, ChunkTable, Index
+from runner.recording.messages import Message, decode
 from runner.recording.record_store import RecordStore
 from runner.recording.schema import ALL_TOPICS, EXTRA_TOPICS, STEP_NANOSECONDS, Topic
 
+M = TypeVar("M")
 _MANY: Final = 32
 """The least number of chunks of one size whose topic is inferred instead of unpacking them."""
 
@@ -138,11 +141,11 @@ class TopicChunks:
         lost: Sequence[Sequence[int]],
         path: str,
     ) -> None:
-        self._topic = topic
+        self.topic = topic
+        self.dtype = dtype
         self._places = places
         self._table = table
         self._store = store
-        self._dtype = dtype
         self._lost = lost
         self._path = path
         self._last: tuple[bytes, NDArray[np.void]] | None = None
@@ -157,7 +160,7 @@ class TopicChunks:
 
     def count(self) -> int:
         """Return the number after that of the last message; where messages vary in size, by reading them."""
-        if self._dtype is None:
+        if self.dtype is None:
             return sum(1 for _ in self.messages())
         _, ends = self._numbers
         return int(ends[-1]) if len(ends) else 0
@@ -169,7 +172,7 @@ class TopicChunks:
         is_held = k < len(ends) and firsts[k] <= number
         return ChunkSpan(int(firsts[k]), int(ends[k]), self.entry(k)) if is_held else None
 
-    def blocks(self, start: int, stop: int | None) -> Iterator[NDArray[np.void]]:
+    def blocks(self, start: int = 0, stop: int | None = None) -> Iterator[NDArray[np.void]]:
         """Yield the messages number `start` up to `stop`, a chunk at a time; they must have one size."""
         firsts, ends = self._numbers
         stop = int(ends[-1]) if stop is None and len(ends) else (stop or 0)
@@ -223,20 +226,57 @@ class TopicChunks:
                 opcode, length, channel, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, at)
                 end = at + RECORD_HEAD.size + length
                 whole = at + HEADER_BYTES <= end <= len(data)
-                if opcode != MESSAGE or not whole or channel != self._topic.channel:
-                    raise self._damaged(k, f"no message of {self._topic.name} at {at}")
+                if opcode != MESSAGE or not whole or channel != self.topic.channel:
+                    raise self._damaged(k, f"no message of {self.topic.name} at {at}")
                 if times is None or log_time in times:
                     yield log_time, data[at + HEADER_BYTES : end]
                 at = end
 
+    def decoded(
+        self, max_bytes: int = MAX_CHUNK_BYTES, times: range | None = None, first_chunk: int = 0
+    ) -> Iterator[Message]:
+        """Yield the messages of a topic of variable size: `log_time` and the fields, by name.
+
+        Args:
+            max_bytes: the largest message that is accepted.
+            times: in ns, from the first to before the last; None for all.
+
+        Raises:
+            RecordingError: one cannot be read, or has more than `max_bytes` bytes.
+        """
+        parse = partial(decode, self.topic.message)
+        for time, fields in self.parsed(parse, first_chunk, max_bytes, times):
+            yield {"log_time": time} | fields
+
+    def parsed(
+        self,
+        parse: Callable[[bytes], M],
+        first_chunk: int = 0,
+        max_bytes: int = MAX_CHUNK_BYTES,
+        times: range | None = None,
+    ) -> Iterator[tuple[int, M]]:
+        """Yield (log time in nanoseconds, parsed message) of the messages, in order.
+
+        Raises:
+            RecordingError: one cannot be parsed, or has more than `max_bytes` bytes; it is named.
+        """
+        for time, payload in self.messages(first_chunk, times):
+            try:
+                if len(payload) > max_bytes:
+                    raise RecordingError(f"found {len(payload):,} bytes, expected at most {max_bytes:,}.")
+                message = parse(payload)
+            except RecordingError as error:
+                raise RecordingError(f"{self._path}: {self.topic.name} at {time} ns: {error}") from error
+            yield time, message
+
     @cached_property
     def _numbers(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """The number of each chunk's first message, and the number after its last."""
-        if self._dtype is None:
+        if self.dtype is None and self:
             raise RecordingError(
-                f"{self._path}: the messages of {self._topic.name} vary in size; read them one by one."
+                f"{self._path}: the messages of {self.topic.name} vary in size; read them one by one."
             )
-        width = self._dtype.itemsize
+        width = 1 if self.dtype is None else self.dtype.itemsize
         sizes = np.empty(0, np.int64)
         if len(self):
             sizes = self._table.columns["uncompressed_size"][self._places].astype(np.int64)
@@ -254,14 +294,14 @@ class TopicChunks:
 
     def _block(self, k: int, data: bytes) -> NDArray[np.void]:
         """Return chunk number k as an array, after checking its constant bytes."""
-        assert self._dtype is not None
+        assert self.dtype is not None
         if self._last is not None and self._last[0] is data:
             return self._last[1]
-        block = np.frombuffer(data, dtype=self._dtype)
-        if (block["channel_id"] != self._topic.channel).any() or (
-            block["record_length"] != self._dtype.itemsize - RECORD_HEAD.size
+        block = np.frombuffer(data, dtype=self.dtype)
+        if (block["channel_id"] != self.topic.channel).any() or (
+            block["record_length"] != self.dtype.itemsize - RECORD_HEAD.size
         ).any():
-            raise self._damaged(k, f"other messages than of {self._topic.name}")
+            raise self._damaged(k, f"other messages than of {self.topic.name}")
         self._last = data, block
         return block
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Callable, Iterator, Mapping
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Final, Self, TypeVar
+from typing import Final, Self
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -18,14 +18,23 @@ from runner.errors import RecordingError
 from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.description import RunDescription
 from runner.recording.index import ChunkEntry, read_index
-from runner.recording.messages import Message, Scalars, decode, decode_scalars
+from runner.recording.messages import Message, Scalars, decode_scalars
 from runner.recording.metadata import check_file, dtypes_of
 from runner.recording.record_store import RecordStore
-from runner.recording.schema import SCALAR_TOPIC, Topic
-from runner.recording.topic_chunks import ChunkSpan, TopicChunks, chunks_by_topic
+from runner.recording.schema import PHASE_NAMES, SCALAR_TOPIC, PhaseTopics, Topic, topics_of
+from runner.recording.topic_chunks import TopicChunks, chunks_by_topic
 
-M = TypeVar("M")
 _MAX_SCALARS: Final = 8_192
+
+
+class Phase:
+    """A phase of an open recording: the messages of each of its topics."""
+
+    def __init__(self, name: str, topics: PhaseTopics, chunks: Callable[[Topic], TopicChunks]) -> None:
+        self.name, self.title = name, PHASE_NAMES[name]
+        self.steps, self.actions, self.episodes = map(chunks, (topics.steps, topics.actions, topics.episodes))
+        self.resets, self.reset_states = map(chunks, (topics.resets, topics.reset_states))
+        self.infos, self.frames, self.metrics = map(chunks, (topics.infos, topics.frames, topics.metrics))
 
 
 class TopicReader(RunDescription):
@@ -54,6 +63,7 @@ class TopicReader(RunDescription):
             self.close()
             raise
         self._topic_chunks: dict[Topic, TopicChunks] = {}
+        self._phases: dict[str, Phase] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -123,6 +133,12 @@ class TopicReader(RunDescription):
         """The dtype of each fixed-width topic's message records in this recording."""
         return dtypes_of(self.run, str(self.path))
 
+    def phase(self, name: str) -> Phase:
+        """Return a phase, `train` or `eval`."""
+        if name not in self._phases:
+            self._phases[name] = Phase(name, topics_of(self.kind, name), self.table)
+        return self._phases[name]
+
     def topic(self, name: str) -> Topic:
         """Return the topic of that name, such as `/train/step`.
 
@@ -139,22 +155,7 @@ class TopicReader(RunDescription):
         Each block is a read-only structured array with the fields of the message, and those of the MCAP
         record (`log_time` in nanoseconds, ...).
         """
-        return self._chunks(topic).blocks(start, stop)
-
-    def blocks_between(self, topic: Topic, start_time: int, stop_time: int) -> Iterator[NDArray[np.void]]:
-        """Yield the messages of a fixed-width topic logged from `start_time` up to `stop_time`, in ns."""
-        return self._chunks(topic).blocks_between(range(start_time, stop_time))
-
-    def first_from(self, topic: Topic, field: str, value: int) -> int:
-        """Return the number of a fixed-width topic's first message of that value or more.
-
-        The values of the field must never decrease.
-        """
-        return self._chunks(topic).first_from(field, value)
-
-    def chunk_holding(self, topic: Topic, number: int) -> ChunkSpan | None:
-        """Return the chunk that holds a message of a fixed-width topic; None if there is none."""
-        return self._chunks(topic).holding(number)
+        return self.table(topic).blocks(start, stop)
 
     def chunk_body(self, entry: ChunkEntry) -> memoryview:
         """Return the body of a chunk's record, still packed; safe to call from several threads.
@@ -166,24 +167,13 @@ class TopicReader(RunDescription):
 
     def messages(self, topic: Topic, first_chunk: int = 0) -> Iterator[tuple[int, bytes]]:
         """Yield (log time in nanoseconds, payload) of a topic's messages, in order."""
-        return self._chunks(topic).messages(first_chunk)
+        return self.table(topic).messages(first_chunk)
 
     def decoded(
         self, topic: Topic, max_bytes: int = MAX_CHUNK_BYTES, times: range | None = None
     ) -> Iterator[Message]:
-        """Yield the messages of a topic of variable size: `log_time` and the fields, by name.
-
-        Args:
-            topic: the topic.
-            max_bytes: the largest message that is accepted.
-            times: in ns, from the first to before the last; None for all.
-
-        Raises:
-            RecordingError: one cannot be read, or has more than `max_bytes` bytes.
-        """
-        parse = partial(decode, topic.message)
-        for time, fields in self._parsed(topic, parse, max_bytes=max_bytes, times=times):
-            yield {"log_time": time} | fields
+        """Yield the messages of a topic of variable size, as `TopicChunks.decoded` does."""
+        return self.table(topic).decoded(max_bytes, times)
 
     def scalars(self) -> Iterator[Scalars]:
         """Yield the values that a loop logged, thousands at a time, as columns.
@@ -191,7 +181,7 @@ class TopicReader(RunDescription):
         Raises:
             RecordingError: a message cannot be read.
         """
-        messages = self._parsed(SCALAR_TOPIC, bytes)
+        messages = self.table(SCALAR_TOPIC).parsed(bytes)
         while batch := list(islice(messages, _MAX_SCALARS)):
             try:
                 yield decode_scalars(batch)
@@ -200,30 +190,8 @@ class TopicReader(RunDescription):
                     pass
                 raise
 
-    def _parsed(
-        self,
-        topic: Topic,
-        parse: Callable[[bytes], M],
-        first_chunk: int = 0,
-        max_bytes: int = MAX_CHUNK_BYTES,
-        times: range | None = None,
-    ) -> Iterator[tuple[int, M]]:
-        """Yield (log time in nanoseconds, parsed message) of a topic's messages, in order.
-
-        Raises:
-            RecordingError: one cannot be parsed, or has more than `max_bytes` bytes; it is named.
-        """
-        for time, payload in self._chunks(topic).messages(first_chunk, times):
-            try:
-                if len(payload) > max_bytes:
-                    raise RecordingError(f"found {len(payload):,} bytes, expected at most {max_bytes:,}.")
-                message = parse(payload)
-            except RecordingError as error:
-                raise RecordingError(f"{self.path}: {topic.name} at {time} ns: {error}") from error
-            yield time, message
-
-    def _chunks(self, topic: Topic) -> TopicChunks:
-        """Return the chunks of a topic, or of this recording's own topic of that name: the kinds differ."""
+    def table(self, topic: Topic) -> TopicChunks:
+        """Return the messages of a topic, or of this recording's own topic of that name: the kinds differ."""
         own = self._topics_by_name.get(topic.name, topic)
         if own not in self._topic_chunks:
             self._topic_chunks[own] = TopicChunks(

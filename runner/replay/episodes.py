@@ -137,13 +137,13 @@ def _target(recording: Recording, phase: str, number: int) -> _Target:
 
 
 def _step_time(recording: Recording, phase: str, step: int) -> int:
-    topic = recording.topic(f"/{phase}/step")
-    if topic in recording.dtypes and not recording.has_actions_alone(phase):
-        blocks = recording.blocks(topic, step, step + 1)
+    steps = recording.phase(phase).steps
+    if steps.dtype is not None and not recording.has_actions_alone(phase):
+        blocks = steps.blocks(step, step + 1)
     else:
-        blocks = (block[block["step"] == step] for block in recording.rows(topic.name))
+        blocks = (block[block["step"] == step] for block in recording.rows(steps))
     if (time := next((int(block["log_time"][0]) for block in blocks if len(block)), None)) is None:
-        raise RecordingError(f"{recording.path}: {topic.name}: step {step:,} was lost.")
+        raise RecordingError(f"{recording.path}: {steps.topic.name}: step {step:,} was lost.")
     return time
 
 

@@ -117,7 +117,7 @@ def resets_of(
     names = ("reset", "environment", "episode", "step", "log_time", "seed", "seeded")
     rows = (
         row
-        for block in recording.rows(f"/{phase}/reset", times)
+        for block in recording.rows(recording.phase(phase).resets, times)
         for row in zip(*(block[name].tolist() for name in names), block["observation"], strict=True)
     )
     for row, options, large_seed in _with_extras(recording, phase, rows, times):
@@ -158,9 +158,7 @@ def _extras(
     recording: Recording, phase: str, times: range
 ) -> Iterator[tuple[int, int, dict[str, object] | None, int | None]]:
     """Yield time, step, options and large seed of calls of `reset` that had one of both."""
-    if not recording.has_messages(f"/{phase}/info"):
-        return
-    for info in recording.decoded(recording.topic(f"/{phase}/info"), times=times):
+    for info in recording.phase(phase).infos.decoded(times=times):
         if not info["reset"] or '"reset": {' not in info["json"]:
             continue
         try:
@@ -202,7 +200,7 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
     if "content_digest" not in recording.result:
         stop = recording.whole_steps(phase)
         rows = (whole for block in rows if len(whole := block[block["step"] < stop]))
-    nothing = np.empty(0, recording.row_dtype(f"/{phase}/step"))
+    nothing = np.empty(0, recording.row_dtype(recording.phase(phase).steps))
     for block in rows:
         first, time = int(block["step"][0]), int(block["log_time"][0]) - STEP_NANOSECONDS
         early = []
@@ -256,12 +254,11 @@ def _blocks(
     recording: Recording, phase: str, start_time: int, stop_time: int | None
 ) -> Iterator[NDArray[np.void]]:
     """Yield the steps of a phase in blocks, each without steps of the other phase in between."""
-    name = f"/{phase}/step"
-    topic, stop = recording.topic(name), FOREVER if stop_time is None else stop_time + 1
+    table, stop = recording.phase(phase).steps, FOREVER if stop_time is None else stop_time + 1
     # A block of actions alone may have more steps than fit into memory when they are whole.
-    width = recording.dtypes[topic].itemsize * recording.environments if topic in recording.dtypes else 1
+    width = 1 if table.dtype is None else table.dtype.itemsize * recording.environments
     rows = max(_BLOCK_BYTES // width, 1) * recording.environments
-    for block in recording.rows(name, range(start_time + 1, stop)):
+    for block in recording.rows(table, range(start_time + 1, stop)):
         others = block["log_time"].astype(np.int64) // STEP_NANOSECONDS - block["step"]
         changes = (np.flatnonzero(np.diff(others)) + 1).tolist()
         for begin, end in pairwise(sorted({*changes, *range(0, len(block), rows), len(block)})):
@@ -270,7 +267,7 @@ def _blocks(
 
 def ended_episode(recording: Recording, phase: str, environment: int, step: int) -> int | None:
     """Return the number of the episode that a step of an environment belongs to; None if it never ended."""
-    for block in recording.blocks(recording.topic(f"/{phase}/episode")):
+    for block in recording.phase(phase).episodes.blocks():
         own = (block["last_step"] >= step) & (block["last_step"] % recording.environments == environment)
         if own.any():
             return int(block["episode"][np.argmax(own)])

@@ -103,11 +103,9 @@ class Stepper(ABC):
         self._recording = recording
         self.observation_space, self.action_space = self._spaces()
         self._learners = len(recording.agents)
-        topics = [recording.topic(f"/train/{name}") for name in ("step", "reset")]
-        fields = "next_state" if recording.kind == "step" else "next_observation", "observation"
-        places, dtypes = zip(topics, fields, strict=True), recording.dtypes
-        varying = np.dtype(object)
-        self.dtypes = Dtypes(*(dtypes[topic][name] if topic in dtypes else varying for topic, name in places))
+        phase, after = recording.phase("train"), "next_state" if recording.has_states else "next_observation"
+        fields = (phase.steps.dtype, after), (phase.resets.dtype, "observation")
+        self.dtypes = Dtypes(*(np.dtype(object) if own is None else own[name] for own, name in fields))
 
     @abstractmethod
     def _spaces(self) -> tuple[Space, Space]:
@@ -251,7 +249,7 @@ class EnvironmentStepper(RowStepper):
         return self.env.observation_space, self.env.action_space
 
     def _filler(self, column: Array, is_first: bool = False) -> Put:
-        if self._recording.kind == "step":
+        if self._recording.has_states:
             # States are counted from 0, the first observations are as they came.
             start = 0 if is_first else int(self.observation_space.start)  # type: ignore[attr-defined]
 
@@ -262,7 +260,7 @@ class EnvironmentStepper(RowStepper):
 
             return put_state
         leaves = leaves_of(self.observation_space, "observation")
-        if self._recording.kind == "transition":
+        if not self._recording.has_varying_values:
             return filler(leaves, column)
 
         def put_bytes(row: int, observation: object) -> None:
@@ -272,10 +270,10 @@ class EnvironmentStepper(RowStepper):
 
     def actions(self, rows: NDArray[np.void]) -> Sequence[Value]:
         """Return the actions of recorded steps as the environment takes them."""
-        if self._recording.kind == "step":
+        if self._recording.has_states:
             start = int(self.action_space.start)  # type: ignore[attr-defined]
             return (rows["action"].astype(np.int64) + start).tolist()  # type: ignore[no-any-return]
-        if self._recording.kind == "transition":
+        if not self._recording.has_varying_values:
             return values_in(self.action_space, np.array(rows["action"]))
         description = self._recording.spaces["action"]
         where = f"{self._recording.path}: an action"

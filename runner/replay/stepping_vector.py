@@ -102,7 +102,7 @@ class VectorStepper(Stepper):
         return pictures[self._drawn]
 
     def _raw_actions(self, rows: NDArray[np.void]) -> Array:
-        if self._recording.kind != "step":
+        if not self._recording.has_states:
             return np.array(rows["action"])
         start = int(self.action_space.start)  # type: ignore[attr-defined]
         return np.asarray(rows["action"].astype(np.int64) + start)
@@ -148,7 +148,7 @@ class VectorStepper(Stepper):
         final = final_observations(infos) if self._autoreset == "SameStep" else None
         if final is not None and self._over.any():
             put_chosen(self._leaves, final, after, np.flatnonzero(self._over))
-        if self._recording.kind == "step":
+        if self._recording.has_states:
             after = after - int(self.observation_space.start)  # type: ignore[attr-defined]
         results.observations[rows] = after
         results.rewards[rows, 0] = rewards

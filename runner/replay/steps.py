@@ -41,7 +41,7 @@ def step_of_episode(recording: Recording, episode: int) -> int:
 
 def transitions_of(recording: Recording, phase: str, episode: int) -> Iterator[Any]:
     """Yield an episode's steps one by one, as `Recording.transitions` yields them; memory is bounded."""
-    if recording.topic(f"/{phase}/step") in recording.dtypes:
+    if recording.phase(phase).steps.dtype is not None:
         for block in episode_blocks(recording, phase, episode):
             yield from block
         return
@@ -55,12 +55,12 @@ def episode_blocks(recording: Recording, phase: str, episode: int) -> Iterator[N
     Raises:
         RecordingError: the recording has no such episode, or steps of it were lost.
     """
-    topic, numbers = recording.topic(f"/{phase}/step"), recording.episode_span(phase, episode)
+    numbers = recording.episode_span(phase, episode)
     if recording.has_actions_alone(phase):
         yield whole_steps(recording, phase, episode)
         return
     count = 0
-    for block in recording.blocks(topic, numbers.start, numbers.stop):
+    for block in recording.phase(phase).steps.blocks(numbers.start, numbers.stop):
         steps = block[(numbers.start - int(block["step"][0])) % numbers.step :: numbers.step]
         count += len(steps)
         yield steps
@@ -87,8 +87,8 @@ def reset_of(recording: Recording, phase: str, episode: int) -> Any | None:
 
     It is the last one of the episode's environment at or before its first step. None if it was lost.
     """
-    topic, numbers = recording.topic(f"/{phase}/reset"), recording.episode_span(phase, episode)
-    if topic not in recording.dtypes:
+    resets, numbers = recording.phase(phase).resets, recording.episode_span(phase, episode)
+    if resets.dtype is None:
         last = None
         for reset in recording.resets(phase):
             if reset["step"] > numbers.start:
@@ -96,11 +96,10 @@ def reset_of(recording: Recording, phase: str, episode: int) -> Any | None:
             last = reset
         return last
     first, stop = (
-        recording.first_from(topic, "step", number)
-        for number in (numbers.start - 2 * numbers.step, numbers.start + 1)
+        resets.first_from("step", number) for number in (numbers.start - 2 * numbers.step, numbers.start + 1)
     )
     latest = None
-    for block in recording.blocks(topic, first, stop):
+    for block in resets.blocks(first, stop):
         own = block[block["environment"] % numbers.step == numbers.start % numbers.step]
         latest = own[-1] if len(own) else latest
     return latest
@@ -124,10 +123,9 @@ def recorded_frames(recording: Recording, phase: str, episode: int, start: int =
     begin = (
         times[max(0, first - 1)] - n * schema.STEP_NANOSECONDS if reset is None else int(reset["log_time"])
     )
-    topic = recording.topic(f"/{phase}/frame")
     frames = (
         (int(frame["log_time"]), frame_place(frame)[1], frame)
-        for frame in recording.decoded(topic, times=range(max(0, begin), _END_OF_TIME))
+        for frame in recording.phase(phase).frames.decoded(times=range(max(0, begin), _END_OF_TIME))
         if frame_place(frame)[0] == span.start % n
     )
     shown, following = None, next(frames, None)
@@ -158,7 +156,7 @@ def frames_every(recording: Recording) -> int:
 
 def environments_with_frames(recording: Recording, phase: str) -> Sequence[int]:
     """Return the environments of which frames were recorded in a phase; of a job none."""
-    if recording.can_train_again or not recording.has_messages(f"/{phase}/frame"):
+    if not recording.phase(phase).frames:
         return ()
     frames = recording.config.get("frames")
     chosen = frames.get("environments") if isinstance(frames, Mapping) else None

@@ -27,7 +27,7 @@ def whole_steps(recording: Recording, phase: str, episode: int) -> NDArray[np.vo
         CannotRedo: the environment cannot be made, or is another one.
         RecordingError: actions of the episode were lost, or it is too long for an array.
     """
-    span, topic = recording.episode_span(phase, episode), recording.topic(f"/{phase}/step")
+    span, topic = recording.episode_span(phase, episode), recording.phase(phase).steps.topic
     if len(span) * recording.dtypes[topic].itemsize > MAX_EPISODE_BYTES:
         raise RecordingError(
             f"{recording.path}: {phase} episode {episode} has {len(span):,} steps, too many to rerun for "
@@ -48,7 +48,7 @@ def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> NDArray[np
         if not own or not np.array_equal(np.concatenate([part["step"] for part in own]), span):
             raise RecordingError(f"{path}: steps of {PHASE_NAMES[phase]} episode {episode:,} were lost.")
         records = blank_steps(recording, phase, np.concatenate(own))
-        is_state, start = recording.kind == "step", least_number(recording.spaces["observation"])
+        is_state, start = recording.has_states, least_number(recording.spaces["observation"])
     for steps in redo_in_child(path, phase, [episode]):
         fill_in(records, (steps.step - span.start) // span.step, steps)
         for first in steps.starts if is_state else ():
@@ -61,7 +61,7 @@ def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> NDArray[np
 
 def blank_steps(recording: Recording, phase: str, rows: NDArray[np.void]) -> NDArray[np.void]:
     """Return whole records of recorded actions, without states, observations and rewards."""
-    topic = recording.topic(f"/{phase}/step")
+    topic = recording.phase(phase).steps.topic
     records = blank_records(topic, recording.dtypes[topic], len(rows))
     for name in rows.dtype.names or ():
         if name != "digest":

@@ -204,7 +204,7 @@ def typical_episode(path: Path) -> bytes:
 def latest_episode(path: Path) -> bytes:
     """Return the address of the training episode that ended last, as `typical_episode`; empty without one."""
     with open_recording(path) as recording:
-        ended = recording.count(recording.topic("/train/episode"))
+        ended = recording.phase("train").episodes.count()
         return f"train/{ended - 1}".encode() if ended and recording.has_steps else b""
 
 

@@ -82,7 +82,7 @@ def _tables(recording: Recording) -> Iterator[tuple[str, Table]]:
 
 
 def _phase_tables(recording: Recording, phase: str) -> Iterator[tuple[str, Table]]:
-    resets = {} if recording.is_job else _resets(recording, phase)
+    resets = _resets(recording, phase)
     yield "resets", resets
     yield "steps", _steps(recording, phase, resets)
     yield "episodes", _episodes(recording, phase, resets)
@@ -157,7 +157,7 @@ def _environment(recording: Recording) -> Table:
 
 
 def _steps(recording: Recording, phase: str, resets: Table) -> Table:
-    if recording.has_actions_of(phase) and recording.has_actions_alone(phase):
+    if recording.has_actions_alone(phase):
         blocks = list(recording.actions(phase))
         columns = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0].dtype.names}
         columns = {name: values for name, values in columns.items() if name in ("step", *KEPT_COLUMNS)}
@@ -170,7 +170,7 @@ def _steps(recording: Recording, phase: str, resets: Table) -> Table:
     only_reset = columns["t"] == schema.RESET_ONLY
     columns |= {"taken": ~only_reset, "t": np.where(only_reset, -1, columns["t"].astype(np.int64))}
     columns["environment"] = _environments(recording, columns["step"].astype(np.int64), resets)
-    if recording.is_job:
+    if recording.can_train_again:
         return _of_columns(_positioned(columns))
     columns.pop("explored", None)
     for name in ("acted", "agents_terminated", "agents_truncated"):

@@ -85,8 +85,8 @@ def differences(run: str, expected: Content, found: Content) -> Iterator[str]:
             if (_type(old), old.shape) != (_type(new), new.shape):
                 yield f"{where}: found {_type(new)}{list(new.shape)}, expected {_type(old)}{list(old.shape)}"
                 old, new = old[: len(new)], new[: len(old)]
-            rows = [row for row in range(len(old)) if _data(old[row : row + 1]) != _data(new[row : row + 1])]
-            if rows:
+            if _data(old) != _data(new):
+                rows = [k for k in range(len(old)) if _data(old[k : k + 1]) != _data(new[k : k + 1])]
                 more = f", and {len(rows) - 1} more rows" if rows[1:] else ""
                 yield f"{where}, row {rows[0]}: found {new[rows[0]]}, expected {old[rows[0]]}{more}"
 

@@ -20,6 +20,7 @@ def kept():
     return storing.read()
 
 
+@pytest.mark.timeout(900)  # it compiles the kernel for several kinds of jobs
 def test_every_recording_has_the_content_that_it_had(kept, tmp_path):
     found = contents(tmp_path, ALGORITHMS)
     assert found.keys() == kept.keys() - {f"job-{algorithm}" for algorithm in MORE_ALGORITHMS}

@@ -108,7 +108,7 @@ def read_episodes(recording: Recording) -> None:
                 recording.episode_steps(phase, episode)
         for blocks in (
             recording.blocks_of_episodes(phase, 0, 1),
-            recording.blocks_between(schema.PHASES[phase][0], 10**9, 10**12),
+            recording.phase(phase).steps.blocks_between(range(10**9, 10**12)),
         ):
             with contextlib.suppress(RunnerError):
                 for _ in blocks:

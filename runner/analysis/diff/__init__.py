@@ -121,7 +121,7 @@ def diff(
             isinstance(origin, BranchOrigin)
             and origin.run == parent.run_id
             and have_same_spaces(a, b)
-            and a.kind != "variable"
+            and not a.has_varying_values
         ):
             return _diff_branch(difference, a, b, Cause("branch", f"{names}, {origin}"), origin)
     return _diff_loops(difference, a, b)
@@ -266,7 +266,7 @@ def as_json(difference: RunDiff) -> dict[str, object]:
 def can_compare_steps(a: Recording, b: Recording) -> bool:
     """Return whether two runs have recorded training steps of the same states and actions, or spaces."""
     are_alike = _same_sizes(a, b) if a.has_tables and b.has_tables else have_same_spaces(a, b)
-    return are_alike and all(recording.count(recording.topic("/train/step")) for recording in (a, b))
+    return are_alike and all(recording.phase("train").steps.count() for recording in (a, b))
 
 
 def divergences(a: Recording, b: Recording) -> Iterator[Divergence]:

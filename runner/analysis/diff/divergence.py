@@ -274,12 +274,12 @@ def loop_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None
 
 def _first_in_phase(a: Recording, b: Recording, phase: str) -> Divergence | None:
     """Return the same; the number of a trial is that among all evaluations."""
-    name, is_tabular = f"/{phase}/step", a.has_states
+    (ours, theirs), is_tabular = (one.phase(phase).steps for one in (a, b)), a.has_states
     alone = [one.has_actions_alone(phase) for one in (a, b)]
-    common = set.intersection(*(set(one.row_dtype(name).names or ()) for one in (a, b)))
+    common = set(a.row_dtype(ours).names or ()) & set(b.row_dtype(theirs).names or ())
     digest = ("digest",) if all(alone) else ()
     fields = (*(each for each in (FIELDS if is_tabular else _TRANSITION_FIELDS) if each in common), *digest)
-    divergence = _divergence(phase, a.rows(name), b.rows(name), fields)
+    divergence = _divergence(phase, a.rows(ours), b.rows(theirs), fields)
     if not is_tabular:  # else a step has the state before it
         divergence = (
             _reset_divergence(a, b, phase, math.inf if divergence is None else divergence.step) or divergence
@@ -292,7 +292,7 @@ def _first_in_phase(a: Recording, b: Recording, phase: str) -> Divergence | None
             a=_legible(a, divergence.field, divergence.a),
             b=_legible(b, divergence.field, divergence.b),
         )
-    if any(alone) or a.kind == "variable":
+    if any(alone) or ours.dtype is None:
         divergence = replace(divergence, a_step=None, b_step=None, actions_alone=any(alone))
     return divergence
 
@@ -313,7 +313,7 @@ def branch_divergence(a: Recording, b: Recording, origin: BranchOrigin) -> Diver
     blocks = [
         episode_blocks(one, origin.phase, origin.episode if one.run_id == origin.run else 0) for one in (a, b)
     ]
-    fields = tuple(name for name in (FIELDS if a.kind == "step" else _TRANSITION_FIELDS) if name != "episode")
+    fields = tuple(name for name in (FIELDS if a.has_states else _TRANSITION_FIELDS) if name != "episode")
     divergence = _divergence(origin.phase, blocks[0], blocks[1], fields)
     if divergence is None:
         return None
@@ -324,7 +324,7 @@ def branch_divergence(a: Recording, b: Recording, origin: BranchOrigin) -> Diver
 def _reset_divergence(a: Recording, b: Recording, phase: str, last: float) -> Divergence | None:
     """Return where what a reset observed differs, if that is before the end of the step `last`."""
     streams = [
-        itertools.takewhile(lambda block: block["step"][0] <= last, one.rows(f"/{phase}/reset"))
+        itertools.takewhile(lambda block: block["step"][0] <= last, one.rows(one.phase(phase).resets))
         for one in (a, b)
     ]
     _, left, right = first_difference(streams[0], streams[1], ("observation",)) or (0, None, None)

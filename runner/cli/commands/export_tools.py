@@ -47,7 +47,7 @@ def minari(
     with opened_run(run_name, to.recordings, needs_steps=True) as (_, recording):
         folder = to.path()
         path = folder / dataset_id(recording)
-        total = recording.count(recording.topic(f"/{phase}/episode"))
+        total = recording.phase(phase).episodes.count()
         with new_folder(path, to.force, PATTERNS) as fresh, count_line("episodes", total) as report:
             written = write_dataset(recording, fresh, phase, episodes or (), report)
     for note in written.notes:

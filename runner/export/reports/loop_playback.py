@@ -135,10 +135,9 @@ def _steps(recording: Recording, place: EpisodePlace, numbers: range) -> Iterato
         steps = whole_steps(recording, phase, place.number)
         yield steps[(steps["step"] >= numbers.start) & (steps["step"] < numbers.stop)]
         return
-    name = f"/{phase}/step"
-    topic = recording.topic(name)
-    is_fixed = topic in recording.dtypes
-    for block in recording.blocks(topic, numbers.start, numbers.stop) if is_fixed else recording.rows(name):
+    table = recording.phase(phase).steps
+    is_fixed = table.dtype is not None
+    for block in table.blocks(numbers.start, numbers.stop) if is_fixed else recording.rows(table):
         if (first := int(block["step"][0])) >= numbers.stop:
             return
         chosen = block[(numbers.start - first) % numbers.step :: numbers.step]
@@ -173,7 +172,7 @@ def _observations_before(
     if reset is None:
         return []
     value = reset["observation"]
-    return [part.column([value] if recording.kind == "variable" else np.array([value])) for part in parts]
+    return [part.column([value] if recording.has_varying_values else np.array([value])) for part in parts]
 
 
 def _observations(recording: Recording, steps: Records, parts: Sequence[_ShownPart]) -> list[Column]:

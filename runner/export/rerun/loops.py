@@ -254,7 +254,7 @@ class LoopReader:
         """Yield entity and row of each recorded frame, at the step of its own environment."""
         recording, n = self._recording, 1 if self._is_game else len(self._members)
         is_each_step = frames_every(recording) == 1
-        for frame in recording.decoded(recording.topic(f"/{phase}/frame")):
+        for frame in recording.phase(phase).frames.decoded():
             environment, _ = frame_place(frame)
             if environment < n:
                 entity = self._frame_entity(phase, environment)
@@ -313,22 +313,20 @@ class LoopReader:
 
     def _batches(self, phase: str, spans: Sequence[range]) -> Iterator[NDArray[np.void]]:
         """Yield the steps of all environments, at most a batch of each at a time."""
-        recording, name = self._recording, f"/{phase}/step"
-        topic = recording.topic(name)
-        if topic not in recording.dtypes:  # they vary in size, so they are read from the first on
+        recording, table = self._recording, self._recording.phase(phase).steps
+        if table.dtype is None:  # they vary in size, so they are read from the first on
             for span in spans:
-                for block in recording.rows(name):
+                for block in recording.rows(table):
                     if block["step"][0] >= span.stop:
                         break
                     if len(own := block[(block["step"] >= span.start) & (block["step"] < span.stop)]):
                         yield own
             return
-        dtype = recording.dtypes[topic]
-        limit = max(1, min(MAX_ROWS * recording.environments, _BATCH_BYTES // dtype.itemsize))
+        limit = max(1, min(MAX_ROWS * recording.environments, _BATCH_BYTES // table.dtype.itemsize))
         for span in spans:
             for start in range(span.start, span.stop, limit):
-                blocks = recording.blocks(topic, start, min(start + limit, span.stop))
-                steps = np.concatenate([np.empty(0, dtype), *blocks])
+                blocks = table.blocks(start, min(start + limit, span.stop))
+                steps = np.concatenate([np.empty(0, table.dtype), *blocks])
                 steps = steps[steps["t"] != schema.RESET_ONLY]
                 if len(steps):
                     if self._scene:
@@ -348,7 +346,7 @@ class LoopReader:
 def _parts(recording: Recording, agent: str = "") -> dict[str, Part]:
     """Return the numbers of a step, of one agent or of all, that are drawn as lines."""
     parts = {}
-    for quantity in OBSERVED if recording.kind != "variable" else ():
+    for quantity in OBSERVED if not recording.has_varying_values else ():
         leaves = [
             leaf
             for leaf in leaves_of(recording.spaces[quantity], f"the {quantity} space")

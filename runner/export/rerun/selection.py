@@ -194,7 +194,7 @@ def time_of(recording: Recording, phase: str, step: int) -> int:
 
 def _focus(recording: Recording, request: Request) -> tuple[int, int] | None:
     explicit = dataclasses.replace(request, with_default=False)
-    if explicit.is_default or request.everything or not recording.has_steps or recording.kind == "variable":
+    if explicit.is_default or request.everything or not recording.has_steps or recording.has_varying_values:
         return None
     train, evals = (episodes_of(recording, phase) for phase in schema.PHASES)
     trials = [np.array(request.trials, np.int64)]
@@ -295,11 +295,11 @@ def _select_loop(recording: Recording, request: Request, selection: Selection) -
     Raises:
         NotInRecording: an episode or an evaluation does not exist.
     """
-    if recording.kind == "variable":
+    if recording.has_varying_values:
         selection.warnings.append("Observations and actions vary in size (texts): they are not drawn.")
     total, tested = recording.count(schema.TRAIN_STEP), recording.count(schema.EVAL_STEP)
     n, train = recording.environments, episodes_of(recording, "train")
-    is_short = total <= DEFAULT_STEPS or recording.kind == "variable"
+    is_short = total <= DEFAULT_STEPS or recording.has_varying_values
     if request.everything or (request.is_default and is_short):
         stop = total if request.everything else min(total, DEFAULT_STEPS)
         selection.train = [range(stop)] if stop else []

@@ -200,7 +200,7 @@ def episodes(
     recording: OpenRecording, settings: SettingsOf, phase: PhasePath, start: Start = 0, stop: Stop = None
 ) -> Response:
     """Return episodes as columns: length, return of each agent, events, how it ended."""
-    total = recording.count(recording.topic(f"/{phase}/episode"))
+    total = recording.phase(phase).episodes.count()
     stop = _stop(start, stop, total, settings.limits.page_records)
     return _columns(recording, episode_columns(recording, phase, start, stop), start, total)
 
@@ -216,7 +216,7 @@ def steps(
 ) -> Response:
     """Return steps as columns: state, joint action, next state, reward of each agent, ..."""
     limit = settings.limits.page_records
-    total = recording.count(recording.topic(f"/{phase}/step"))
+    total = recording.phase(phase).steps.count()
     if episode is None:
         stop = _stop(start, stop, total, limit)
         return _columns(recording, step_columns(recording, phase, start=start, stop=stop), start, total)

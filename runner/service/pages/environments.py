@@ -74,10 +74,10 @@ def _environments(run: Run, at: StepRef) -> dict[str, object]:
 
 def _episodes_at(recording: Recording, place: EpisodePlace, span: range) -> list[tuple[int, int]]:
     """Return each environment and the number of its episode at the first step of another one, if it ended."""
-    topic, n = recording.topic(f"/{place.phase}/episode"), span.step
+    episodes, n = recording.phase(place.phase).episodes, span.step
     begin = span.start // n * n
     by_environment = {span.start % n: place.number}
-    for block in recording.blocks(topic, recording.first_from(topic, "last_step", begin)):
+    for block in episodes.blocks(episodes.first_from("last_step", begin)):
         for last, number in zip(block["last_step"].tolist(), block["episode"].tolist(), strict=True):
             if last >= begin:
                 by_environment.setdefault(last % n, number)

@@ -34,7 +34,7 @@ def episodes(
     number: Annotated[int, Query(alias="page", ge=1, lt=10**9)] = 1,
 ) -> Response:
     """Show the episodes of a phase; each links to its replay."""
-    total = recording.count(recording.topic(f"/{phase}/episode"))
+    total = recording.phase(phase).episodes.count()
     first = (number - 1) * ROWS
     columns = episode_columns(recording, phase, min(first, total), min(first + ROWS, total))
     if recording.environment["penalty_below"] is None:

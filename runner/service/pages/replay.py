@@ -198,8 +198,8 @@ def _values(
     run: Run, at: StepRef, branches: list[Link], stage: Stage | None, problem: str = ""
 ) -> dict[str, object]:
     with open_recording(run.recording) as recording:
-        episodes = recording.count(recording.topic("/train/episode"))
-        environments, is_job = recording.environments, recording.is_job
+        episodes = recording.phase("train").episodes.count()
+        environments, is_job = recording.environments, recording.can_train_again
         evaluations = [Evaluation(one.after, one.stop - one.start) for one in evaluations_of(recording)]
     if at.after is None:
         count = episodes

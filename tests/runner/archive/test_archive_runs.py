@@ -196,7 +196,7 @@ def test_archiving_several_runs_skips_those_that_are_archived_already(run, recor
 def test_a_damaged_recording_is_refused_and_repair_is_named(run, recordings, command):
     recording = recordings / run.run_id / "recording.mcap"
     with open_recording(recording) as opened:
-        place = opened._chunks(schema.TRAIN_STEP).entry(0).offset + 100
+        place = opened.table(schema.TRAIN_STEP).entry(0).offset + 100
     data = bytearray(recording.read_bytes())
     data[place] ^= 255
     recording.write_bytes(data)

@@ -235,7 +235,7 @@ def test_a_damaged_recording_is_reported(tmp_path):
     run = make_run(tmp_path, LAKE, episodes=200)
     data = bytearray(run.recording.read_bytes())
     with open_recording(run.recording) as recording:
-        offset = recording._chunks(schema.TRAIN_STEP).entry(0).offset
+        offset = recording.table(schema.TRAIN_STEP).entry(0).offset
     data[offset + 80] ^= 0xFF
     run.recording.write_bytes(data)
     with pytest.raises(RecordingError, match="repair"):

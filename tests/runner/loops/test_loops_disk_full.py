@@ -51,7 +51,7 @@ def test_all_steps_in_the_file_have_their_resets_and_episodes(tmp_path, kind):
     with open_recording(run.recording) as recording:
         assert recording.step_count("train") > 2_000
         assert recording.whole_steps("train") == recording.step_count("train")
-        steps = np.concatenate(list(recording.rows("/train/step")))
+        steps = np.concatenate(list(recording.rows(recording.phase("train").steps)))
         ended = int(np.count_nonzero(steps["terminated"] | steps["truncated"]))
         assert recording.count(recording.topic("/train/episode")) >= ended
     found = verify(run.recording, sample=3)

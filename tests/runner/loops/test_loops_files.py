@@ -77,7 +77,7 @@ def test_a_damaged_chunk_is_reported_and_the_rest_is_read(whole, tmp_path):
     with open_recording(path) as recording:
         topic = recording.topic("/train/step")
         before = recording.count(topic)
-        entry = recording._chunks(topic).entry(1 if KINDS[name] != "variable" else 0)
+        entry = recording.table(topic).entry(1 if KINDS[name] != "variable" else 0)
     at = entry.offset + entry.length - 40
     data[at : at + 8] = b"\xff" * 8
     damaged.write_bytes(data)

@@ -46,7 +46,7 @@ def run(unfolded, tmp_path) -> runner.Run:
 
 def chunks_of_steps(path: Path) -> list[slice]:
     with open_recording(path) as recording:
-        chunks = recording._chunks(TRAIN_TRANSITION)
+        chunks = recording.table(TRAIN_TRANSITION)
         entries = [chunks.entry(k) for k in range(len(chunks))]
     return [slice(entry.offset, entry.offset + entry.length) for entry in entries]
 

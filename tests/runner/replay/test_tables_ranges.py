@@ -39,7 +39,7 @@ def test_by_time(recording, topic):
         moments += [int(times[-1]), int(times[-1]) + 1]
     for start in moments:
         for stop in moments:
-            found = joined(recording, topic, recording.blocks_between(topic, start, stop))
+            found = joined(recording, topic, recording.table(topic).blocks_between(range(start, stop)))
             expected = records[(times >= max(start, 0)) & (times < max(stop, 0))]
             assert found.tobytes() == expected.tobytes()
 
@@ -59,5 +59,5 @@ def test_by_episode(recording, phase):
 def test_where_there_is_nothing(tmp_path):
     run = make_run(tmp_path, TAXIS, recording={"steps": "none"})
     with open_recording(run.recording) as recording:
-        assert not list(recording.blocks_between(schema.TRAIN_STEP, 0, 2**62))
+        assert not list(recording.table(schema.TRAIN_STEP).blocks_between(range(2**62)))
         assert not list(recording.blocks_of_episodes("train", 0, None))
