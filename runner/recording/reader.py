@@ -121,7 +121,8 @@ class Recording(RowReader):
     def episodes(self, phase: str, start: int = 0, stop: int | None = None) -> NDArray[np.void]:
         """Return the episode records of a phase (`train` or `eval`) as one array."""
         episodes = self.phase(phase).episodes
-        return np.concatenate([np.empty(0, episodes.dtype), *episodes.blocks(start, stop)])
+        blocks = list(episodes.blocks(start, stop))
+        return np.concatenate(blocks) if blocks else np.empty(0, episodes.dtype)
 
     def episode_span(self, phase: str, episode: int) -> range:
         """Return the numbers of the steps of one episode, also of one that never ended.
