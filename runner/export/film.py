@@ -53,8 +53,6 @@ class Film:
     frames: int
     width: int
     height: int
-    notes: tuple[str, ...]
-    """Why episodes are not shown to their end, one text for each such episode."""
 
 
 def write_film(
@@ -69,12 +67,11 @@ def write_film(
     `fps` are frames, and thus steps, per second; `width` is in pixels, None for about that of the pictures;
     `progress` is called with the number of frames that are done.
     """
-    notes: list[str] = []
     with contextlib.closing(shot.pictures), encoder(path, fps) as film:
-        for frame in captioned(shot, width, notes):
+        for frame in captioned(shot, width):
             film.add(frame)
             progress(film.frames)
-    return Film(film.frames, *film.size, tuple(notes))
+    return Film(film.frames, *film.size)
 
 
 def write_grid(
@@ -91,13 +88,12 @@ def write_grid(
     The arguments are those of `write_film`, of episodes row by row; `progress` counts the frames of single
     episodes, a `width` of None is at most `MAX_WIDTH`, and no episode has more than `max_frames`.
     """
-    notes: list[str] = []
     with tempfile.TemporaryDirectory(prefix="dualtaxi-film-") as folder, contextlib.ExitStack() as stack:
         films: list[Encoder] = []
         done = 0
         for number, shot in enumerate(shots):
             with contextlib.closing(shot.pictures), Encoder(Path(folder, f"{number}"), LOSSLESS, fps) as one:
-                captions = captioned(shot, (width or MAX_WIDTH) // columns, notes)
+                captions = captioned(shot, (width or MAX_WIDTH) // columns)
                 for frame in islice(captions, max_frames):
                     one.add(frame)
                     done += 1
@@ -114,17 +110,16 @@ def write_grid(
                 for frame in islice(frames, 1):
                     canvas[top : top + frame.shape[0], left : left + frame.shape[1]] = frame
             film.add(canvas)
-    return Film(film.frames, *film.size, tuple(notes))
+    return Film(film.frames, *film.size)
 
 
 # --- captions ---------------------------------------------------------------------------------------------
 
 
-def captioned(shot: Shot, width: int | None, notes: list[str]) -> Iterator[Pixels]:
+def captioned(shot: Shot, width: int | None) -> Iterator[Pixels]:
     """Yield the frames of an episode: each picture with a heading above, and step, action and rewards below.
 
-    `width` is that of a frame, None for about that of the pictures; `notes` gets the note of the last
-    picture.
+    `width` is that of a frame, None for about that of the pictures.
     """
     from PIL import Image
 
@@ -144,7 +139,6 @@ def captioned(shot: Shot, width: int | None, notes: list[str]) -> Iterator[Pixel
         frame.paste(_resized(picture.pixels, size), (0, top))
         lines = wrapped(picture.note, inner, text, _LINES) or _lines(shot.pictures, picture)
         _write(frame, [shortened(words, inner, text) for words in lines], top + size[1] + _MARGIN // 2, text)
-        notes += [picture.note] if picture.note else []
         yield np.asarray(frame)
 
 

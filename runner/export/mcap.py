@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from runner.errors import RecordingError, RunnerError
-from runner.export.places import write_new
+from runner.export.places import new_file
 from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD
 from runner.recording.labels import Labels
 from runner.recording.reader import open_recording
@@ -55,11 +55,8 @@ def export_mcap(run: Run, target: Path, anonymous: bool = False, force: bool = F
         return _without_names(name, entries, run.recording) if anonymous else entries
 
     left_out = (CODE_ATTACHMENT, CONSOLE_TOPIC.name) if anonymous else ()
-    write_new(
-        target,
-        force,
-        lambda temporary: rewrite(run.recording, temporary, change, {EXPORT_RECORD: record}, left_out),
-    )
+    with new_file(target, force) as temporary:
+        rewrite(run.recording, temporary, change, {EXPORT_RECORD: record}, left_out)
     return McapExport(target, list(_warnings(run)) if anonymous else [])
 
 

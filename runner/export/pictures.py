@@ -115,6 +115,7 @@ class Pictures:
         reason: why they are not drawn again, as a sentence; empty if they are, or have no need to be.
         steps: steps of the episode; there is one more picture, unless one has a note.
         learners: the names of the learners, one for each reward.
+        note: why the pictures ended before the steps; empty if they have not.
     """
 
     def __init__(self, recording: Recording, phase: str, episode: int, trust: bool) -> None:
@@ -124,6 +125,7 @@ class Pictures:
         self.learners = recording.agents
         self.steps = len(recording.episode_span(phase, episode))
         self.source, self.reason, _, self._painted = paint(recording, phase, episode, trust)
+        self.note = ""
         self._pictures = self._generate()
 
     def __iter__(self) -> Iterator[Picture]:
@@ -140,13 +142,12 @@ class Pictures:
     def _generate(self) -> Generator[Picture, None, None]:
         pixels = next(self._painted)
         for moment in moments_of(self._recording, self._phase, self._episode):
-            note = ""
             try:
                 pixels = next(self._painted) if moment.t else pixels
             except CannotRedo as error:
-                note = str(error)
-            yield Picture(**vars(moment), pixels=pixels, note=note)
-            if note:
+                self.note = str(error)
+            yield Picture(**vars(moment), pixels=pixels, note=self.note)
+            if self.note:
                 return
 
 

@@ -7,7 +7,7 @@ import fnmatch
 import secrets
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -19,8 +19,9 @@ _MARK: Final = "dualtaxi-export-"
 _IDLE_SECONDS: Final = 3600
 
 
-def write_new(path: Path, force: bool, write: Callable[[Path], object]) -> None:
-    """Call `write` with a temporary path next to `path`, then move that file there.
+@contextlib.contextmanager
+def new_file(path: Path, force: bool) -> Iterator[Path]:
+    """Yield a temporary path next to `path`; the file there becomes `path` if the block succeeds.
 
     Raises:
         StorageError: it cannot be written.
@@ -33,7 +34,7 @@ def write_new(path: Path, force: bool, write: Callable[[Path], object]) -> None:
             raise StorageError(f"{path}: {path.parent} is a file, expected a folder.") from error
         _remove_left_over(path.parent)
         with replacing(path, _MARK) as temporary:
-            write(temporary)
+            yield temporary
 
 
 def _remove_left_over(folder: Path) -> None:
@@ -57,8 +58,9 @@ def require_new(path: Path, force: bool) -> None:
 
 
 def write_text_new(path: Path, force: bool, text: str) -> None:
-    """Write text to a file, as `write_new` does."""
-    write_new(path, force, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    """Write text to a file, as `new_file` does."""
+    with new_file(path, force) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 @contextlib.contextmanager

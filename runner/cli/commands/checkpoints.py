@@ -26,7 +26,7 @@ from runner.cli.options import (
 from runner.cli.output import csv_lines, draw, echo, files_written, print_json, say, table
 from runner.cli.progress import stage_line
 from runner.cli.runs import find_recorded
-from runner.export.places import write_new, write_text_new
+from runner.export.places import new_file, write_text_new
 from runner.util.humanize import size
 
 _HEADINGS: Final = ("checkpoint", "phase", "episode", "format", "size", "digest", "content")
@@ -99,7 +99,8 @@ def get_command(
     name = re.sub(r"[^\w.+=-]", "_", checkpoint.name)
     path = output or Path(f"{name}-{checkpoint.step}.{checkpoint.format}")
     checkpoint.check()
-    write_new(path, force, lambda fresh: shutil.copyfile(checkpoint.path, fresh))
+    with new_file(path, force) as temporary:
+        shutil.copyfile(checkpoint.path, temporary)
     if as_json:
         print_json(checkpoint.as_json() | {"files": files_written(path)})
     else:

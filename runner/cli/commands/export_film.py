@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
@@ -22,7 +21,7 @@ from runner.cli.parameter_types import GRID
 from runner.cli.progress import count_line
 from runner.cli.runs import opened_run
 from runner.errors import ExitCode
-from runner.export.places import require_new, write_new
+from runner.export.places import new_file, require_new
 from runner.util.humanize import size
 
 if TYPE_CHECKING:
@@ -116,32 +115,29 @@ def command(
             max(lengths) if whole or not grid else min(max(lengths), int(GRID_LENGTHS * median(lengths)))
         )
         cut = sum(length > longest for length in lengths)
-        made: list[film.Film] = []
-        with count_line("frames", sum(min(length, longest) + 1 for length in lengths)) as progress:
-
-            def write(path: Path) -> None:
-                if grid:
-                    made.append(film.write_grid(path, shots(), grid[1], speed, width, progress, longest + 1))
-                else:
-                    made.append(film.write_film(path, next(shots()), speed, width, progress))
-
-            write_new(path, to.force, write)
+        frames = sum(min(length, longest) + 1 for length in lengths)
+        with count_line("frames", frames) as progress, new_file(path, to.force) as temporary:
+            if grid:
+                made = film.write_grid(temporary, shots(), grid[1], speed, width, progress, longest + 1)
+            else:
+                made = film.write_film(temporary, next(shots()), speed, width, progress)
     for note in dict.fromkeys(each.reason for each in opened if each.reason):
         say(f"The film shows {opened[0].source}: {note}")
-    for note in made[0].notes:
+    notes = [each.note for each in opened if each.note]
+    for note in notes:
         say(note)
     if cut:
         say(f"{cut} of {len(shown)} episodes are longer than the film, {longest:,} steps; --whole shows all.")
     what = shown[0].title if len(shown) == 1 else f"{len(shown)} episodes"
-    facts = f"{made[0].frames:,} frames of {made[0].width}x{made[0].height}, {size(path.stat().st_size)}"
+    facts = f"{made.frames:,} frames of {made.width}x{made.height}, {size(path.stat().st_size)}"
     to.report(
         f"{path}: {what}, {opened[0].source}, {facts}",
         path,
         episodes=[one.title for one in shown],
         source=str(opened[0].source),
-        frames=made[0].frames,
+        frames=made.frames,
     )
-    if made[0].notes:
+    if notes:
         raise SystemExit(ExitCode.DIFFERENT)
 
 

@@ -21,7 +21,7 @@ from runner.cli.output import say
 from runner.cli.parameter_types import INDEX, TRIAL
 from runner.cli.progress import count_line, stage_line
 from runner.cli.runs import find_all_recorded
-from runner.export.places import write_new, write_text_new
+from runner.export.places import new_file, write_text_new
 from runner.runs.run import recordings_folder
 from runner.sweep import is_sweep
 from runner.util.humanize import counted, sentence, size
@@ -98,8 +98,8 @@ def plot_command(
     for left_out in values_left_out(series):
         say(left_out)
     panels = panels_of(groups)
-    with stage_line("drawing"):
-        write_new(output, to.force, lambda path: save(curves_sheet(groups, panels, style), path))
+    with stage_line("drawing"), new_file(output, to.force) as path:
+        save(curves_sheet(groups, panels, style), path)
     count = sum(len(group.runs) for group in groups)
     text = f"{output}: {counted(len(panels), 'metric')} of {counted(count, 'run')}"
     to.report(text, output, metrics=len(panels), runs=count)
@@ -115,7 +115,8 @@ def _plot_tasks(series: list[RunSeries], normalise: str, to: Writing) -> None:
     with stage_line("computing intervals") as stage:
         comparison = compare_algorithms(series, table)
         stage("drawing")
-        write_new(output, to.force, lambda path: save(tasks_sheet(comparison), path))
+        with new_file(output, to.force) as path:
+            save(tasks_sheet(comparison), path)
     for note in comparison.notes:
         say(f"Note: {note}.")
     text = f"{output}: {len(comparison.algorithms)} groups in {len(comparison.tasks)} environments"
@@ -141,9 +142,8 @@ def _plot_sweep(name: str, recordings: Path, to: Writing) -> None:
     picture = picture_of(results)
     groups, panels = learning(results, recordings)
     panel = panel_of(results.sweep.objective.metric, panels)
-    with stage_line("drawing"):
-        sheet = sweep_sheet(f"Sweep {name}", picture, groups, panel)
-        write_new(to.path(), to.force, lambda path: save(sheet, path))
+    with stage_line("drawing"), new_file(to.path(), to.force) as path:
+        save(sweep_sheet(f"Sweep {name}", picture, groups, panel), path)
     count = len(picture.trials)
     to.report(f"{to.path()}: the sweep {name}, {count} trials", to.path(), sweep=name, trials=count)
 
@@ -196,13 +196,8 @@ def report_command(
         return
     replays = [*(("train", number, 0) for number in episodes), *(("eval", *trial) for trial in trials)]
     paths = [run.recording for run in find_all_recorded(run_names, folder)]
-    notes: list[str] = []
-    with stage_line("reading") as progress:
-        write_new(
-            output,
-            to.force,
-            lambda path: notes.extend(write_report(path, paths, replays, progress, axis, style)),
-        )
+    with stage_line("reading") as progress, new_file(output, to.force) as path:
+        notes = write_report(path, paths, replays, progress, axis, style)
     for note in notes:
         say(note)
     text = f"{output}: {size(output.stat().st_size)}, {counted(len(paths), 'run')}"

@@ -14,7 +14,7 @@ from runner.cli.output import draw, echo_csv, facts, files_written, print_json, 
 from runner.cli.parameter_types import FILE, INDEX
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_recorded
-from runner.export.places import require_new, write_new
+from runner.export.places import new_file, require_new
 from runner.util.humanize import UNKNOWN, number
 
 if TYPE_CHECKING:
@@ -78,12 +78,8 @@ def qtable_command(
     ):
         values, array = describe_tables(recording, step, episode, state)
     if output is not None:
-
-        def write(path: Path) -> None:
-            with path.open("wb") as stream:  # NumPy would append .npy to a path
-                np.save(stream, array)
-
-        write_new(output, force, write)
+        with new_file(output, force) as temporary, temporary.open("wb") as stream:
+            np.save(stream, array)  # it would append .npy to a path
     if as_json:
         print_json(values if output is None else {**values, "files": files_written(output)})
         return

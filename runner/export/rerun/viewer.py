@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from runner.errors import RunnerError
-from runner.export.places import write_new
+from runner.export.places import new_file
 from runner.util.extras import missing
 
 if TYPE_CHECKING:
@@ -183,7 +183,8 @@ def screenshot(path: Path, step: int, picture: Path, size: str = "1600x900") -> 
             client.save_screenshot(str(drawn))
         if not drawn.exists():
             raise ViewerError(f"{picture}: the Rerun viewer has not drawn it.")
-        write_new(picture, True, lambda temporary: shutil.copyfile(drawn, temporary))
+        with new_file(picture, True) as temporary:
+            shutil.copyfile(drawn, temporary)
 
 
 def open_window(path: Path, step: int, port: int) -> None:
