@@ -6,7 +6,6 @@ each cell (the place of the first) contains the whole grid once more (the place 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from html import escape
 from typing import Final
 
@@ -41,14 +40,14 @@ def levels_of(values: NDArray[np.float64], low: float, high: float) -> NDArray[n
 def policy_map(
     scene: SceneDescription,
     values: NDArray[np.float64],
-    greedy: Sequence[int | None],
+    greedy: NDArray[np.float64] | None,
     bounds: tuple[float, float],
     title: str,
 ) -> str:
     """Return the map of one mover: the highest value and the greedy action in each cell.
 
-    The values are [cells], nan where no action is better than another; the bounds are those of the darkest
-    and of the lightest colour.
+    Values and actions are [cells], nan where no action is better than another; without actions there are no
+    arrows. The bounds are those of the darkest and of the lightest colour.
     """
     letters = {
         row * scene["columns"] + column: mark["name"][:2]
@@ -56,7 +55,7 @@ def policy_map(
         for row, column in [mark["cell"]]
     }
     parts, labels = [], []
-    for cell, (level, action) in enumerate(zip(levels_of(values, *bounds).tolist(), greedy, strict=True)):
+    for cell, level in enumerate(levels_of(values, *bounds).tolist()):
         x, y = corner(scene, cell)
         colour = _colour(level)
         ink = ink_on(colour)
@@ -65,8 +64,8 @@ def policy_map(
         )
         if level >= 0:
             parts.append(_text(x + CELL // 2, y + CELL - 9, short(float(values[cell])), ink))
-        if level >= 0 and action is not None:
-            parts.append(_action(scene["actions"][action], x + CELL // 2, y, ink))
+        if level >= 0 and greedy is not None:
+            parts.append(_action(scene["actions"][int(greedy[cell])], x + CELL // 2, y, ink))
         if cell in letters:
             label = escape(letters[cell])
             labels.append(f'<text class="m-letter" x="{x + 8}" y="{y + 23}" fill="{ink}">{label}</text>')

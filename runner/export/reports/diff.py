@@ -27,12 +27,12 @@ from runner.analysis.groups import Group
 from runner.analysis.sections import Grid, Section
 from runner.analysis.series import read_series
 from runner.analysis.step_reference import StepRef
-from runner.drawing import svg, svg_maps
+from runner.drawing import svg
 from runner.environments.mdp import Mdp
 from runner.environments.naming import agent_actions_in_words, exploration_in_words, spoken, states_in_words
 from runner.export.plots.comparisons import tables_svg
 from runner.export.plots.curves import Plot, plots_of
-from runner.export.reports.maps import situation, situation_in_words
+from runner.export.reports.maps import drawn, on_grid, situation, situation_in_words
 from runner.export.reports.rendering import Figure, LegendEntry, Link, View, render
 from runner.recording.reader import Recording
 from runner.recording.run_file import run_title
@@ -172,9 +172,8 @@ def _picture(recording: Recording, step: np.void, title: str, after: bool) -> St
         rewards = " and ".join(f"{reward:g}" for reward in step["rewards"])
         end = "; the end" if step["terminated"] else "; the step limit" if step["truncated"] else ""
         text = f"{agent_actions_in_words(mdp)[int(step['action'])]} ({explored}); reward {rewards}{end}"
-    if mdp.scene is None or mdp.scene_cells is None:
+    if (drawing := svg.drawing_of(mdp)) is None:
         return StepPicture(title, "", f"{text}. {state_text}" if after else text, False)
-    drawing = svg.Drawing(mdp.scene)
     places = drawing.places(mdp, np.array([step["state"], state]))
     picture = drawing.frame(places[1], f"{title}: {state_text}", places, style="")
     return StepPicture(title, picture, text, drawing.width > svg.BROAD)
@@ -210,24 +209,17 @@ def _table_figures(difference: RunDiff, a: Recording, b: Recording) -> Iterator[
 
 def _map(mdp: Mdp, distances: NDArray[np.float64], agent: str) -> Iterator[Figure]:
     """Yield the map of the largest difference in each state, in the situation where it is largest."""
-    if mdp.scene is None or mdp.scene_cells is None or not distances.max() > 0:
+    drawing = svg.drawing_of(mdp)
+    if drawing is None or len(drawing.movers) not in (1, 2) or not distances.max() > 0:
         return
-    movers = svg.Drawing(mdp.scene).movers
-    if len(movers) not in (1, 2):
-        return
-    state = int(distances.argmax())
+    state, movers = int(distances.argmax()), drawing.movers
     states = np.flatnonzero(situation(mdp, state, movers))
-    cells = mdp.scene["rows"] * mdp.scene["columns"]
-    values = np.full((cells,) * len(movers), np.nan)
-    values[tuple(mdp.scene_cells[states][:, movers].T)] = distances[states]
+    values = on_grid(mdp, states, movers, distances[states])
     bounds = (0.0, float(np.nanmax(values)))
     title = f"Largest difference of {agent}'s Q-values in each state"
     fixed = situation_in_words(mdp, state, movers)
     caption = f"{title}, at the end, in the situation where it is largest{f' ({fixed})' if fixed else ''}."
-    if len(movers) == 2:
+    if mdp.scene is not None and len(movers) == 2:
         one, other = (mdp.scene["things"][mover]["label"] for mover in movers)
         caption += f" Large square: the place of {one}; in it: the place of {other}."
-        picture = svg_maps.pair_map(mdp.scene, values, bounds, title)
-    else:
-        picture = svg_maps.policy_map(mdp.scene, values, [None] * cells, bounds, title)
-    yield Figure(picture, caption, bounds[1])
+    yield Figure(drawn(mdp, values, bounds, title), caption, bounds[1])

@@ -6,7 +6,7 @@ for (a passenger at G, a destination R).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.qtable import recorded_tables
+from runner.drawing.svg import drawing_of
 from runner.drawing.svg_maps import pair_map, policy_map
 from runner.environments.mdp import Mdp
 from runner.environments.naming import spoken, states_in_words
@@ -22,6 +23,7 @@ from runner.recording.messages import Snapshot
 from runner.recording.reader import Recording
 from runner.replay.steps import step_of_episode
 from runner.replay.tables import tables_at
+from runner.util.arrays import Array
 
 Values = NDArray[np.float64]
 Bounds = tuple[float, float]
@@ -86,13 +88,13 @@ def stages_of(recording: Recording) -> list[Stage]:
 
 def maps_of(mdp: Mdp, learners: Sequence[str], stages: Sequence[Stage], state: int) -> list[MapRow]:
     """Return the maps for the situation of a state; none without a scene or a mover."""
-    if mdp.scene is None or mdp.scene_cells is None or not stages:
+    drawing = drawing_of(mdp)
+    if drawing is None or not stages:
         return []
-    movers = [i for i, thing in enumerate(mdp.scene["things"]) if thing["kind"] == "mover"]
-    pairs = range(len(learners)) if len(movers) == 2 else ()
+    pairs = range(len(learners)) if len(drawing.movers) == 2 else ()
     return [
-        *(_pair_row(mdp, learners, stages, state, movers, learner) for learner in pairs),
-        *(_policy_row(mdp, learners, stages, state, mover) for mover in movers),
+        *(_pair_row(mdp, learners, stages, state, drawing.movers, learner) for learner in pairs),
+        *(_policy_row(mdp, learners, stages, state, mover) for mover in drawing.movers),
     ]
 
 
@@ -125,77 +127,73 @@ def _pair_row(
 ) -> MapRow:
     """Return the highest value for each pair of cells of two movers."""
     assert mdp.scene is not None
-    assert mdp.scene_cells is not None
-    scene, cells = mdp.scene, mdp.scene["rows"] * mdp.scene["columns"]
-    states = np.flatnonzero(situation(mdp, state, movers))
-    places = tuple(mdp.scene_cells[states][:, movers].T)
-    grids = []
-    for stage in stages:
-        values = np.full((cells, cells), np.nan)
-        values[places] = _highest(stage.tables[learner][states])
-        grids.append(values)
-    one, other = (scene["things"][mover]["label"] for mover in movers)
+    one, other = (mdp.scene["things"][mover]["label"] for mover in movers)
     whose = "" if len(learners) == 1 else f" of {spoken(learners[learner])}"
-    return _row(
-        f"Highest Q-value{whose} for every pair of places",
+    title = f"Highest Q-value{whose} for every pair of places"
+    explanation = (
         f"Large square: the place of {one}. In it the grid again: the place of {other}. Grey: all actions "
-        "have the same value.",
-        situation_in_words(mdp, state, movers),
-        stages,
-        grids,
-        lambda i, bounds, title: pair_map(scene, grids[i], bounds, title),
+        "have the same value."
     )
+    return _row(title, explanation, mdp, stages, state, movers, learner)
 
 
 def _policy_row(mdp: Mdp, learners: Sequence[str], stages: Sequence[Stage], state: int, mover: int) -> MapRow:
     """Return the greedy action and the highest value of one mover in each cell."""
     assert mdp.scene is not None
-    assert mdp.scene_cells is not None
-    scene, cells = mdp.scene, mdp.scene["rows"] * mdp.scene["columns"]
-    thing = scene["things"][mover]
+    thing = mdp.scene["things"][mover]
     agent = mdp.agents.index(thing["agent"]) if thing.get("agent") in mdp.agents else 0
-    is_joint = len(learners) == 1
-    states = np.flatnonzero(situation(mdp, state, [mover]))
-    places = mdp.scene_cells[states, mover]
-    grids, policies = [], []
-    for stage in stages:
-        rows = stage.tables[0 if is_joint else agent][states]
-        values = np.full(cells, np.nan)
-        values[places] = _highest(rows)
-        greedy: list[int | None] = [None] * cells
-        for cell, best in zip(places.tolist(), rows.argmax(axis=1).tolist(), strict=True):
-            if not np.isnan(values[cell]):
-                greedy[cell] = int(mdp.own_actions[best, agent]) if is_joint else best
-        grids.append(values)
-        policies.append(greedy)
-    return _row(
-        f"Greedy actions of {thing['label']}, and the highest Q-value",
-        "Arrow: the greedy action in that cell. Grey: all actions have the same value there.",
-        situation_in_words(mdp, state, [mover]),
-        stages,
-        grids,
-        lambda i, bounds, title: policy_map(scene, grids[i], policies[i], bounds, title),
-    )
+    title = f"Greedy actions of {thing['label']}, and the highest Q-value"
+    explanation = "Arrow: the greedy action in that cell. Grey: all actions have the same value there."
+    if len(learners) > 1:
+        return _row(title, explanation, mdp, stages, state, [mover], agent)
+    return _row(title, explanation, mdp, stages, state, [mover], 0, mdp.own_actions[:, agent])
 
 
 def _row(
     title: str,
     explanation: str,
-    fixed: str,
+    mdp: Mdp,
     stages: Sequence[Stage],
-    grids: Sequence[Values],
-    draw: Callable[[int, Bounds, str], str],
+    state: int,
+    movers: list[int],
+    learner: int,
+    own_actions: NDArray[np.int64] | None = None,
 ) -> MapRow:
-    """Return the maps of some grids of values, a grid for each stage, drawn by number, bounds and title."""
+    """Return the maps of a learner's table at each stage; `own_actions` has a mover's part of its actions."""
+    states = np.flatnonzero(situation(mdp, state, movers))
+    grids, policies = [], []
+    for stage in stages:
+        rows = stage.tables[learner][states]
+        greedy = rows.argmax(axis=1)
+        grids.append(on_grid(mdp, states, movers, _highest(rows)))
+        policies.append(on_grid(mdp, states, movers, greedy if own_actions is None else own_actions[greedy]))
     numbers = np.concatenate([grid[~np.isnan(grid)] for grid in grids])
     bounds = (float(numbers.min()), float(numbers.max())) if len(numbers) else (0.0, 0.0)
     svgs = []
-    for i, (stage, grid) in enumerate(zip(stages, grids, strict=True)):
+    for stage, grid, policy in zip(stages, grids, policies, strict=True):
         span = "no action is preferred anywhere"
         if not np.isnan(grid).all():
             span = f"from {np.nanmin(grid):.4g} to {np.nanmax(grid):.4g}"
-        svgs.append((stage.title, draw(i, bounds, f"{title}, {stage.title}; {span}")))
+        svgs.append((stage.title, drawn(mdp, grid, bounds, f"{title}, {stage.title}; {span}", policy)))
+    fixed = situation_in_words(mdp, state, movers)
     return MapRow(title, explanation + (f" Situation: {fixed}." if fixed else ""), tuple(svgs), *bounds)
+
+
+def on_grid(mdp: Mdp, states: NDArray[np.int64], movers: list[int], values: Array) -> Values:
+    """Return the values of states by the cells of one or two movers, [cells] or [cells, cells], else NaN."""
+    assert mdp.scene is not None
+    assert mdp.scene_cells is not None
+    grid = np.full((mdp.scene["rows"] * mdp.scene["columns"],) * len(movers), np.nan)
+    grid[tuple(mdp.scene_cells[states][:, movers].T)] = values
+    return grid
+
+
+def drawn(mdp: Mdp, grid: Values, bounds: Bounds, title: str, greedy: Values | None = None) -> str:
+    """Return the map of values as `on_grid` returns them, with the greedy actions of one mover."""
+    assert mdp.scene is not None
+    if grid.ndim == 2:
+        return pair_map(mdp.scene, grid, bounds, title)
+    return policy_map(mdp.scene, grid, greedy, bounds, title)
 
 
 def _highest(rows: Values) -> Values:
