@@ -9,29 +9,19 @@ from __future__ import annotations
 
 import contextlib
 import json
+import sqlite3
 import threading
 from collections import Counter, defaultdict
 from collections.abc import Container, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
 
-from peewee import (
-    AutoField,
-    BooleanField,
-    CompositeKey,
-    IntegerField,
-    Model,
-    PeeweeException,
-    SchemaManager,
-    SqliteDatabase,
-    TextField,
-)
-
 from runner.client.jobs import OVER, EventData, JobEvent, LogEvent, RunEvent, StateEvent
 from runner.config.document import read_yaml, write_yaml
 from runner.errors import RunnerError, StorageError
+from runner.runs.catalogue.database import transaction
 from runner.runs.locking import acquired
 from runner.service.errors import JobNotFound, QueueFull
 from runner.util.values import JsonView
@@ -50,6 +40,27 @@ LOCK_FILE: Final = f"{FOLDER}/queue.lock"
 MAX_EVENTS: Final = 50_000
 """Stored events of a job; beyond them only its states are stored."""
 EVENTS_PER_READ: Final = 2000
+# With exclusive locking the write-ahead log needs no shared memory, so network disks will do. Seeds exceed
+# SQLite's integers. The name of the index is in use in files that older servers wrote.
+_SCHEMA: Final = """
+PRAGMA locking_mode = exclusive;
+PRAGMA journal_mode = wal;
+PRAGMA synchronous = full;
+CREATE TABLE IF NOT EXISTS jobs (
+    number INTEGER NOT NULL PRIMARY KEY, kind TEXT NOT NULL, name TEXT NOT NULL, runs INTEGER NOT NULL,
+    created TEXT NOT NULL, workers INTEGER NOT NULL, state TEXT NOT NULL, started TEXT NOT NULL,
+    ended TEXT NOT NULL, error TEXT NOT NULL, deaths INTEGER NOT NULL, accept_changes INTEGER NOT NULL,
+    retry INTEGER NOT NULL, submitted TEXT NOT NULL, "values" TEXT NOT NULL
+);
+CREATE TABLE IF NOT EXISTS runs (
+    job INTEGER NOT NULL, seed TEXT NOT NULL, run_id TEXT NOT NULL, started INTEGER NOT NULL,
+    PRIMARY KEY (job, seed)
+);
+CREATE TABLE IF NOT EXISTS events (
+    id INTEGER NOT NULL PRIMARY KEY, job INTEGER NOT NULL, kind TEXT NOT NULL, data TEXT NOT NULL
+);
+CREATE INDEX IF NOT EXISTS _eventrow_job ON events (job);
+"""
 
 
 @dataclass(frozen=True)
@@ -87,50 +98,8 @@ class _RunOfJob(NamedTuple):
     is_started: bool
 
 
-class _JobRow(Model):
-    number = IntegerField(primary_key=True)
-    kind = TextField()
-    name = TextField()
-    runs = IntegerField()
-    created = TextField()
-    workers = IntegerField(default=1)
-    state = TextField()
-    started = TextField()
-    ended = TextField()
-    error = TextField()
-    deaths = IntegerField()
-    accept_changes = BooleanField()
-    retry = BooleanField()
-    submitted = TextField()
-    values = TextField()
-
-    class Meta:
-        table_name = "jobs"
-
-
-class _RunRow(Model):
-    job = IntegerField()
-    seed = TextField()
-    """Decimal: seeds exceed SQLite's integers."""
-    run_id = TextField()
-    started = BooleanField()
-
-    class Meta:
-        table_name = "runs"
-        primary_key = CompositeKey("job", "seed")
-
-
-class _EventRow(Model):
-    id = AutoField()
-    job = IntegerField(index=True)
-    kind = TextField()
-    data = TextField()
-
-    class Meta:
-        table_name = "events"
-
-
-_TABLES: Final = (_JobRow, _RunRow, _EventRow)
+_FIELDS: Final = ", ".join(field.name for field in fields(Job))
+_PLACES: Final = ", ".join("?" for _ in fields(Job))
 
 
 class JobStore:
@@ -147,27 +116,24 @@ class JobStore:
         self.lock = threading.RLock()
         """Held by methods that use the database, and by callers over several calls that belong together; not
         by methods that copy a dictionary, which no other thread changes meanwhile."""
-        self._file_lock = lock_folder(recordings, LOCK_FILE)
-        # With exclusive locking the write-ahead log needs no shared memory, so network disks will do.
-        pragmas = {"locking_mode": "exclusive", "journal_mode": "wal", "synchronous": "full"}
-        # One connection, guarded by our own lock.
-        self._database = SqliteDatabase(
-            str(self.path), pragmas=pragmas, thread_safe=False, check_same_thread=False
-        )
+        self._open = contextlib.ExitStack()
+        self._open.callback(lock_folder(recordings, LOCK_FILE).release)
         try:
-            with self._transaction("move it away to start with an empty queue"):
-                for table in _TABLES:
-                    SchemaManager(table, self._database).create_all()
-                if not any(column.name == "workers" for column in self._database.get_columns("jobs")):
+            with self._storing("move it away to start with an empty queue"):
+                # One connection, guarded by our own lock.
+                database = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False)
+                self._database = self._open.enter_context(contextlib.closing(database))
+                database.executescript(_SCHEMA)
+                if not self._rows("SELECT 1 FROM pragma_table_info('jobs') WHERE name = 'workers'"):
                     # The file is of a server whose jobs did not state their workers.
-                    self._database.execute_sql("ALTER TABLE jobs ADD COLUMN workers INTEGER DEFAULT 1")  # type: ignore[no-untyped-call]
-                columns = [getattr(_JobRow, field.name) for field in fields(Job)]
-                rows = self._tuples(_JobRow.select(*columns).order_by(_JobRow.number))
-                self._jobs = {row[0]: Job(*row) for row in rows}
+                    database.execute("ALTER TABLE jobs ADD COLUMN workers INTEGER DEFAULT 1")
+                jobs = self._rows(f"SELECT {_FIELDS} FROM jobs ORDER BY number")
+                self._jobs = {row[0]: Job(*row[:-2], *map(bool, row[-2:])) for row in jobs}
                 self._runs: defaultdict[int, dict[int, _RunOfJob]] = defaultdict(dict)
-                for job, seed, *run in self._tuples(_RunRow.select()):
+                for job, seed, *run in self._rows("SELECT job, seed, run_id, started FROM runs"):
                     self._runs[job][int(seed)] = _RunOfJob(*run)
-                self._event_counts = Counter(job for (job,) in self._tuples(_EventRow.select(_EventRow.job)))
+                counts = self._rows("SELECT job, COUNT(*) FROM events GROUP BY job")
+                self._event_counts = Counter(dict(counts))
         except BaseException:
             self.close()
             raise
@@ -181,8 +147,7 @@ class JobStore:
     def close(self) -> None:
         """Close the database, and release the folder for other processes."""
         with self.lock:
-            self._database.close()
-            self._file_lock.release()
+            self._open.close()
 
     def jobs(self) -> list[Job]:
         """Return all jobs, in the order of submission."""
@@ -227,15 +192,12 @@ class JobStore:
             over = [old.number for old in self._jobs.values() if old.is_over and old.number not in keep]
             forgotten = over[: max(0, len(over) - self._max_over)]
             with self._transaction():
-                row = asdict(job) | {"submitted": submitted, "values": write_yaml(values)}
-                _JobRow.insert(row).execute(self._database)
+                row = (*astuple(job), submitted, write_yaml(values))
+                columns, places = f'{_FIELDS}, submitted, "values"', f"{_PLACES}, ?, ?"
+                self._database.execute(f"INSERT INTO jobs ({columns}) VALUES ({places})", row)
                 self._insert_state(job)
-                for table, column in (
-                    (_JobRow, _JobRow.number),
-                    (_RunRow, _RunRow.job),
-                    (_EventRow, _EventRow.job),
-                ):
-                    table.delete().where(column.in_(forgotten)).execute(self._database)
+                for column in ("jobs WHERE number", "runs WHERE job", "events WHERE job"):
+                    self._database.executemany(f"DELETE FROM {column} = ?", [(old,) for old in forgotten])
             for number in forgotten:
                 del self._jobs[number], self._event_counts[number]
                 self._runs.pop(number, None)
@@ -251,9 +213,9 @@ class JobStore:
         with self.lock:
             before = self.job(number)
             job = self._jobs[number] = replace(before, **changes)
-            with self._transaction("free some disk"):
-                row = _JobRow.update(asdict(job)).where(_JobRow.number == number)
-                row.execute(self._database)
+            with self._transaction():
+                statement = f"UPDATE jobs SET ({_FIELDS}) = ({_PLACES}) WHERE number = ?"
+                self._database.execute(statement, (*astuple(job), number))
                 if (job.state, job.error) != (before.state, before.error):
                     self._insert_state(job)
             return job
@@ -281,12 +243,10 @@ class JobStore:
         """
         with self.lock:
             self.job(number)
-            columns = (_EventRow.id, _EventRow.kind, _EventRow.data)
-            own = _EventRow.select(*columns).where(_EventRow.job == number)
-            if after and not self._tuples(own.where(_EventRow.id == after)):
+            if after and not self._rows("SELECT 1 FROM events WHERE job = ? AND id = ?", number, after):
                 after = 0
-            query = own.where(_EventRow.id > after).order_by(_EventRow.id).limit(EVENTS_PER_READ)
-            rows = self._tuples(query)
+            query = "SELECT id, kind, data FROM events WHERE job = ? AND id > ? ORDER BY id LIMIT ?"
+            rows = self._rows(query, number, after, EVENTS_PER_READ)
             events = [JobEvent.from_json(kind, json.loads(data), str(id_)) for id_, kind, data in rows]
             return events, rows[-1][0] if rows else after
 
@@ -294,8 +254,8 @@ class JobStore:
         """Return the last events of a job, and the id of the last one."""
         with self.lock:
             self.job(number)
-            query = _EventRow.select(_EventRow.id).where(_EventRow.job == number)
-            ids = self._tuples(query.order_by(_EventRow.id.desc()).limit(1).offset(limit))
+            query = "SELECT id FROM events WHERE job = ? ORDER BY id DESC LIMIT 1 OFFSET ?"
+            ids = self._rows(query, number, limit)
             return self.events(number, ids[0][0] if ids else 0)
 
     def run_ids(self, number: int, started: bool = True) -> dict[int, str]:
@@ -316,19 +276,18 @@ class JobStore:
     def submitted(self, number: int) -> str:
         """Return the text of a job as it was submitted."""
         self.job(number)
-        return self._column(number, _JobRow.submitted)
+        return self._text(number, "submitted")
 
     def values(self, number: int) -> dict[str, object]:
         """Return the configuration or sweep of a job, every value present."""
-        return dict(read_yaml(self._column(number, _JobRow.values), f"job {number}").value)
+        return dict(read_yaml(self._text(number, '"values"'), f"job {number}").value)
 
-    def _column(self, number: int, column: TextField) -> str:
+    def _text(self, number: int, column: str) -> str:
         with self.lock:
-            ((text,),) = self._tuples(_JobRow.select(column).where(_JobRow.number == number))
-            return str(text)
+            return str(self._rows(f"SELECT {column} FROM jobs WHERE number = ?", number)[0][0])
 
-    def _tuples(self, query: Any) -> list[tuple[Any, ...]]:
-        return list(query.tuples().execute(self._database))
+    def _rows(self, query: str, *values: object) -> list[tuple[Any, ...]]:
+        return self._database.execute(query, values).fetchall()
 
     def _insert_state(self, job: Job) -> None:
         self._insert_events(job.number, [StateEvent(job.state, job.error or None, now())])
@@ -337,25 +296,26 @@ class JobStore:
         self, number: int, runs: Mapping[int, _RunOfJob], events: Sequence[EventData] = ()
     ) -> None:
         with self._transaction():
-            for seed, run in runs.items():
-                row = {"job": number, "seed": str(seed), "run_id": run.run_id, "started": run.is_started}
-                _RunRow.insert(row).on_conflict_replace().execute(self._database)
+            rows = [(number, str(seed), *run) for seed, run in runs.items()]
+            self._database.executemany("INSERT OR REPLACE INTO runs VALUES (?, ?, ?, ?)", rows)
             self._insert_events(number, events)
         self._runs[number].update(runs)
 
     def _insert_events(self, number: int, data: Sequence[EventData]) -> None:
-        events = map(JobEvent, data)
-        rows = [{"job": number, "kind": each.kind, "data": json.dumps(each.as_json())} for each in events]
-        if rows:
-            _EventRow.insert_many(rows).execute(self._database)
-            self._event_counts[number] += len(rows)
+        rows = [(number, event.kind, json.dumps(event.as_json())) for event in map(JobEvent, data)]
+        self._database.executemany("INSERT INTO events (job, kind, data) VALUES (?, ?, ?)", rows)
+        self._event_counts[number] += len(rows)
 
     @contextlib.contextmanager
-    def _transaction(self, advice: str = "free some disk") -> Iterator[None]:
+    def _transaction(self) -> Iterator[None]:
+        with self._storing("free some disk"), transaction(self._database, "IMMEDIATE"):
+            yield
+
+    @contextlib.contextmanager
+    def _storing(self, advice: str) -> Iterator[None]:
         try:
-            with self._database.atomic():
-                yield
-        except PeeweeException as error:
+            yield
+        except sqlite3.Error as error:
             raise StorageError(f"{self.path}: cannot be written ({error}); {advice}.") from error
 
 

@@ -6,7 +6,6 @@ import contextlib
 import os
 import sqlite3
 
-import peewee
 import pytest
 
 from runner.client.jobs import LogEvent
@@ -134,7 +133,7 @@ def test_a_folder_that_cannot_be_written_is_reported(tmp_path):
 
 def test_on_a_full_disk_a_job_is_not_queued_and_a_change_counts_until_the_next_start(tmp_path, monkeypatch):
     def full(*_):
-        raise peewee.OperationalError("database or disk is full")
+        raise sqlite3.OperationalError("database or disk is full")
 
     with JobStore(tmp_path) as store:
         job = added(store)
