@@ -12,7 +12,7 @@ from runner.environments.mdp import events_of
 from runner.environments.naming import actions_in_words, states_in_words
 from runner.export.contents import Step
 from runner.export.pictures import Moment, moments_of
-from runner.export.values import acted, action_in_words, plain_value, value_in_words
+from runner.export.values import plain_value, step_actions_in_words, value_in_words
 from runner.recording.spaces import least_number
 from runner.replay.steps import check_steps, transitions_of
 from runner.util.humanize import number
@@ -115,11 +115,8 @@ def _named(recording: Recording) -> Callable[[Step], dict[str, object]]:
 def _valued(recording: Recording, phase: str) -> Callable[[Step], dict[str, object]]:
     """Return a function that gives the action of a step, by name where it has one, and the observation."""
     agents = recording.agents if len(recording.agents) > 1 else ("",)
-    words = {
-        agent: action_in_words(recording, phase, agent)
-        for agent in agents
-        if recording.action_names(phase, agent)
-    }
+    in_words = step_actions_in_words(recording, phase)
+    has_names = [agent for agent in agents if recording.action_names(phase, agent)]
 
     def describe(row: Step) -> dict[str, object]:
         if recording.has_states:
@@ -128,11 +125,8 @@ def _valued(recording: Recording, phase: str) -> Callable[[Step], dict[str, obje
             description = {name: as_json(plain_value(row[name])) for name in ("action", "next_observation")}
         if agents != ("",):
             description["acted"] = [agent for i, agent in enumerate(agents) if int(row["acted"]) >> i & 1]
-            own = {
-                agent: words[agent](row["action"][agent]) for agent in description["acted"] if agent in words
-            }
-            return description | ({"action_in_words": own} if own else {})
-        return description | ({"action_in_words": words[""](acted(recording, row))} if words else {})
+        own = {agent: words for agent, words in in_words(row).items() if agent in has_names}
+        return description | ({"action_in_words": own.get("", own)} if own else {})
 
     return describe
 

@@ -23,7 +23,7 @@ import numpy as np
 from runner.drawing import svg
 from runner.drawing.raster import Pixels, require_packages
 from runner.environments.mdp import events_of
-from runner.environments.naming import agent_actions_in_words, events_in_words, exploration_in_words
+from runner.environments.naming import agent_actions_in_words, events_in_words, exploration_in_words, spoken
 from runner.errors import CannotRedo
 from runner.export.contents import ENDINGS, Step, ending_of, require_steps
 from runner.export.painting import (
@@ -34,7 +34,7 @@ from runner.export.painting import (
     paint_scene,
     paint_values,
 )
-from runner.export.values import Values, acted, action_in_words, observations_of, observed
+from runner.export.values import Values, observations_of, observed, step_actions_in_words
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value
 from runner.replay.makers import why_not_redone
@@ -249,14 +249,11 @@ def describer(recording: Recording, phase: str) -> Callable[[Step], tuple[str, s
             return named[row["action"]], ", ".join(filter(None, [events, explored]))
 
         return describe
-    in_words = action_in_words(recording, phase)
-    texts, agents = Values(recording.spaces["observation"], "observation"), recording.agents
+    in_words = step_actions_in_words(recording, phase)
+    texts = Values(recording.spaces["observation"], "observation")
 
     def describe_values(row: Step) -> tuple[str, str]:
-        action = acted(recording, row)
-        if len(agents) > 1:
-            action = {agent: action[agent] for i, agent in enumerate(agents) if int(row["acted"]) >> i & 1}
-        words = in_words(action)
+        words = ", ".join(f"{spoken(agent)} {action}".lstrip() for agent, action in in_words(row).items())
         words = f"action {words}" if words.removeprefix("-").isdecimal() else words
         return words, texts.texts_in(observed(recording, row))
 

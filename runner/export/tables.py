@@ -156,11 +156,7 @@ def _write(path: Path, form: str, batches: Iterator[pa.RecordBatch], report: Cal
                     if not pa.types.is_fixed_size_binary(column.type)
                 ]
             )
-            is_compressed = path.suffix == ".gz"
-            target = (
-                pa.CompressedOutputStream(str(path), "gzip") if is_compressed else pa.OSFile(str(path), "wb")
-            )
-            stack.enter_context(target)
+            target = stack.enter_context(pa.output_stream(str(path)))  # compressed if its name ends in .gz
             options = pa.csv.WriteOptions(quoting_style="needed")
             writer: Any = pa.csv.CSVWriter(target, columns, write_options=options)
         else:

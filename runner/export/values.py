@@ -131,16 +131,28 @@ def value_in_words(value: object, limit: int = FEW) -> str:
     return f"{array.item():.3g}" if array.dtype.kind == "f" else f"{array.item()}"
 
 
-def action_in_words(recording: Recording, phase: str, agent: str = "") -> Callable[[Value], str]:
-    """Return how to put an action, as `acted` returns it, in words: `left`, or its value without a name.
+def step_actions_in_words(recording: Recording, phase: str) -> Callable[[Step], dict[str, str]]:
+    """Return how to put the actions of a step in words, by agent: `left`, or a value without a name.
 
-    Actions of a game are mappings by agent, unless an agent is given.
+    An agent that took no part is left out; a single agent has no name.
     """
-    if len(recording.agents) > 1 and not agent:
-        by_agent = {each: action_in_words(recording, phase, each) for each in recording.agents}
-        return lambda actions: ", ".join(
-            f"{spoken(each)} {by_agent[each](own)}" for each, own in actions.items()
-        )
+    agents = recording.agents if len(recording.agents) > 1 else ("",)
+    by_agent = {agent: _action_in_words(recording, phase, agent) for agent in agents}
+
+    def in_words(step: Step) -> dict[str, str]:
+        action = acted(recording, step)
+        if "" in by_agent:
+            return {"": by_agent[""](action)}
+        numbered = enumerate(by_agent.items())
+        return {
+            agent: text_of(action[agent]) for i, (agent, text_of) in numbered if int(step["acted"]) >> i & 1
+        }
+
+    return in_words
+
+
+def _action_in_words(recording: Recording, phase: str, agent: str) -> Callable[[Value], str]:
+    """Return how to put an agent's action in words; a single agent has no name."""
     space = recording.spaces["action"]
     least = least_number(space["spaces"][agent] if agent else space)
     names = [spoken(name) for name in recording.action_names(phase, agent)]

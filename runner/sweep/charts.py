@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from runner.drawing import palette
 from runner.errors import RunnerError
 from runner.export.plots.chart import SMALL, Canvas, Chart, Scale, labelled, series_colour
 from runner.export.plots.curves import HEIGHT, WIDTH, Plot, footnote, panel_chart, panel_plots
-from runner.export.reports.rendering import LegendEntry, View, render
+from runner.export.reports.rendering import LegendEntry, render
 from runner.runs.resolve import find_run
 from runner.sweep.model import Range
 from runner.sweep.results import Ranked, Results, sections, value_text, values_text
@@ -278,27 +278,13 @@ def _unit(values: Values, log: bool, choices: tuple[str, ...]) -> Values:
 # --- the page -----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _SweepView(View):
-    TEMPLATE: ClassVar = "sweep.html"
-    title: str
-    lead: list[str]
-    sections: list[Section]
-    parameters: list[Plot]
-    note: str
-    best: str | None
-    legend: list[LegendEntry]
-    plots: list[Plot]
-    footnote: str
-    moment: str
-
-
 def render_sweep(results: Results, recordings: Path) -> str:
     """Return the page of a sweep whose runs are in a recordings folder."""
     picture = picture_of(results)
     groups, panels = learning(results, recordings)
     ranking, *others = sections(results)
-    view = _SweepView(
+    return render(
+        "sweep.html",
         title=ranking.title,
         lead=ranking.sentences,
         sections=[Section("Ranking", grids=ranking.grids), *others],
@@ -310,7 +296,6 @@ def render_sweep(results: Results, recordings: Path) -> str:
         footnote=footnote(groups, panels),
         moment=f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     )
-    return render(view)
 
 
 def sweep_legend(groups: list[Group]) -> list[LegendEntry]:

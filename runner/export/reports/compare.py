@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 from runner.analysis.compare import Comparison, MetricResult
 from runner.analysis.compare.sections import EXPLANATION, metric_section, summary
@@ -15,9 +14,9 @@ from runner.analysis.compare.tasks import TaskComparison
 from runner.analysis.groups import Group
 from runner.analysis.sections import Grid, Section
 from runner.export.plots.comparisons import intervals_svg, letter, profile_svg
-from runner.export.plots.curves import Plot, plots_of
+from runner.export.plots.curves import plots_of
 from runner.export.plots.tasks import task_charts
-from runner.export.reports.rendering import Figure, LegendEntry, View, render
+from runner.export.reports.rendering import Figure, LegendEntry, render
 from runner.util.humanize import UNKNOWN
 
 
@@ -27,21 +26,6 @@ class ComparedMetric(NamedTuple):
     id: str
     section: Section
     figures: list[Figure]
-
-
-@dataclass(frozen=True)
-class _ComparisonView(View):
-    TEMPLATE: ClassVar = "compare.html"
-    title: str
-    lead: list[str]
-    notes: Sequence[str]
-    legend: list[LegendEntry]
-    metrics: list[ComparedMetric]
-    plots: list[Plot]
-    footnote: str
-    runs: Grid
-    moment: str
-    explanation: str = EXPLANATION
 
 
 def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
@@ -60,20 +44,20 @@ def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
         for run in group.runs
     ]
     return render(
-        _ComparisonView(
-            title=" against ".join(labels) if len(labels) < 4 else f"{len(labels)} groups of runs compared",
-            lead=summary(comparison),
-            notes=comparison.notes,
-            legend=[
-                LegendEntry(letter(i), f"{group.label}: {len(group.runs)} run{'s'[: len(group.runs) - 1]}")
-                for i, group in enumerate(groups)
-            ],
-            metrics=[_metric(metric, labels) for metric in comparison.metrics],
-            plots=plots,
-            footnote=footnote,
-            runs=Grid(("run", "group", "name", "seed", "status"), rows),
-            moment=comparison.moment,
-        )
+        "compare.html",
+        title=" against ".join(labels) if len(labels) < 4 else f"{len(labels)} groups of runs compared",
+        lead=summary(comparison),
+        notes=comparison.notes,
+        legend=[
+            LegendEntry(letter(i), f"{group.label}: {len(group.runs)} run{'s'[: len(group.runs) - 1]}")
+            for i, group in enumerate(groups)
+        ],
+        metrics=[_metric(metric, labels) for metric in comparison.metrics],
+        plots=plots,
+        footnote=footnote,
+        runs=Grid(("run", "group", "name", "seed", "status"), rows),
+        moment=comparison.moment,
+        explanation=EXPLANATION,
     )
 
 
@@ -85,28 +69,17 @@ def _metric(metric: MetricResult, labels: list[str]) -> ComparedMetric:
     return ComparedMetric("metric-" + re.sub(r"\W+", "-", metric.name), section, figures)
 
 
-@dataclass(frozen=True)
-class _TasksView(View):
-    TEMPLATE: ClassVar = "tasks.html"
-    title: str
-    sections: Sequence[Section]
-    legend: list[LegendEntry]
-    charts: list[str]
-    moment: str
-    explanation: str = TASKS_EXPLANATION
-
-
 def render_tasks(comparison: TaskComparison) -> str:
     """Return the page of a comparison over environments."""
     labels = [result.label for result in comparison.algorithms]
     return render(
-        _TasksView(
-            title=f"{' against '.join(labels)} over {len(comparison.tasks)} environments",
-            sections=task_sections(comparison)[:-1],
-            legend=tasks_legend(comparison),
-            charts=[chart.svg() for chart in task_charts(comparison)],
-            moment=comparison.moment,
-        )
+        "tasks.html",
+        title=f"{' against '.join(labels)} over {len(comparison.tasks)} environments",
+        sections=task_sections(comparison)[:-1],
+        legend=tasks_legend(comparison),
+        charts=[chart.svg() for chart in task_charts(comparison)],
+        moment=comparison.moment,
+        explanation=TASKS_EXPLANATION,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ from runner.environments.naming import agent_actions_in_words, exploration_in_wo
 from runner.export.plots.comparisons import tables_svg
 from runner.export.plots.curves import Plot, plots_of
 from runner.export.reports.maps import drawn, on_grid, situation, situation_in_words
-from runner.export.reports.rendering import Figure, LegendEntry, Link, View, render
+from runner.export.reports.rendering import Figure, LegendEntry, Link, render
 from runner.recording.reader import Recording
 from runner.recording.run_file import run_title
 from runner.util.humanize import capitalised
@@ -69,10 +69,9 @@ class ShownDivergence:
 
 
 @dataclass(frozen=True)
-class DifferenceView(View):
+class DifferenceView:
     """The page of a difference."""
 
-    TEMPLATE: ClassVar = "diff.html"
     title: str
     lead: str
     notes: Sequence[str]
@@ -91,7 +90,7 @@ class DifferenceView(View):
 def render_diff(difference: RunDiff, a: Recording, b: Recording) -> str:
     """Return the page of a difference of two recordings."""
     groups = [Group(name, (read_series(recording),)) for name, recording in (("A", a), ("B", b))]
-    return render(difference_view(difference, a, b, plots_of(groups)[0]))
+    return render("diff.html", **vars(difference_view(difference, a, b, plots_of(groups)[0])))
 
 
 def difference_view(

@@ -6,7 +6,7 @@ Only what the page shows is kept in memory: not the other steps, and nothing of 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Final
@@ -29,7 +29,7 @@ from runner.export.reports.player_data import (
     short_rows,
     words,
 )
-from runner.export.values import acted, action_in_words, is_image, names_in, number_names, observed
+from runner.export.values import is_image, names_in, number_names, observed, step_actions_in_words
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, leaves_of
@@ -82,10 +82,11 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
         raise no_step(recording, place.title, len(span), first)
     part = span[first : first + limit]
     parts, notes = _shown_parts(recording)
-    in_words = _actions_in_words(recording, place.phase)
+    in_words = step_actions_in_words(recording, place.phase)
+    agents = recording.agents if len(recording.agents) > 1 else ("",)
     before = np.zeros(len(recording.agents))
     rewards, log_times = [np.empty((0, len(before)))], [np.empty(0, np.int64)]
-    actions: dict[str, list[str]] = {agent: [] for agent in in_words}
+    actions: list[dict[str, str]] = []
     observations = [_observations_before(recording, place, span, first, parts)]
     for steps in _steps(recording, place, range(span.start, part[-1] + 1, span.step)):
         paid = steps["rewards"].astype(np.float64)
@@ -95,8 +96,7 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
             shown = steps[earlier:]
             rewards.append(paid[earlier:])
             log_times.append(shown["log_time"].astype(np.int64))
-            for agent, text_of in in_words.items():
-                actions[agent] += [shortened(text_of(step), _MAX_LETTERS) for step in shown]
+            actions += map(in_words, shown)
             observations.append(_observations(recording, shown, parts))
     reward, time = np.concatenate(rewards), np.concatenate(log_times)
     if len(reward) != len(part):
@@ -119,7 +119,10 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
         agents=[spoken(agent) for agent in recording.agents],
         before=[short(value) for value in before.tolist()] if first else [],
         reward=short_rows(reward),
-        actions=[words(agent, "action", own) for agent, own in actions.items()],
+        actions=[
+            words(agent, "action", (shortened(own.get(agent, "–"), _MAX_LETTERS) for own in actions))
+            for agent in agents
+        ],
         texts=texts,
         time=frames,
         series=[*series, *_extras(recording, place.phase, part, notes)],
@@ -144,20 +147,6 @@ def _steps(recording: Recording, place: EpisodePlace, numbers: range) -> Iterato
         chosen = chosen[(chosen["step"] >= numbers.start) & (chosen["step"] < numbers.stop)]
         if len(chosen):
             yield chosen
-
-
-def _actions_in_words(recording: Recording, phase: str) -> dict[str, Callable[[np.void], str]]:
-    """Return by agent how to put its action of a step in words: a dash where it took no part."""
-    agents = recording.agents
-    if len(agents) == 1:
-        in_words = action_in_words(recording, phase)
-        return {"": lambda step: in_words(acted(recording, step))}
-
-    def text_of(number: int, agent: str) -> Callable[[np.void], str]:
-        own = action_in_words(recording, phase, agent)
-        return lambda step: own(acted(recording, step)[agent]) if int(step["acted"]) >> number & 1 else "–"
-
-    return {agent: text_of(number, agent) for number, agent in enumerate(agents)}
 
 
 def _observations_before(

@@ -6,8 +6,9 @@ with the index of each frame's text.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain, islice
 from typing import Final
 
 import numpy as np
@@ -144,31 +145,32 @@ def logged_near(recording: Recording, phase: str, time: Sequence[int]) -> list[L
     """
     tick = schema.STEP_NANOSECONDS
     times = range(max(0, time[0] - _NEAR) * tick, (time[-1] + _NEAR) * tick + 1)
-    by_name: dict[str, Logged] = {}
-    count = 0
-
-    def add(name: str, log_time: int, value: Value) -> None:
-        name = name[:_MAX_LETTERS]
-        one = by_name.setdefault(name, Logged(name, [], []))
-        one.at.append(log_time // tick)
-        one.values.append(value)
-
+    entries: Iterator[tuple[str, int, Value]]
     if recording.has_reports:
-        for report in recording.decoded(schema.TRAIN_METRICS_TOPIC, times=times):
-            for name in ("epsilon", "step_size", "mean_length"):
-                add(name.replace("_", " "), report["log_time"], short(report[name]))
-        return list(by_name.values())
-    for scalar in recording.decoded(schema.SCALAR_TOPIC, times=times):
-        own = scalar["name"] if scalar["phase"] == phase else f"{scalar['name']} ({scalar['phase']})"
-        add(own, scalar["log_time"], short(scalar["value"]))
-        count += 1
-        if count == MAX_LOGGED:
-            break
-    for text in recording.decoded(schema.LOG_TOPIC, times=times):
-        add(text["name"], text["log_time"], text["message"][:_MAX_LETTERS])
-        count += 1
-        if count >= MAX_LOGGED:
-            break
+        entries = (
+            (name.replace("_", " "), report["log_time"], short(report[name]))
+            for report in recording.decoded(schema.TRAIN_METRICS_TOPIC, times=times)
+            for name in ("epsilon", "step_size", "mean_length")
+        )
+    else:
+        scalars = (
+            (
+                scalar["name"] if scalar["phase"] == phase else f"{scalar['name']} ({scalar['phase']})",
+                scalar["log_time"],
+                short(scalar["value"]),
+            )
+            for scalar in recording.decoded(schema.SCALAR_TOPIC, times=times)
+        )
+        texts = (
+            (text["name"], text["log_time"], text["message"][:_MAX_LETTERS])
+            for text in recording.decoded(schema.LOG_TOPIC, times=times)
+        )
+        entries = islice(chain(scalars, texts), MAX_LOGGED)
+    by_name: dict[str, Logged] = {}
+    for name, log_time, value in entries:
+        logged = by_name.setdefault(name[:_MAX_LETTERS], Logged(name[:_MAX_LETTERS], [], []))
+        logged.at.append(log_time // tick)
+        logged.values.append(value)
     return list(by_name.values())
 
 

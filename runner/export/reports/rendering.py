@@ -6,11 +6,10 @@ import functools
 import json
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
 from html import escape
 from importlib.resources import files
 from importlib.resources.abc import Traversable
-from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from runner.drawing import palette, svg, svg_maps
 from runner.recording.metrics import METRICS
@@ -22,13 +21,6 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
 TEMPLATES: Final = files("runner.export") / "templates"
-
-
-@dataclass(frozen=True)
-class View:
-    """The values that a template shows, under the names that it uses."""
-
-    TEMPLATE: ClassVar[str]
 
 
 class LegendEntry(NamedTuple):
@@ -60,10 +52,9 @@ def partials() -> Any:
     return templates().get_template("parts.html").module
 
 
-def render(view: View) -> str:
-    """Return the page of a report."""
-    values = {field.name: getattr(view, field.name) for field in fields(view)}
-    return templates().get_template(view.TEMPLATE).render(values)
+def render(template: str, **values: object) -> str:
+    """Return the page of a report: a template with the values that it shows."""
+    return templates().get_template(template).render(values)
 
 
 @functools.cache

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -24,14 +23,14 @@ from runner.errors import RecordingError
 from runner.export.contents import flat_text, shortcomings, why_no_steps
 from runner.export.encoded import Thumbnails, picture_note, thumbnails
 from runner.export.episodes import first_state, last_whole_evaluation, place_of, ranked, ranked_trials
-from runner.export.plots.curves import Plot, plots_of
+from runner.export.plots.curves import plots_of
 from runner.export.plots.style import PLAIN, CurveStyle
 from runner.export.reports.maps import MapRow, maps_of, stages_of
 from runner.export.reports.playback import MAX_VALUES, playback_of, titled
-from runner.export.reports.rendering import LegendEntry, View, embedded, render, templates
+from runner.export.reports.rendering import LegendEntry, embedded, render, templates
 from runner.recording import schema
 from runner.recording.composition import composition_of
-from runner.recording.metrics import METRICS, Metric
+from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import RecentTraining
 
@@ -86,19 +85,6 @@ class ReportedRun:
     has_tables: bool
 
 
-@dataclass(frozen=True)
-class _ReportView(View):
-    TEMPLATE: ClassVar = "report.html"
-    title: str
-    runs: list[ReportedRun]
-    plots: list[Plot]
-    footnote: str
-    legend: list[LegendEntry]
-    columns: Sequence[Metric]
-    """The metrics of the last evaluations that any run knows."""
-    max_values: int = MAX_VALUES
-
-
 def write_report(
     path: Path,
     recordings: Sequence[Path],
@@ -141,13 +127,23 @@ def render_report(
     progress("drawing")
     groups = groups_of(series)
     legend = [LegendEntry("", group.described) for group in groups]
-    columns = [
+    columns = [  # the metrics of the last evaluations that any run knows
         metric
         for metric in METRICS
         if not (metric.per_agent and any(run.has_tables for run in runs))
         and any(run.last is not None and run.last.value(metric.name) is not None for run in runs)
     ]
-    page = render(_ReportView(_title(runs), runs, *plots_of(groups, style), legend, columns))
+    plots, footnote = plots_of(groups, style)
+    page = render(
+        "report.html",
+        title=_title(runs),
+        runs=runs,
+        plots=plots,
+        footnote=footnote,
+        legend=legend,
+        columns=columns,
+        max_values=MAX_VALUES,
+    )
     return page, [*(note for run in runs for note in run.notes), *values_left_out(series)]
 
 
