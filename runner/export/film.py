@@ -46,32 +46,23 @@ class Shot:
     pictures: Pictures
 
 
-@dataclass(frozen=True)
-class Film:
-    """What was written."""
-
-    frames: int
-    width: int
-    height: int
-
-
 def write_film(
     path: Path,
     shot: Shot,
     fps: float,
-    width: int | None = None,
-    progress: Callable[[int], None] = lambda _: None,
-) -> Film:
+    width: int | None,
+    progress: Callable[[int], None],
+) -> Encoder:
     """Write the film of an episode; the ending of `path` chooses the format.
 
     `fps` are frames, and thus steps, per second; `width` is in pixels, None for about that of the pictures;
-    `progress` is called with the number of frames that are done.
+    `progress` is called with the number of frames that are done. The encoder is returned for its facts.
     """
     with contextlib.closing(shot.pictures), encoder(path, fps) as film:
         for frame in captioned(shot, width):
             film.add(frame)
             progress(film.frames)
-    return Film(film.frames, *film.size)
+    return film
 
 
 def write_grid(
@@ -79,10 +70,10 @@ def write_grid(
     shots: Iterator[Shot],
     columns: int,
     fps: float,
-    width: int | None = None,
-    progress: Callable[[int], None] = lambda _: None,
-    max_frames: int | None = None,
-) -> Film:
+    width: int | None,
+    progress: Callable[[int], None],
+    max_frames: int | None,
+) -> Encoder:
     """Write a film of several episodes side by side; each stays at its last frame until all have ended.
 
     The arguments are those of `write_film`, of episodes row by row; `progress` counts the frames of single
@@ -110,7 +101,7 @@ def write_grid(
                 for frame in islice(frames, 1):
                     canvas[top : top + frame.shape[0], left : left + frame.shape[1]] = frame
             film.add(canvas)
-    return Film(film.frames, *film.size)
+    return film
 
 
 # --- captions ---------------------------------------------------------------------------------------------

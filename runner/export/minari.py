@@ -54,8 +54,8 @@ def write_dataset(
     recording: Recording,
     folder: Path,
     phase: str,
-    ranges: Ranges = (),
-    report: Callable[[int], None] = lambda _: None,
+    ranges: Ranges,
+    report: Callable[[int], None],
 ) -> Written:
     """Write whole episodes into the empty folder of a dataset.
 

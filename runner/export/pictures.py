@@ -1,6 +1,6 @@
 """The pictures of a recorded episode: one source for films, pages, reports and terminals.
 
-    with contextlib.closing(pictures(recording, "train", 12)) as shown:
+    with contextlib.closing(Pictures(recording, "train", 12)) as shown:
         for picture in shown:                       # T + 1 of them for an episode of T steps
             print(picture.t, picture.pixels.shape, picture.action, picture.returns)
 
@@ -110,6 +110,16 @@ def moments_of(recording: Recording, phase: str, episode: int) -> Iterator[Momen
 class Pictures:
     """The pictures of an episode, an iterator; `close` it if it is left before its end.
 
+    Args:
+        recording: the run.
+        phase: `train` or `eval`.
+        episode: among the episodes of the phase, counted from 0.
+        trust: whether what the recording names may be imported, see `runner.replay.trust`.
+
+    Raises:
+        RecordingError: there is no such episode, or the recording has no steps.
+        MissingExtra: a package that draws them is not installed.
+
     Attributes:
         source: what they are made from.
         reason: why they are not drawn again, as a sentence; empty if they are, or have no need to be.
@@ -118,7 +128,7 @@ class Pictures:
         note: why the pictures ended before the steps; empty if they have not.
     """
 
-    def __init__(self, recording: Recording, phase: str, episode: int, trust: bool) -> None:
+    def __init__(self, recording: Recording, phase: str, episode: int, trust: bool = False) -> None:
         require_packages()
         require_steps(recording, "show", may_redo=True)
         self._recording, self._phase, self._episode = recording, phase, episode
@@ -149,22 +159,6 @@ class Pictures:
             yield Picture(**vars(moment), pixels=pixels, note=self.note)
             if self.note:
                 return
-
-
-def pictures(recording: Recording, phase: str, episode: int, trust: bool = False) -> Pictures:
-    """Return the pictures of an episode.
-
-    Args:
-        recording: the run.
-        phase: `train` or `eval`.
-        episode: among the episodes of the phase, counted from 0.
-        trust: whether what the recording names may be imported, see `runner.replay.trust`.
-
-    Raises:
-        RecordingError: there is no such episode, or the recording has no steps.
-        MissingExtra: a package that draws them is not installed.
-    """
-    return Pictures(recording, phase, episode, trust)
 
 
 def source_of(

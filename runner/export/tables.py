@@ -53,10 +53,10 @@ def write_tables(
     recording: Recording,
     folder: Path,
     form: str,
-    phase: str | None = None,
-    episodes: Ranges = (),
-    gz: bool = False,
-    report: Callable[[int], None] = lambda _: None,
+    phase: str | None,
+    episodes: Ranges,
+    gz: bool,
+    report: Callable[[int], None],
 ) -> dict[str, int]:
     """Write the tables of a recording into an empty folder; return the number of rows of each file.
 

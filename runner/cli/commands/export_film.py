@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from runner.export.episodes import EpisodePlace
-    from runner.export.pictures import Pictures
     from runner.recording.reader import Recording
 
 GRID_LENGTHS = 2
@@ -92,7 +91,7 @@ def command(
         raise click.UsageError("--whole is for a grid: the film of one episode is always whole.")
     from runner.export import film
     from runner.export.encoder import format_of
-    from runner.export.pictures import Source, pictures, source_of
+    from runner.export.pictures import Pictures, Source, source_of
 
     with opened_run(run_name, to.recordings) as (run, recording):
         path = to.path(run.file_stem)
@@ -107,7 +106,7 @@ def command(
 
         def shots() -> Iterator[film.Shot]:
             for one in shown:
-                opened.append(pictures(recording, one.phase, one.number, trust))
+                opened.append(Pictures(recording, one.phase, one.number, trust))
                 yield film.Shot(f"{run.title}: {one.title}", opened[-1])
 
         lengths = [len(recording.episode_span(one.phase, one.number)) for one in shown]
@@ -129,7 +128,7 @@ def command(
     if cut:
         say(f"{cut} of {len(shown)} episodes are longer than the film, {longest:,} steps; --whole shows all.")
     what = shown[0].title if len(shown) == 1 else f"{len(shown)} episodes"
-    facts = f"{made.frames:,} frames of {made.width}x{made.height}, {size(path.stat().st_size)}"
+    facts = f"{made.frames:,} frames of {made.size[0]}x{made.size[1]}, {size(path.stat().st_size)}"
     to.report(
         f"{path}: {what}, {opened[0].source}, {facts}",
         path,

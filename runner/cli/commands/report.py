@@ -17,7 +17,7 @@ from runner.cli.options import (
     runs_argument,
     writing_options,
 )
-from runner.cli.output import say
+from runner.cli.output import require_page, say
 from runner.cli.parameter_types import INDEX, TRIAL
 from runner.cli.progress import count_line, stage_line
 from runner.cli.runs import find_all_recorded
@@ -184,20 +184,21 @@ def report_command(
       dualtaxi report hyperparameters -o hyperparameters.html
       dualtaxi report k3v9m2xq --episode 500 --eval 3000:7 --force
     """
-    from runner.export.reports.report import require_packages, write_report
+    from runner.export.reports.report import render_report
 
-    require_packages()
     output, folder = to.path(), recordings_folder(to.recordings)
+    require_page(output, to.force)
     if is_sweep(run_names, folder):
         if episodes or trials:
             raise click.UsageError("the page of a sweep shows no episode: leave out --episode and --eval.")
         _refuse_style(axis, style)
         _report_sweep(run_names[0], folder, to)
         return
-    replays = [*(("train", number, 0) for number in episodes), *(("eval", *trial) for trial in trials)]
+    replays = [*((number,) for number in episodes), *trials]
     paths = [run.recording for run in find_all_recorded(run_names, folder)]
-    with stage_line("reading") as progress, new_file(output, to.force) as path:
-        notes = write_report(path, paths, replays, progress, axis, style)
+    with stage_line("reading") as progress:
+        page, notes = render_report(paths, replays, progress, axis, style)
+    write_text_new(output, to.force, page)
     for note in notes:
         say(note)
     text = f"{output}: {size(output.stat().st_size)}, {counted(len(paths), 'run')}"

@@ -157,6 +157,11 @@ class Canvas:
         """Fill rectangles [n, 4]: x and y of the upper left corner, width and height."""
         self.marks.append(Cells(rectangles, fill))
 
+    def notes(self, lines: Sequence[str]) -> None:
+        """Write small lines of text at the bottom."""
+        for number, line in enumerate(lines):
+            self.text(10, self.height - 10 * (len(lines) - number) + 2, line, size=SMALL)
+
     def place(self, other: Canvas, x: float, y: float) -> None:
         """Draw everything of another canvas with its corner at a point."""
         for mark in other.marks:
@@ -244,6 +249,15 @@ class Chart(Canvas):
             points = np.column_stack([self.x(x), self.y(y)])
             fill = "" if hollow else colour
             self.marks.append(Markers(points, marker, radius, fill, edge or colour, opacity))
+
+    def marked_line(
+        self, x: Values, y: Values, number: int, dash: int = 0, at: tuple[Values, Values] | None = None
+    ) -> None:
+        """Draw a line in a series' colour with about eight of its markers, at other points if given."""
+        self.line(x, y, series_colour(number), dash)
+        marked_x, marked_y = at or (x, y)
+        every = slice(None, None, max(len(marked_x) // 8, 1))
+        self.markers(marked_x[every], marked_y[every], series_colour(number), series_marker(number), 1.7)
 
     def _grid_line(self, start: tuple[float, float], end: tuple[float, float]) -> None:
         self.shape([start, end], stroke=palette.INK, width=0.5, opacity=0.15)

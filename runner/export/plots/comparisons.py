@@ -83,17 +83,14 @@ def profile_chart(
     chart.frame(heading, 25.0 if heading else 14.0, f"{unit}, {sign}", ["percent of runs"])
     for group in groups:
         number = labels.index(group.label)
-        colour, share = series_colour(number), 100 * np.array(group.profile)
+        share = 100 * np.array(group.profile)
         low, high = 100 * np.array(group.profile_low), 100 * np.array(group.profile_high)
         if not np.isnan(low).any():
-            chart.band(levels, low, high, colour, opacity=0.2)
+            chart.band(levels, low, high, series_colour(number), opacity=0.2)
         steps, heights = np.repeat(levels, 2), np.repeat(share, 2)
-        if is_lower_better:  # a share holds from its level on, else up to it
-            chart.line(steps[1:], heights[:-1], colour)
-        else:
-            chart.line(steps[:-1], heights[1:], colour)
-        every = slice(None, None, max(len(levels) // 8, 1))
-        chart.markers(levels[every], share[every], colour, series_marker(number), 1.7)
+        # A share holds from its level on where lower is better, else up to it.
+        line = (steps[1:], heights[:-1]) if is_lower_better else (steps[:-1], heights[1:])
+        chart.marked_line(*line, number, at=(levels, share))
     return chart
 
 

@@ -84,8 +84,7 @@ def curves_sheet(groups: Sequence[Group], panels: Sequence[Panel], style: CurveS
     for number, panel in enumerate(wide):
         chart = panel_chart(panel, len(groups), style)
         sheet.place(chart, 0, head + HEIGHT * (rows - len(wide) + number))
-    for number, line in enumerate(notes):
-        sheet.text(10, sheet.height - 10 * (len(notes) - number) + 2, line, size=SMALL)
+    sheet.notes(notes)
     return sheet
 
 
@@ -206,9 +205,7 @@ def _draw_curve(chart: Chart, panel: Panel, curve: Curve, groups: int, style: Cu
     places, values = curve.places[~np.isnan(values)], values[~np.isnan(values)]
     if not len(places):
         return
-    chart.line(places, values, colour, line)
-    every = slice(None, None, max(len(places) // 8, 1))
-    chart.markers(places[every], values[every], colour, series_marker(number), 1.7)
+    chart.marked_line(places, values, number, line)
 
 
 def _draw_shares(chart: Chart, panel: Panel, style: CurveStyle) -> None:

@@ -48,8 +48,7 @@ def tasks_sheet(comparison: TaskComparison) -> Canvas:
         sheet.text(42, y, f"{letter(i)}: {result.label}, {sum(result.seeds.values())} runs")
     for i, chart in enumerate(charts):
         sheet.place(chart, WIDTH * i, head)
-    for i, line in enumerate(notes):
-        sheet.text(10, height - 10 * (len(notes) - i) + 2, line, size=SMALL)
+    sheet.notes(notes)
     return sheet
 
 
@@ -102,8 +101,5 @@ def _curves(comparison: TaskComparison) -> Chart:
         low, high = np.array(result.curve_low), np.array(result.curve_high)
         if not np.isnan(low).any():
             chart.band(places, low, high, series_colour(i), opacity=0.2)
-        curve = np.array(result.curve)
-        chart.line(places, curve, series_colour(i))
-        every = slice(None, None, max(len(places) // 8, 1))
-        chart.markers(places[every], curve[every], series_colour(i), series_marker(i), 1.7)
+        chart.marked_line(places, np.array(result.curve), i)
     return chart

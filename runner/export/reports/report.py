@@ -34,9 +34,6 @@ from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import RecentTraining
 
-Choice = tuple[str, int, int]
-"""An episode to show: ("train", number, 0), or ("eval", training episodes before it, trial)."""
-
 
 @dataclass(frozen=True)
 class Replay:
@@ -85,24 +82,6 @@ class ReportedRun:
     has_tables: bool
 
 
-def write_report(
-    path: Path,
-    recordings: Sequence[Path],
-    chosen: Sequence[Choice] = (),
-    progress: Callable[[str], None] = lambda _: None,
-    axis: Axis = EPISODES,
-    style: CurveStyle = PLAIN,
-) -> list[str]:
-    """Write the page about some recordings, and return what is missing from it, a sentence each.
-
-    The chosen episodes are shown in addition to those that are always shown; `progress` is called with the
-    next stage of the work; axis and style are those of the plots.
-    """
-    page, missing = render_report(recordings, chosen, progress, axis, style)
-    path.write_text(page, encoding="utf-8")
-    return missing
-
-
 def require_packages() -> None:
     """Check that the packages that a report needs are installed."""
     templates()
@@ -110,12 +89,16 @@ def require_packages() -> None:
 
 def render_report(
     recordings: Sequence[Path],
-    chosen: Sequence[Choice] = (),
+    chosen: Sequence[tuple[int, ...]] = (),
     progress: Callable[[str], None] = lambda _: None,
     axis: Axis = EPISODES,
     style: CurveStyle = PLAIN,
 ) -> tuple[str, list[str]]:
-    """Return the page about some recordings, and what is missing from it; see `write_report`."""
+    """Return the page about some recordings, and what is missing from it, a sentence each.
+
+    The chosen episodes, given as for `place_of`, are shown in addition to those that are always shown;
+    `progress` is called with the next stage of the work; axis and style are those of the plots.
+    """
     require_packages()
     series: list[RunSeries] = []
     runs: list[ReportedRun] = []
@@ -148,7 +131,7 @@ def render_report(
 
 
 def _run(
-    recording: Recording, number: int, chosen: Sequence[Choice], progress: Callable[[str], None]
+    recording: Recording, number: int, chosen: Sequence[tuple[int, ...]], progress: Callable[[str], None]
 ) -> ReportedRun:
     evaluations = evaluation_records(recording)
     environment = recording.environment
@@ -224,7 +207,7 @@ def _facts(recording: Recording) -> dict[str, str]:
     return {key: str(value) for key, value in facts.items()}
 
 
-def _episodes(recording: Recording, chosen: Sequence[Choice]) -> dict[tuple[int, ...], list[str]]:
+def _episodes(recording: Recording, chosen: Sequence[tuple[int, ...]]) -> dict[tuple[int, ...], list[str]]:
     """Return the episodes to show, each with the reasons for it.
 
     They are the chosen ones; the typical, the best and the worst one of the last evaluation, or else of the
@@ -232,22 +215,27 @@ def _episodes(recording: Recording, chosen: Sequence[Choice]) -> dict[tuple[int,
     """
     if not recording.has_actions:
         return {}
-    episodes: dict[tuple[int, ...], list[str]] = {}
-    for phase, number, trial in chosen:
-        episodes.setdefault((number,) if phase == "train" else (number, trial), []).append("chosen")
-    after = last_whole_evaluation(recording)
-    ended = recording.count(schema.TRAIN_EPISODE)
+    after, ended = last_whole_evaluation(recording), recording.count(schema.TRAIN_EPISODE)
+    reasons = [(which, "chosen") for which in chosen]
     if after is not None:
         worst, typical, best = ranked_trials(recording, after)
-        for name, number in (("typical", typical), ("best", best), ("worst", worst)):
-            episodes.setdefault((after, number), []).append(f"{name} trial")
+        reasons += [
+            ((after, typical), "typical trial"),
+            ((after, best), "best trial"),
+            ((after, worst), "worst trial"),
+        ]
     elif ended:
         worst, typical, best = ranked(recording, "train", ended - max(1, ended // 10), ended)
-        for name, number in (("typical", typical), ("best", best), ("worst", worst)):
-            episodes.setdefault((number,), []).append(f"{name} of the last tenth")
+        reasons += [
+            ((typical,), "typical of the last tenth"),
+            ((best,), "best of the last tenth"),
+            ((worst,), "worst of the last tenth"),
+        ]
     if recording.tabular:
-        for name, number in (("first", 0), ("last", max(0, ended - 1))):
-            episodes.setdefault((number,), []).append(f"{name} of training")
+        reasons += [((0,), "first of training"), ((max(0, ended - 1),), "last of training")]
+    episodes: dict[tuple[int, ...], list[str]] = {}
+    for which, reason in reasons:
+        episodes.setdefault(which, []).append(reason)
     return episodes
 
 

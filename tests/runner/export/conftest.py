@@ -41,7 +41,7 @@ def page_of(pictured):
 
     def page(world):
         if world not in made:
-            chosen = [("train", 7, 0), ("train", 30, 0)]
+            chosen = [(7,), (30,)]
             made[world] = render_report([pictured(world).recording], chosen)[0]
         return made[world]
 

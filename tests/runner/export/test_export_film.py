@@ -22,7 +22,7 @@ from runner.cli import cli
 from runner.errors import RunnerError
 from runner.export.encoder import FORMATS, Encoder
 from runner.export.episodes import ranked_episodes, typical_trial
-from runner.export.pictures import pictures
+from runner.export.pictures import Pictures
 from runner.recording.reader import open_recording
 from tests.runner.export.making import made_otherwise
 from tests.runner.loops.making import Rooms, play
@@ -96,7 +96,7 @@ def test_a_job_becomes_a_film_of_its_scene(pictured, tmp_path, ending):
     result = film(run.recording, "--eval", "40:2", "-o", path, "--width", 300)
     assert result.exit_code == 0, result.output
     with open_recording(run.recording) as recording:
-        shown = list(pictures(recording, "eval", 14))
+        shown = list(Pictures(recording, "eval", 14))
     frames = frames_of(path)
     assert frames.shape[2] == 300
     assert len(frames) == len(shown)

@@ -14,7 +14,7 @@ import runner
 from runner.drawing.raster import render_svg
 from runner.drawing.svg import Drawing
 from runner.errors import RecordingError
-from runner.export.pictures import Source, pictures
+from runner.export.pictures import Pictures, Source
 from runner.recording.reader import open_recording
 from runner.runs.marks import MARK_FILE
 from tests.runner.export.making import made_otherwise
@@ -39,7 +39,7 @@ def recorded(folder, env, steps=60, **options):
 
 def test_there_is_a_picture_of_every_state_with_its_step(recording):
     steps = recording.episode_steps("train", 3)
-    shown = list(pictures(recording, "train", 3))
+    shown = list(Pictures(recording, "train", 3))
     assert [picture.t for picture in shown] == list(range(len(steps) + 1))
     assert len({picture.pixels.shape for picture in shown}) == 1
     assert not any(shown[0].rewards)
@@ -52,7 +52,7 @@ def test_there_is_a_picture_of_every_state_with_its_step(recording):
 
 def test_scenes_look_like_the_pictures_of_the_pages(recording):
     mdp, steps = recording.mdp, recording.episode_steps("train", 3)[:30]
-    shown = pictures(recording, "train", 3)
+    shown = Pictures(recording, "train", 3)
     if mdp.scene is None:
         assert shown.source is Source.VALUES
         return
@@ -80,7 +80,7 @@ def test_recorded_frames_are_those_that_the_environment_drew(tmp_path):
     )
     with recording:
         for episode in (0, 1, len(drawn) - 1):
-            shown = pictures(recording, "train", episode)
+            shown = Pictures(recording, "train", episode)
             assert shown.source is Source.RECORDED
             np.testing.assert_array_equal([picture.pixels for picture in shown], drawn[episode])
 
@@ -92,7 +92,7 @@ def test_a_frame_is_shown_until_the_next_recorded_one(tmp_path):
     recording, drawn = recorded(tmp_path, Hidden(), frames_every=4)
     with recording:
         for episode, frames in enumerate(drawn[:-1]):
-            shown = pictures(recording, "train", episode)
+            shown = Pictures(recording, "train", episode)
             assert shown.source is Source.RECORDED
             assert "cannot be imported" in shown.reason  # which is why it is not drawn again
             last = len(frames) - 1
@@ -120,7 +120,7 @@ def test_pictures_drawn_again_are_those_of_the_environment(tmp_path, case):
     )
     with recording:
         for episode in {0, min(1, len(drawn) - 1)}:
-            with contextlib.closing(pictures(recording, "train", episode)) as shown:
+            with contextlib.closing(Pictures(recording, "train", episode)) as shown:
                 assert (shown.source, shown.reason) == (Source.REDRAWN, "")
                 np.testing.assert_array_equal([picture.pixels for picture in shown], drawn[episode])
 
@@ -134,13 +134,13 @@ def test_what_a_recording_names_is_imported_if_it_is_trusted_only(tmp_path):
     with runner.record(own_pole(), tmp_path, make=own_pole) as rec:
         list(play(rec, 60))
     with open_recording(rec.run.recording) as recording:
-        with contextlib.closing(pictures(recording, "train", 0)) as shown:
+        with contextlib.closing(Pictures(recording, "train", 0)) as shown:
             assert shown.source is Source.REDRAWN
         (rec.run.folder / MARK_FILE).unlink()
-        shown = pictures(recording, "train", 0)
+        shown = Pictures(recording, "train", 0)
         assert shown.source is Source.VALUES
         assert "--trust" in shown.reason
-        with contextlib.closing(pictures(recording, "train", 0, trust=True)) as shown:
+        with contextlib.closing(Pictures(recording, "train", 0, trust=True)) as shown:
             assert shown.source is Source.REDRAWN
             assert next(shown).pixels.shape == (400, 600, 3)
 
@@ -150,9 +150,9 @@ def test_pictures_end_with_a_note_where_the_environment_differs(tmp_path):
         list(play(rec, 120))
     other = made_otherwise(rec.run.recording, tmp_path / "other.mcap", max_episode_steps=5)
     with open_recording(other) as recording:
-        shown = list(pictures(recording, "train", 0))
+        shown = list(Pictures(recording, "train", 0))
         steps = recording.episode_steps("train", 0)
-        later = pictures(recording, "train", 1)  # its reset needs those before it
+        later = Pictures(recording, "train", 1)  # its reset needs those before it
     assert later.source is Source.VALUES
     assert "before, at train episode 0, t 4: truncated" in later.reason
     expected = "At step 5 the environment differs from the recording: truncated: recorded False, got True."
@@ -169,7 +169,7 @@ def test_values_are_shown_where_the_environment_begins_otherwise(tmp_path):
         list(play(rec, 150))
     other = made_otherwise(rec.run.recording, tmp_path / "other.mcap", kwargs={"gravity": -5.0})
     with open_recording(other) as recording:
-        shown = pictures(recording, "train", 0)
+        shown = Pictures(recording, "train", 0)
         assert shown.source is Source.VALUES
         assert "first observation" in shown.reason
         assert len(list(shown)) == len(recording.episode_steps("train", 0)) + 1
@@ -181,7 +181,7 @@ def test_values_are_drawn_as_bars_that_follow_them(tmp_path):
 
     recording, _ = recorded(tmp_path, Hidden())
     with recording:
-        shown = pictures(recording, "train", 0)
+        shown = Pictures(recording, "train", 0)
         assert shown.source is Source.VALUES
         assert "cannot be imported" in shown.reason
         frames = [picture.pixels for picture in shown]
@@ -200,7 +200,7 @@ def test_observations_that_are_images_are_shown(tmp_path):
 
     recording, _ = recorded(tmp_path, Camera(), 20)
     with recording:
-        shown = pictures(recording, "train", 0)
+        shown = Pictures(recording, "train", 0)
         assert shown.source is Source.OBSERVATION
         last = recording.episode_steps("train", 0)["next_observation"][:, -1]
         np.testing.assert_array_equal([picture.pixels[..., 0] for picture in shown][1:], last)
@@ -214,7 +214,7 @@ def test_games_and_vectors_have_pictures(tmp_path):
         game.step(dict.fromkeys(game.agents, 1))
     game.close()
     with open_recording(game.run.recording) as recording:
-        shown = pictures(recording, "train", 0)
+        shown = Pictures(recording, "train", 0)
         assert shown.source is Source.REDRAWN
         last = list(shown)[-1]
         assert last.pixels.shape == (700, 700, 3)
@@ -228,7 +228,7 @@ def test_games_and_vectors_have_pictures(tmp_path):
     envs.close()
     with open_recording(envs.run.recording) as recording:
         for episode, record in enumerate(recording.episodes("train")):
-            shown = list(pictures(recording, "train", episode))
+            shown = list(Pictures(recording, "train", episode))
             assert len(shown) == record["length"] + 1
             assert shown[-1].returns[0] == record["returns"][0]
             assert shown[-1].ended == "ended"
@@ -237,7 +237,7 @@ def test_games_and_vectors_have_pictures(tmp_path):
 def test_texts_of_an_observation_are_named(tmp_path):
     recording, _ = recorded(tmp_path, make("RoomsText"))
     with recording:
-        shown = list(pictures(recording, "train", 1))
+        shown = list(Pictures(recording, "train", 1))
         missions = [step["next_observation"]["mission"] for step in recording.transitions("train")]
     assert all(picture.events.startswith("mission ") for picture in shown[1:])
     assert any(repr(mission) in shown[1].events for mission in missions)
@@ -246,4 +246,4 @@ def test_texts_of_an_observation_are_named(tmp_path):
 
 def test_an_episode_that_is_not_there_is_refused(recording):
     with pytest.raises(RecordingError, match="has no training episode 999; there are 40, from 0"):
-        pictures(recording, "train", 999)
+        Pictures(recording, "train", 999)

@@ -16,8 +16,8 @@ import runner
 from runner.analysis.step_reference import StepRef
 from runner.errors import RecordingError
 from runner.export.encoded import encoded_picture
+from runner.export.pictures import Pictures
 from runner.export.pictures import Source as PictureSource
-from runner.export.pictures import pictures
 from runner.export.rerun import selection
 from runner.export.rerun.location import locate
 from runner.export.rerun.runs import Source
@@ -189,7 +189,7 @@ def test_pictures_of_selected_episodes_of_a_vector_are_drawn(tmp_path):
             span = recording.episode_span("train", number)
             own = steps[np.isin(steps["step"], list(span))]["log_time"] // schema.STEP_NANOSECONDS
             shown = dict(picture_rows(exported, f"/train/env_{span.start % N}/frame"))
-            with contextlib.closing(pictures(recording, "train", number)) as expected:
+            with contextlib.closing(Pictures(recording, "train", number)) as expected:
                 assert expected.source is PictureSource.REDRAWN
                 first, *others = [encoded_picture(picture.pixels) for picture in expected]
             assert shown[own[0] - 1] == first

@@ -18,7 +18,7 @@ from runner.archive import layout
 from runner.archive.restoring import restore
 from runner.errors import CannotRedo, ConfigError
 from runner.export.encoded import encoded_pictures
-from runner.export.pictures import Source, pictures
+from runner.export.pictures import Pictures, Source
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
@@ -29,7 +29,7 @@ from tests.runner.loops.making import Counting, Rooms, counting, play, record_co
 
 def shown_states(recording, phase, episode):
     """Return the state that each picture of an episode shows."""
-    with contextlib.closing(pictures(recording, phase, episode)) as shown:
+    with contextlib.closing(Pictures(recording, phase, episode)) as shown:
         assert shown.source is Source.RECORDED
         return [picture.pixels[0, 0].tolist() for picture in shown]
 
@@ -85,7 +85,7 @@ def test_frames_of_chosen_environments(tmp_path):
         ids = {frame["frame_id"] for frame in recording.decoded(recording.topic("/train/frame"))}
         assert ids == {"train/2", "train/2/reset"}
         for number, episode in enumerate(recording.episodes("train")):
-            with contextlib.closing(pictures(recording, "train", number)) as shown:
+            with contextlib.closing(Pictures(recording, "train", number)) as shown:
                 is_chosen = int(episode["last_step"]) % N == 2
                 assert shown.source is (Source.RECORDED if is_chosen else Source.VALUES)
             if is_chosen:
@@ -107,7 +107,7 @@ def test_a_game_has_a_frame_each_step(tmp_path):
                 seen[-1].append(env.render())
     with open_recording(rec.run.recording) as recording:
         for number, frames in enumerate(seen):
-            with contextlib.closing(pictures(recording, "train", number)) as shown:
+            with contextlib.closing(Pictures(recording, "train", number)) as shown:
                 assert shown.source is Source.RECORDED
                 found = [picture.pixels for picture in shown]
             assert len(found) == len(frames) == 6

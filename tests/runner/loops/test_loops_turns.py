@@ -13,7 +13,7 @@ import runner
 from runner.analysis.diff import diff
 from runner.errors import ConfigError
 from runner.execution.verify import check_integrity, verify
-from runner.export.pictures import Source, pictures
+from runner.export.pictures import Pictures, Source
 from runner.recording.reader import open_recording
 from tests.runner.loops.making import dualtaxi
 
@@ -100,7 +100,7 @@ def test_pages_films_and_diffs_show_games_in_turns(tmp_path):
             play(rec, 2, np.random.default_rng(seed))
         runs.append(rec.run)
     with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
-        shown = pictures(a, "train", 0)
+        shown = Pictures(a, "train", 0)
         assert shown.source is Source.REDRAWN
         assert [picture.action[:8] for picture in shown][1:3] == ["player 1", "player 2"]
         found = diff(a, b).divergence
