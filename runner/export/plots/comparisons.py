@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.compare import GroupResult, MetricResult
+from runner.analysis.compare.statistics import Estimate
 from runner.analysis.compare.tasks import AlgorithmResult
 from runner.analysis.diff.tables import TableDiff
 from runner.drawing import palette
@@ -135,7 +136,13 @@ def _draw_group(chart: Chart, group: GroupResult, row: int, number: int) -> None
         median = chart.x.at(group.median)
         chart.shape([(median, height - 7.5), (median, height + 7.5)], stroke=palette.INK, width=1.6)
     if all(map(math.isfinite, (group.iqm.value, group.iqm.low, group.iqm.high))):
-        ends = [(chart.x.at(end), height) for end in (group.iqm.low, group.iqm.high)]
-        chart.shape(ends, stroke=colour, width=3.4)
-        middle = np.array([group.iqm.value]), np.array([float(row)])
-        chart.markers(*middle, colour, series_marker(number), 3.0, edge=palette.INK)
+        draw_estimate(chart, group.iqm, row, number, 3.0)
+
+
+def draw_estimate(chart: Chart, estimate: Estimate, row: int, number: int, radius: float) -> None:
+    """Draw a value as the marker of a series in a row of a chart, and its interval as a thick line."""
+    if math.isfinite(estimate.low):
+        ends = [(chart.x.at(end), chart.y.at(row)) for end in (estimate.low, estimate.high)]
+        chart.shape(ends, stroke=series_colour(number), width=radius + 0.4)
+    value, at = np.array([estimate.value]), np.array([float(row)])
+    chart.markers(value, at, series_colour(number), series_marker(number), radius, edge=palette.INK)

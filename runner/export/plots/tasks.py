@@ -10,9 +10,8 @@ import numpy as np
 
 from runner.analysis.compare.task_sections import AGGREGATES, EXPLANATION
 from runner.analysis.compare.tasks import TaskComparison
-from runner.drawing import palette
-from runner.export.plots.chart import SMALL, Canvas, Chart, Scale, labelled, series_colour, series_marker
-from runner.export.plots.comparisons import letter, profile_chart
+from runner.export.plots.chart import SMALL, Canvas, Chart, Scale, labelled, series_colour
+from runner.export.plots.comparisons import draw_estimate, letter, profile_chart
 from runner.export.plots.curves import HEIGHT, WIDTH
 
 _SCORE: Final = "normalised score"
@@ -75,12 +74,7 @@ def _aggregates(comparison: TaskComparison) -> Canvas:
         )
         chart.x_ticks(labelled(chart.x.ticks))
         for i, result in enumerate(comparison.algorithms):
-            own, height = estimate_of(result), chart.y.at(i)
-            if math.isfinite(own.low):
-                places = [(chart.x.at(end), height) for end in (own.low, own.high)]
-                chart.shape(places, stroke=series_colour(i), width=3.0)
-            point = np.array([own.value]), np.array([float(i)])
-            chart.markers(*point, series_colour(i), series_marker(i), 2.6, edge=palette.INK)
+            draw_estimate(chart, estimate_of(result), i, i, 2.6)
         chart.text(70.0, top + (row - 16) / 2 + 3, name, "end")
         canvas.place(chart, 0, 0)
     return canvas
