@@ -23,10 +23,10 @@ from runner.cli.parameter_types import (
     TARGET,
     TRIAL,
     ConfigName,
-    Ranges,
     RunName,
 )
 from runner.runs.run import recordings_folder
+from runner.util.values import Ranges
 
 if TYPE_CHECKING:
     from runner.export.episodes import EpisodePlace

@@ -13,13 +13,12 @@ from runner.errors import RunnerError
 from runner.runs.catalogue import columns
 from runner.runs.resolve import completions
 from runner.runs.run import recordings_folder
-from runner.util.values import Json
+from runner.util.values import Json, ranges_in, whole_number
 
 if TYPE_CHECKING:
     from runner.analysis.axes import Axis
     from runner.analysis.step_reference import StepRef
 
-Ranges = tuple[tuple[int, int | None], ...]
 """Ranges of episodes: the first, and the one after the last or None."""
 
 
@@ -138,33 +137,16 @@ def _keys(schema: Json, part: Json | None = None, prefix: str = "") -> dict[str,
     return keys
 
 
-def _number(text: str) -> int:
-    """Return a number from 0; `int` would accept signs, blanks and underscores."""
-    if not text.strip().isdecimal():
-        raise ValueError(text)
-    return int(text)
-
-
 def _trial(text: str) -> tuple[int, int]:
     after, colon, trial = text.partition(":")
-    return _number(after), _number(trial) if colon else 0
-
-
-def _ranges(text: str) -> Ranges:
-    ranges = []
-    for part in text.split(","):
-        start, colon, stop = part.strip().partition(":")
-        first = 0 if colon and not start else _number(start)
-        end = first + 1 if not colon else _number(stop) if stop else None
-        ranges.append((first, end))
-    return tuple(ranges)
+    return whole_number(after), whole_number(trial) if colon else 0
 
 
 def _pair(text: str, limit: int) -> tuple[int, int]:
     first, _, second = text.partition("x")
-    if not 1 <= _number(first) <= limit >= _number(second) >= 1:
+    if not 1 <= whole_number(first) <= limit >= whole_number(second) >= 1:
         raise ValueError(text)
-    return _number(first), _number(second)
+    return whole_number(first), whole_number(second)
 
 
 def _step(text: str) -> StepRef:
@@ -195,9 +177,9 @@ SHIPPED: Final = Completed("name", _shipped)
 SETTING: Final = Completed("setting", _settings)
 FILTER_WORD: Final = Completed("filter", _filter_words)
 TRIAL: Final = Parsed("N:TRIAL", "N:TRIAL, such as 3000:0", _trial)
-RANGES: Final = Parsed("ranges", "START:STOP or N, such as 0:20,49980:50000", _ranges)
+RANGES: Final = Parsed("ranges", "START:STOP or N, such as 0:20,49980:50000", ranges_in)
 NUMBERS: Final = Parsed(
-    "numbers", "numbers such as 1000,49000", lambda text: tuple(map(_number, text.split(",")))
+    "numbers", "numbers such as 1000,49000", lambda text: tuple(map(whole_number, text.split(",")))
 )
 PICTURE_SIZE: Final = Parsed(
     "WxH", "WIDTHxHEIGHT up to 8192x8192, such as 1600x900", lambda text: "{}x{}".format(*_pair(text, 8192))

@@ -14,6 +14,8 @@ Json = dict[str, Any]
 """An object parsed from JSON or YAML: what it holds is checked where it is used."""
 JsonView = Mapping[str, Any]
 """The same, only to be read."""
+Ranges = tuple[tuple[int, int | None], ...]
+"""Start and stop of each range; None is the end."""
 MAX_TEXT: Final = 200
 """The most characters of a short text."""
 _PLAIN: Final = frozenset((str, int, float, bool, type(None)))
@@ -145,3 +147,29 @@ def _replaced(value: object) -> object:
     if isinstance(value, dict):
         return {_replaced(key): _replaced(item) for key, item in value.items()}
     return value
+
+
+def whole_number(text: str) -> int:
+    """Return a number from 0; `int` would accept signs, blanks and underscores.
+
+    Raises:
+        ValueError: the text is none.
+    """
+    if not text.strip().isdecimal():
+        raise ValueError(text)
+    return int(text)
+
+
+def ranges_in(text: str) -> Ranges:
+    """Return the ranges in a text such as `0:20,40,49980:`; a single number is a range of one.
+
+    Raises:
+        ValueError: the text is no list of ranges.
+    """
+    ranges = []
+    for part in text.split(","):
+        start, colon, stop = part.strip().partition(":")
+        first = 0 if colon and not start else whole_number(start)
+        end = first + 1 if not colon else whole_number(stop) if stop else None
+        ranges.append((first, end))
+    return tuple(ranges)

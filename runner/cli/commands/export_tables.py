@@ -7,12 +7,12 @@ import click
 from runner.cli.command import Command, option
 from runner.cli.options import Writing, episodes_option, run_argument, writing_options
 from runner.cli.output import say
-from runner.cli.parameter_types import Ranges
 from runner.cli.progress import count_line
 from runner.cli.runs import opened_run
 from runner.export.places import new_folder
 from runner.util.extras import require
 from runner.util.humanize import size
+from runner.util.values import Ranges
 
 _HELP = "Steps, episodes and metrics as tables."
 _phase_option = option(

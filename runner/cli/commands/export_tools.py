@@ -12,10 +12,10 @@ from runner.cli.options import (
     writing_options,
 )
 from runner.cli.output import say
-from runner.cli.parameter_types import Ranges
 from runner.cli.progress import count_line, stage_line
 from runner.cli.runs import opened_run
 from runner.export.places import new_folder
+from runner.util.values import Ranges
 
 
 @click.command("minari", cls=Command, short_help="A Minari dataset, for offline learning.")

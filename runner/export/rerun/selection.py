@@ -14,6 +14,7 @@ from runner.analysis.evaluations import Evaluation, evaluation_after, evaluation
 from runner.export.contents import require_steps, shortcomings, whole_ranges, why_no_steps
 from runner.recording import schema
 from runner.recording.reader import Recording
+from runner.util.values import Ranges
 
 DEFAULT_EPISODES: Final = 20
 """Training episodes of the default selection."""
@@ -29,7 +30,7 @@ DEFAULT_STEPS: Final = 50_000
 class Request:
     """The steps to export; the default selection unless anything is given."""
 
-    episodes: tuple[tuple[int, int | None], ...] = ()
+    episodes: Ranges = ()
     """Ranges of training episodes, the second number excluded; None is the end."""
     evaluations: tuple[int, ...] = ()
     """Evaluations, by the number of training episodes before them."""

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import os
 import pathlib
-import re
 from dataclasses import replace
 from http import HTTPStatus
 from typing import Annotated, Final
@@ -23,6 +22,7 @@ from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recor
 from runner.service.errors import Refused
 from runner.service.problems import BUSY_ERRORS, RUN_ERRORS
 from runner.util.processes import CallFailed
+from runner.util.values import Ranges, ranges_in
 
 router = APIRouter(
     prefix="/runs/{run}",
@@ -40,7 +40,6 @@ FILE: Final[dict[int | str, dict[str, object]]] = {
     304: {"description": "The client has it already."},
     416: {"description": "There is no such range.", "content": {"text/plain": {}}},
 }
-_RANGES: Final = re.compile(r"\d+:\d*|:\d+|\d+")
 
 IfNoneMatch = Annotated[str | None, Header(max_length=1000)]
 
@@ -78,12 +77,7 @@ def recording(run: RecordedRun, if_none_match: IfNoneMatch = None) -> Response:
 @router.get("/checkpoints", summary="The checkpoints of a loop.")
 def checkpoints(run: RecordedRun) -> CheckpointsResponse:
     """Return the checkpoints in order, with their digests; `here` says whether the content is."""
-    return CheckpointsResponse(
-        checkpoints=[
-            CheckpointResponse(**{key: value for key, value in each.as_json().items() if key != "path"})
-            for each in run.checkpoints()
-        ]
-    )
+    return CheckpointsResponse.model_validate({"checkpoints": [each.as_json() for each in run.checkpoints()]})
 
 
 @router.get(
@@ -178,16 +172,11 @@ def _file(path: pathlib.Path, name: str, tag: str, if_none_match: str | None) ->
     return _File(path, media_type=MEDIA, filename=name, headers=headers)
 
 
-def _ranges(text: str) -> tuple[tuple[int, int | None], ...]:
-    """Return (start, stop) of each range of episodes; a single number is that one, an open end None."""
-    ranges: list[tuple[int, int | None]] = []
-    for part in filter(None, text.split(",")):
-        if not _RANGES.fullmatch(part) or len(part) > 40:
-            raise Refused(
-                HTTPStatus.UNPROCESSABLE_ENTITY,
-                f"query.episodes: found {part!r}, expected START:STOP or N, such as 0:20,49980:",
-            )
-        start, colon, stop = part.partition(":")
-        first = int(start or 0)
-        ranges.append((first, (int(stop) if stop else None) if colon else first + 1))
-    return tuple(ranges)
+def _ranges(text: str) -> Ranges:
+    try:
+        return ranges_in(text) if text else ()
+    except ValueError as error:
+        raise Refused(
+            HTTPStatus.UNPROCESSABLE_ENTITY,
+            f"query.episodes: found {text!r}, expected START:STOP or N, such as 0:20,49980:",
+        ) from error

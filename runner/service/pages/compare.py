@@ -19,6 +19,7 @@ from runner.errors import RunnerError
 from runner.export.plots.comparisons import letter
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
+from runner.recording.run_file import EvaluationMetrics
 from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.addresses import link, places_in
@@ -26,7 +27,7 @@ from runner.service.api.comparing import MAX_SCORES, found_runs
 from runner.service.api.reading import AxisName
 from runner.service.dependencies import CatalogueOf, ComputationOf
 from runner.service.fragments import ShownDifference
-from runner.service.pages.frame import RunHead, has_tables, head_of, last_evaluation, result_of
+from runner.service.pages.frame import RunHead, head_of, last_results, result_of
 from runner.service.pages.rendering import page
 from runner.service.pages.replay import panel_of
 from runner.util import humanize
@@ -224,10 +225,11 @@ def _compared(runs: list[Run], here: str) -> Compared:
         ComparedRun(head_of(each), each.recording, letter, f"{letter}: {each.name}", i % 7)
         for i, (each, letter) in enumerate(zip(runs, letters, strict=True))
     ]
-    if not any(map(has_tables, runs)):
+    are_jobs = [each.can_train_again for each in runs]
+    if not any(are_jobs):
         tabs = [tab for tab in tabs if tab[0] != "/tables"]
     differ = len({repr(_flat(each)) for each in runs}) > 1
-    can_explain = len(runs) == 2 and all(map(has_tables, runs)) and differ
+    can_explain = len(runs) == 2 and all(are_jobs) and differ
     return Compared(compared, tabs if len(runs) == 2 else [], here, can_explain)
 
 
@@ -237,13 +239,8 @@ def _flat(run: Run) -> dict[str, str]:
 
 def _results(runs: list[Run]) -> Rows:
     """Return the results of runs, a row for each measure."""
-    last = [last_evaluation(each) for each in runs]
-    metrics = [
-        metric
-        for metric in METRICS
-        if not (metric.per_agent and all(map(has_tables, runs)))
-        and any(each.values.get(metric.name) is not None for each in last)
-    ]
+    last = [last_results(each).last_evaluation or EvaluationMetrics() for each in runs]
+    metrics = [metric for metric in METRICS if any(each.values.get(metric.name) is not None for each in last)]
     digests = [str(each.summary.content_digest or humanize.UNKNOWN)[:16] for each in runs]
     return [
         ("Status", [each.status for each in runs]),

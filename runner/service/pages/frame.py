@@ -74,11 +74,11 @@ def head_of(run: Run) -> RunHead:
         "episodes": has_episodes,
         "evaluations": has_episodes,
         "rerun": has_episodes,
-        "learned": has_tables(run) or _has_recorded_tables(run),
-        "when": has_tables(run),
-        "why": has_tables(run),
+        "learned": run.can_train_again or _has_recorded_tables(run),
+        "when": run.can_train_again,
+        "why": run.can_train_again,
         "pictures": bool(run.summary.messages.get(schema.IMAGE_TOPIC.name))
-        or (run.status == "running" and not has_tables(run)),
+        or (run.status == "running" and not run.can_train_again),
     }
     return RunHead(
         id=run.run_id,
@@ -92,11 +92,6 @@ def head_of(run: Run) -> RunHead:
     )
 
 
-def has_tables(run: Run) -> bool:
-    """Return whether the Q-tables of a run are known, without opening its recording."""
-    return run.can_train_again
-
-
 def _has_recorded_tables(run: Run) -> bool:
     """Return whether a loop recorded tables that can be drawn as maps; only one with arrays is opened."""
     if not run.summary.messages.get(schema.ARRAY_TOPIC.name):
@@ -106,13 +101,13 @@ def _has_recorded_tables(run: Run) -> bool:
     return False
 
 
-def loop_results(run: Run) -> Summary:
-    """Return the last results of a loop as `loop_summary` does; empty if the recording cannot be read."""
-    try:
-        with open_recording(run.recording) as recording:
-            return loop_summary(recording)
-    except RecordingError:
-        return Summary()
+def last_results(run: Run) -> Summary:
+    """Return the last results of a run; a loop's are empty if its recording cannot be read."""
+    if run.can_train_again:
+        return run.summary
+    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
+        return loop_summary(recording)
+    return Summary()
 
 
 def environment_of(run: Run) -> str:
@@ -127,10 +122,3 @@ def result_of(metric: EvaluationMetric, evaluation: EvaluationMetrics) -> tuple[
     value = evaluation.values.get(metric.name)
     heading = metric.heading.removesuffix(metric.suffix).capitalize()
     return f"{heading} in the last evaluation", humanize.number(value) + metric.suffix * (value is not None)
-
-
-def last_evaluation(run: Run) -> EvaluationMetrics:
-    """Return the measures of the last evaluation of a run; all unknown without one."""
-    if not has_tables(run):
-        return loop_results(run).last_evaluation or EvaluationMetrics()
-    return run.summary.last_evaluation or EvaluationMetrics()

@@ -24,7 +24,7 @@ from runner.service import fragments
 from runner.service.addresses import link
 from runner.service.dependencies import ComputationOf, RecordedRun
 from runner.service.guard import POLICY
-from runner.service.pages.frame import has_tables, run_page
+from runner.service.pages.frame import run_page
 from runner.service.pages.rendering import page
 from runner.util.extras import missing
 from runner.util.files import cache_folder, replacing, storage_errors
@@ -63,7 +63,7 @@ async def frame(
     query: dict[str, object] = {}
     if step:
         query = {"episodes": step.episode} if step.after is None else {"evaluations": step.after}
-        if not has_tables(run):
+        if not run.can_train_again:
             query |= {"trials": place["trials"], "frames": "true"}
     values = {
         "title": f"{run.name}, {run.run_id}",

@@ -39,7 +39,7 @@ from runner.service.dependencies import (
     SettingsOf,
 )
 from runner.service.jobs.queue import JobQueue
-from runner.service.pages.frame import environment_of, has_tables, loop_results, result_of, run_page
+from runner.service.pages.frame import environment_of, last_results, result_of, run_page
 from runner.service.pages.rendering import Form, message_of, page
 from runner.service.settings import Settings
 from runner.util import humanize
@@ -221,9 +221,9 @@ def _done_by(run: Run) -> Json:
 
 def _results(run: Run, last: EvaluationMetrics) -> dict[str, str]:
     """Return the last results of a run by name; of a loop, the known ones."""
-    if has_tables(run):
+    if run.can_train_again:
         return dict(result_of(metric, last) for metric in METRICS if not metric.per_agent)
-    results = loop_results(run)
+    results = last_results(run)
     recent = results.recent_training or RecentTraining(episodes=0)
     episodes = f"the last {recent.episodes:,} training episodes"
     evaluation = results.last_evaluation or EvaluationMetrics()
