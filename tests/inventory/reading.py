@@ -27,6 +27,9 @@ _MASKS: Final = (
     (r"# (k|M|G)?B\b", "SIZE"),
     (r"# (ns|us|µs|ms|s|min|h|d|days?|hours?|minutes?|seconds?)\b", "TIME"),
     (r"(TIME ?)+( ago)?", "TIME"),
+    (r"#[kMG]\b", "#"),  # how quick the machine is decides the unit
+    (r"^seconds # #$", ""),  # of a difference, whose two times may be equal
+    (r"^(stderr: )?Matplotlib is building the font cache.*", ""),  # on its first start
     (r"\bjust now\b|\bnow\b", "TIME"),
 )
 """Patterns of what differs from run to run or machine to machine, and what stands for them."""
