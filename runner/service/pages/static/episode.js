@@ -20,7 +20,8 @@ function moved(k) {
 
 const at = Number(root.dataset.at),
   pictures = picturesOf(root, at);
-const { episode } = await partAt(source, at);
+root.setAttribute("aria-busy", "true");
+const { episode } = await partAt(source, at).finally(() => root.removeAttribute("aria-busy"));
 const replay = new Replay(root, { load: async (k) => (await partAt(source, k)).episode, moved, pictures });
 replay.begin(episode, at);
 

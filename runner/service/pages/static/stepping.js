@@ -20,15 +20,20 @@ async function start(root) {
 }
 
 const roots = [...document.querySelectorAll("[data-source]")];
-for (const root of roots) root.querySelector(".description").textContent = "Loading …";
+for (const root of roots) {
+  root.setAttribute("aria-busy", "true");
+  root.querySelector(".description").textContent = "Loading …";
+}
 const offset = (replay) => Number(replay.root.dataset.offset ?? 0);
 const replays = (
   await Promise.all(
     roots.map((root) =>
-      start(root).catch((error) => {
-        root.querySelector(".description").textContent = error.message;
-        return null;
-      }),
+      start(root)
+        .catch((error) => {
+          root.querySelector(".description").textContent = error.message;
+          return null;
+        })
+        .finally(() => root.removeAttribute("aria-busy")),
     ),
   )
 ).filter(Boolean);
