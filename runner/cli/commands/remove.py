@@ -146,6 +146,7 @@ def _prune_explanations(recordings: Sequence[Path], dry_run: bool, yes: bool, as
     from runner.debugging.explanation_files import remove_trained, trained_in
 
     explanations = [each for folder in recordings for each in trained_in(folder)]
+    rows = [{"name": each.name, "bytes": each.bytes} for each in explanations]
     freed = sum(each.bytes for each in explanations)
     if not explanations and not as_json:
         say("There is nothing to remove.")
@@ -160,7 +161,6 @@ def _prune_explanations(recordings: Sequence[Path], dry_run: bool, yes: bool, as
         _confirm(f"Remove {what} for good, and free {size(freed)}?", yes)
         for each in explanations:
             remove_trained(each)
-    rows = [{"name": each.name, "bytes": each.bytes} for each in explanations]
     _print_removed(what, {"dry_run": dry_run, "freed": freed, "removed": rows}, as_json)
 
 
