@@ -203,7 +203,9 @@ def submit(
     is_watched: bool = option(
         "--watch", is_flag=True, help="Wait until the job is over, and show its progress."
     ),
-    workers: int | None = workers_option("all of the server", "Number of runs to do in parallel; only for sweeps."),
+    workers: int | None = workers_option(
+        "all of the server", "Number of runs to do in parallel; only for sweeps."
+    ),
     server: Server = server_options,
     as_json: bool = json_option,
 ) -> None:
