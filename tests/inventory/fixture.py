@@ -61,6 +61,7 @@ def same_everywhere() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Observer, "take", take_measured)
+        patch.setattr(Observer, "wants_host", lambda _: False)
         machine = {"dualtaxi": "1.0", "python": "3.11", "platform": "Linux"}
         patch.setattr(provenance, "_machine", lambda: machine)
         patch.setattr(provenance, "_packages", lambda: {"package.gymnasium": "1.2"})

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -11,19 +14,18 @@ from runner.service.app import create_app
 from runner.service.settings import Settings
 from tests.browsing import chromium
 from tests.doors import commands, routes
-from tests.inventory.comparing import ADVICE, differences, gone_patterns, read
 from tests.inventory.forms import ADDRESSES, COMMANDS, PARTS, ROUTES, UNTYPED
-from tests.inventory.taking import FILES, Shop
 
 
 @pytest.mark.timeout(900)
-def test_every_form_is_as_inventoried(tmp_path):
-    with chromium() as browser, Shop(tmp_path) as shop:
-        taken = {name: take(shop, browser) for name, take in FILES.items()}
-    gone = gone_patterns()
-    problems = [text for name, found in taken.items() for text in differences(read(name), found, gone)]
-    if problems:
-        pytest.fail("\n".join([*problems, ADVICE]), pytrace=False)
+def test_every_form_is_as_inventoried():
+    with chromium():
+        pass  # or the test is skipped
+    # In a process of its own: what serves pages keeps the environment in which its helpers were started.
+    command = [sys.executable, "-m", "tests.inventory"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[2])
+    if done.returncode:
+        pytest.fail(done.stdout + done.stderr[-4000:], pytrace=False)
 
 
 def without(paths, addresses):
