@@ -306,7 +306,7 @@ def test_a_killed_loop_keeps_its_actions_up_to_the_last_second(tmp_path):
     process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)])
     try:
         until(
-            lambda runs: runs and runs[0].recording.stat().st_size > 40_000,
+            lambda runs: runs and runs[0].recording.exists() and runs[0].recording.stat().st_size > 40_000,
             lambda: runner.list_runs(tmp_path),
         )
     finally:
