@@ -28,7 +28,7 @@ _MASKS: Final = (
     (r"# (ns|us|µs|ms|s|min|h|d|days?|hours?|minutes?|seconds?)\b", "TIME"),
     (r"(TIME ?)+( ago)?", "TIME"),
     (r"#[kMG]\b", "#"),  # how quick the machine is decides the unit
-    (r"^seconds # #$", ""),  # of a difference, whose two times may be equal
+    (r"^\s*seconds\s+#\s+#\s*$", ""),  # of a difference, whose two times may be equal
     (r"^(stderr: )?Matplotlib is building the font cache.*", ""),  # on its first start
     (r"\bjust now\b|\bnow\b", "TIME"),
 )
