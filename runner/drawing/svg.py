@@ -62,7 +62,7 @@ _OFFSETS: Final = {"mover": (0, 16), "goal": (0, 0), "passenger": (4, -24)}
 """Where a kind of thing is drawn, from the middle of its cell."""
 _CARRIED_OFFSET: Final = (-4, -22)
 """Where a carried thing is drawn, from its carrier."""
-_VEHICLES: Final = ("taxi", "car", "bus", "truck")
+VEHICLES: Final = ("taxi", "car", "bus", "truck")
 _CAR: Final = (
     '<path class="g-outline" fill="{colour}" d="M-25 -5L-18 -25H13L25 -5H35a5 5 0 0 1 5 5V13H-40V0'
     'a5 5 0 0 1 5 -5Z"/><path class="g-glass" d="M-19 -5L-14 -20H-3V-5ZM2 -5V-20H10L18 -5Z"/>'
@@ -149,9 +149,8 @@ class Drawing:
     def walls(self) -> str:
         """Return the walls between cells."""
         lines = []
-        for (row, column), (other_row, other_column) in self._scene["walls"]:
-            x, y = MARGIN + max(column, other_column) * CELL, MARGIN + max(row, other_row) * CELL
-            ends = (x, y, x, y + CELL) if row == other_row else (x, y, x + CELL, y)
+        for wall in self._scene["walls"]:
+            ends = (MARGIN + place * CELL for point in wall_ends(wall) for place in point)
             lines.append('<line class="g-wall" x1="{}" y1="{}" x2="{}" y2="{}"/>'.format(*ends))
         return "".join(lines)
 
@@ -203,7 +202,7 @@ class Drawing:
             return _PERSON
         label = thing["label"]
         sign = escape(label[-1] if label[-1].isdigit() else label[0].upper())
-        pattern = _CAR if label.split()[0] in _VEHICLES else _PAWN
+        pattern = _CAR if label.split()[0] in VEHICLES else _PAWN
         return pattern.format(colour=self.colour(number), sign=sign if len(self.movers) > 1 else "")
 
     def colour(self, mover: int) -> str:
@@ -249,6 +248,12 @@ def picture(width: float, height: float, title: str, content: str) -> str:
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" role="img" '
         f'aria-label="{escape(title)}">{content}</svg>'
     )
+
+
+def wall_ends(cells: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
+    """Return the ends (x, y) of the wall between two neighbouring cells, in cells from the upper left."""
+    y, x = (max(ends) for ends in zip(*cells, strict=True))
+    return [(x, y), (x, y + 1) if cells[0][0] == cells[1][0] else (x + 1, y)]
 
 
 def corner(scene: SceneDescription, cell: int) -> tuple[int, int]:

@@ -20,8 +20,8 @@ from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names, numbered_actions, spoken
 from runner.export.rerun.scene import Scene
-from runner.export.rerun.tracks import Column, Track
-from runner.util.arrays import Array
+from runner.export.rerun.tracks import Column, Floats, Points, Track
+from runner.util.arrays import Ints, Records
 
 MAX_REWARDS: Final = 2_000
 MAX_T: Final = 10_000
@@ -52,17 +52,17 @@ class Labels:
         self.mdp, self.scene, self.learners = mdp, scene, tuple(learners)
         self.texts: list[str] = []
         self._colours: list[str] = []
+        self._masks = np.unique(np.append(mdp.events, np.uint32(0)))
+        """The sets of events that a step can have."""
         if scene:
             self._add_movers(scene)
-        passengers = [scene.label(thing) for thing in scene.passengers] if scene else []
-        self.waiting = self._add(passengers, palette.PASSENGER)
-        """The first passenger's label."""
-        self.riding = self._add([""], palette.PASSENGER)
-        """The empty label of a passenger that is carried: the label of its carrier shows it."""
+            self._waiting = self._add([scene.labels[i] for i in scene.passengers], palette.PASSENGER)
+        self._riding = self._add([""], palette.PASSENGER)
+        """A passenger that is carried: the label of its carrier shows it."""
         self._longest = min(mdp.step_limit or MAX_T, MAX_T)
         self._t = self._add([*(f"t = {k}" for k in range(self._longest)), f"t ≥ {self._longest}"])
-        self._rewards: list[tuple[int, NDArray[np.float64]]] = []
-        """For each learner its first label, and the rewards it can get, ascending."""
+        self._rewards: list[tuple[int, int, Floats]] = []
+        """Learner, first label, and the rewards it can get, ascending."""
         rewards, is_alone = mdp.rewards_of(len(learners)), len(learners) == 1
         for i, learner in enumerate(learners):
             distinct = np.unique(rewards[..., i])
@@ -70,17 +70,21 @@ class Labels:
                 prefix = "reward" if is_alone else f"reward of {spoken(learner)}"
                 colour = palette.MIDTONE if is_alone else palette.agent(i)
                 first = self._add([f"{prefix} {reward:g}" for reward in distinct], colour)
-                self._rewards.append((first, distinct))
+                self._rewards.append((i, first, distinct))
         self.unmarked = self._add([""])
         self.greedy = self._add(["●"])
         """The mark of the greedy action."""
         self.exploited = self._add(["greedy"], palette.GOOD)
         """The mark of the chosen action if it was not explored."""
         self.explored = self._add(["explored"], palette.BAD)
-        self.stops: list[NDArray[np.int64]] = []
+        self.stops: list[Ints] = []
         """For each agent, [own actions]: the letter of an action such as a pickup; -1 for a move."""
-        if scene:
-            self._add_stops(scene)
+        for agent, names in enumerate(numbered_actions(mdp)) if scene else ():
+            numbers = np.full(len(names), -1)
+            for own, action in enumerate(mdp.scene["actions"] if mdp.scene and action_names(mdp) else ()):
+                if not any(action.get("move") or ()):
+                    numbers[own] = self._add([names[own][0].upper()], palette.agent(agent))
+            self.stops.append(numbers)
         self._add_levels(*value_range)
 
     def track(self, root: str) -> Track:
@@ -102,35 +106,37 @@ class Labels:
         return Track(f"{root}/", static=[[Column(rr.AnnotationContext.descriptor_context(), context)]])
 
     @cached_property
-    def points(self) -> NDArray[np.float32]:
+    def points(self) -> Points:
         """[S, texts, 2]: where the texts of each state are; `t` and the rewards below the grid."""
         scene, rewards = self.scene, len(self._rewards)
         assert scene is not None
-        offsets = [[0.0, MOVER_LABEL_Y]] * len(scene.movers)
-        offsets += [[0.0, PASSENGER_LABEL_Y]] * len(scene.passengers)
-        points = scene.points + np.array(offsets, np.float32).reshape(-1, 2)
+        rise = np.repeat([MOVER_LABEL_Y, PASSENGER_LABEL_Y], [len(scene.movers), len(scene.passengers)])
+        points = scene.points + np.stack((0 * rise, rise), axis=1).astype(np.float32)
         x = np.array([0.25] + [0.65] * rewards) * scene.columns
         y = scene.rows + STATUS_Y + STATUS_LINE * np.array([0, *range(rewards)])
         status = np.stack((x, y), axis=1).astype(np.float32)
         return np.concatenate((points, np.broadcast_to(status, (len(points), *status.shape))), axis=1)
 
-    def of_movers(self, is_carrying: NDArray[np.int64], events: NDArray[np.uint32]) -> NDArray[np.uint16]:
-        """Return the label of each mover in each step, [n, movers]: its name, and what happened to it."""
-        movers = np.arange(len(self._movers))[None, :]
-        return self._movers[movers, is_carrying, np.searchsorted(self._masks, events)[:, None]]
+    def of_steps(self, records: Records, events: NDArray[np.uint32]) -> NDArray[np.uint16]:
+        """Return the label of each text in each step, [n, texts].
 
-    def of_t(self, t: Array) -> NDArray[np.uint16]:
-        """Return the label of each `t`, [n, 1]."""
-        return np.asarray(self._t + np.minimum(t, self._longest), np.uint16)[:, None]
+        Movers have their name and what happened to them.
+        """
+        scene, state = self.scene, records["state"].astype(np.int64)
+        assert scene is not None
+        movers = 2 * np.arange(len(scene.movers)) + scene.is_carrying[state]
+        waiting = self._waiting + np.arange(len(scene.passengers))
+        labels = [
+            movers * len(self._masks) + np.searchsorted(self._masks, events)[:, None],
+            np.where(scene.is_carried[state], self._riding, waiting),
+            self._t + np.minimum(records["t"], self._longest)[:, None],
+        ]
+        for i, first, distinct in self._rewards:
+            number = np.searchsorted(distinct, records["rewards"][:, [i]])
+            labels.append(first + number.clip(max=len(distinct) - 1))
+        return np.concatenate(labels, axis=1, dtype=np.uint16, casting="unsafe")
 
-    def of_rewards(self, rewards: NDArray[np.float64]) -> NDArray[np.uint16]:
-        """Return the label of each learner's reward, [n, labelled learners]."""
-        labels = np.empty((len(rewards), len(self._rewards)), np.uint16)
-        for i, (first, distinct) in enumerate(self._rewards):
-            labels[:, i] = first + np.searchsorted(distinct, rewards[:, i]).clip(max=len(distinct) - 1)
-        return labels
-
-    def of_values(self, values: NDArray[np.float64]) -> NDArray[np.uint16]:
+    def of_values(self, values: Floats) -> NDArray[np.uint16]:
         """Return the label of each value."""
         levels = np.rint(np.nan_to_num(values, posinf=np.inf, neginf=-np.inf) / self._unit) - self._lowest
         return (self._levels + levels.clip(0, self._level_count - 1)).astype(np.uint16)
@@ -144,28 +150,13 @@ class Labels:
 
     def _add_movers(self, scene: Scene) -> None:
         """Number each mover's label by whether it carries someone, and by the events of a step."""
-        mdp = scene.mdp
-        self._masks = np.unique(np.append(mdp.events, np.uint32(0)))
-        self._movers = np.zeros((len(scene.movers), 2, len(self._masks)), np.uint16)
         for i, (mover, agent) in enumerate(zip(scene.movers, scene.mover_agents, strict=True)):
-            for carries in (0, 1):
-                for k, mask in enumerate(self._masks.tolist()):
-                    events = _event_labels(mdp, mask, agent)
-                    name = scene.label(mover) + (" + passenger" if carries else "")
+            for carried in ("", " + passenger"):
+                for mask in self._masks.tolist():
+                    events = _event_labels(scene.mdp, mask, agent)
                     is_bad = any(event.startswith(BAD_SIGN) for event in events)
-                    text = f"{name}: {', '.join(events)}" if events else name
-                    self._movers[i, carries, k] = self._add(
-                        [text], palette.BAD if is_bad else palette.agent(i)
-                    )
-
-    def _add_stops(self, scene: Scene) -> None:
-        is_named = action_names(scene.mdp) is not None
-        for agent, names in enumerate(numbered_actions(scene.mdp)):
-            numbers = np.full(len(names), -1)
-            for own, action in enumerate(scene.description["actions"] if is_named else ()):
-                if not any(action.get("move") or ()):
-                    numbers[own] = self._add([names[own][0].upper()], palette.agent(agent))
-            self.stops.append(numbers)
+                    text = ": ".join(filter(None, (scene.labels[mover] + carried, ", ".join(events))))
+                    self._add([text], palette.BAD if is_bad else palette.agent(i))
 
     def _add_levels(self, low: float, high: float) -> None:
         """Number values to three digits of the greatest one, with a margin on both sides."""

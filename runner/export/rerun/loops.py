@@ -143,10 +143,10 @@ class LoopReader:
             grid = None
             if scene and spans:
                 labels = Labels(recording.mdp, scene, recording.agents)
-                grid = StepTracks(f"{root}/{phase}", phase, labels)
+                grid = StepTracks(f"{root}/{phase}", phase, title, labels)
                 yield labels.track(root)
                 yield from background(root, scene, grid_view(title, scene))
-                yield from grid.still(title)
+                yield from grid.still
             ends = [block["log_time"] for block in recording.blocks(schema.TRAIN_EPISODE)] if grid else []
             for steps in self._batches(phase, spans):
                 yield from self._lines_of(phase, steps)

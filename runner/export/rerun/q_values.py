@@ -12,7 +12,6 @@ from typing import Any, Final
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
 from runner.drawing import palette
 from runner.environments.mdp import Mdp
@@ -21,11 +20,22 @@ from runner.export.rerun.labels import Labels
 from runner.export.rerun.metrics import series_lines
 from runner.export.rerun.scene import Scene, crossing_lines
 from runner.export.rerun.steps import Batch
-from runner.export.rerun.tracks import Track, View, columns, point, rgba, scalars, texts
+from runner.export.rerun.tracks import (
+    Floats,
+    Track,
+    View,
+    columns,
+    grey_text,
+    pairs,
+    repeated,
+    scalars,
+    text_track,
+)
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.replay.step_replay import StateProbe
 from runner.replay.tables import TableReplay, known_steps
+from runner.util.arrays import Ints, Records
 
 NAME_X: Final = 1.0
 BAR_LEFT: Final = 2.5
@@ -63,13 +73,13 @@ class ValueReader:
         self._last = (0, -1)
         """Time and context of the step before."""
 
-    def split(self, block: NDArray[np.void]) -> Iterator[NDArray[np.void]]:
+    def split(self, block: Records) -> Iterator[Records]:
         """Yield a block of training steps in parts whose values are either all known or all unknown."""
         first = int(block["step"][0])
         edges = [edge for start, last in self._known_ranges for edge in (start, last + 1)]
         yield from np.split(block, [edge - first for edge in edges if 0 < edge - first < len(block)])
 
-    def values(self, block: NDArray[np.void], train_step: int | None = None) -> tuple[Any, ...]:
+    def values(self, block: Records, train_step: int | None = None) -> tuple[Any, ...]:
         """Return the values of a `Batch` before the update of each step of a part; nothing if unknown.
 
         `train_step` is the number of training steps before a block of evaluation steps.
@@ -98,7 +108,7 @@ class ValueReader:
             tables = self._replay.values_in(block["state"])
         return *self._by_agent(tables), has_map, *maps
 
-    def _by_agent(self, tables: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def _by_agent(self, tables: Floats) -> tuple[Floats, Ints]:
         """Return values and greedy actions by agent, of rows by learner."""
         counts = self._mdp.action_counts
         if tables.shape[1] == len(counts):
@@ -106,43 +116,56 @@ class ValueReader:
             return np.concatenate(own, axis=1), np.stack([q.argmax(axis=1) for q in own], axis=1)
         joint = tables[:, 0].reshape(-1, *counts)
         axes = set(range(1, joint.ndim))
-        best = [joint.max(axis=tuple(axes - {1 + i})) for i in range(len(counts))]
+        best = [joint.max(axis=tuple(axes - {axis})) for axis in sorted(axes)]
         return np.concatenate(best, axis=1), self._mdp.own_actions[tables[:, 0].argmax(axis=1)]
 
 
 class ValueTracks:
     """Makes the table of values of one phase: its numbers as text are rounded, its scalars exact."""
 
-    def __init__(self, path: str, labels: Labels) -> None:
-        self._entity, self._labels, self._mdp = f"{path}/q", labels, labels.mdp
-        counts = self._mdp.action_counts
-        self._y = np.concatenate(_bar_rows(self._mdp))
-        self._agent = np.repeat(np.arange(len(counts)), counts)
+    def __init__(self, root: str, phase: str, labels: Labels) -> None:
+        self._entity, self._labels, mdp = f"{root}/{phase}/q", labels, labels.mdp
+        agents, self._own_actions = len(mdp.agents), mdp.own_actions
+        self._agent = np.repeat(np.arange(agents), mdp.action_counts)
         """[values]: the agent of each value."""
-        self._first = np.cumsum((0, *counts[:-1]))
-        self._explored_bit = np.arange(len(counts)) * (len(labels.learners) == len(counts))
-        height = self._y - LABEL_RISE
-        marks = [np.stack((np.full_like(height, x), height), axis=1) for x in (NUMBER_X, GREEDY_X, CHOSEN_X)]
-        self._points = np.concatenate(marks).astype(np.float32)
+        self._first = np.cumsum((0, *mdp.action_counts[:-1]))
+        self._explored_bit = np.arange(agents) * (len(labels.learners) == agents)
+        y = self._y = 1.0 + np.arange(len(self._agent)) + _AGENT_GAP * self._agent
+        """[values]: the row of each value in the table, from top to bottom."""
+        self._points = pairs((x, row - LABEL_RISE) for x in (NUMBER_X, GREEDY_X, CHOSEN_X) for row in y)
         """The points of each action's number, then of its mark as greedy, then of its mark as chosen."""
-
-    def still(self) -> Iterator[Track]:
-        """Yield what never changes."""
-        names = zip(self._mdp.agents, numbered_actions(self._mdp), strict=True)
-        static = [
-            rr.LineStrips2D.from_fields(
-                colors=[rgba(palette.agent(i)) for i in self._agent.tolist()], radii=0.22
-            ),
+        words, lines, colours = [], [], [palette.rgb(palette.agent(i)) for i in range(agents)]
+        grey = palette.rgb(palette.MIDTONE)
+        for i, names in enumerate(numbered_actions(mdp)):
+            agent, rows = spoken(mdp.agents[i]), y[self._agent == i]
+            words.append((NAME_X, rows[0] - 1.15, agent.upper(), colours[i]))
+            words += [(NAME_X, row, name, grey) for row, name in zip(rows, names, strict=True)]
+            lines += [f"{agent} {name}" for name in names]
+        middle = BAR_LEFT + BAR_LENGTH / 2
+        headings = {middle: "worst to best", NUMBER_X: "Q", GREEDY_X: "greedy", CHOSEN_X: "chosen"}
+        words += [(x, -0.15, heading, grey) for x, heading in headings.items()]
+        xs, ys, texts, tints = zip(*words, strict=True)
+        points = np.stack((xs, np.array(ys) - LABEL_RISE), axis=1)
+        bounds = rrb.VisualBounds2D(x_range=(-0.4, TABLE_WIDTH), y_range=(TABLE_TOP, float(y[-1]) + 0.9))
+        name = "Q-values of this state, before the move"
+        view = View("values", name, rrb.Spatial2DView, {"visual_bounds": bounds})
+        words_style = rr.Points2D(points, labels=texts, colors=tints, radii=0.0, show_labels=True)
+        style = [
+            rr.LineStrips2D.from_fields(colors=[colours[i] for i in self._agent], radii=0.22),
             rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=40.0),
-            series_lines([f"{spoken(agent)} {name}" for agent, actions in names for name in actions]),
+            series_lines(lines),
         ]
-        yield Track(self._entity, static=static, view=table_view(self._mdp))
+        self.still = [
+            Track(f"{root}/table/words", static=[words_style], view=view),
+            Track(self._entity, static=style, view=view),
+        ]
+        """What never changes; the words around the table for both phases."""
 
     def of(self, batch: Batch) -> Iterator[Track]:
         """Yield the values of each step of a batch: as they were before its update."""
         q, labels, first, agent = batch.values, self._labels, self._first, self._agent
         n, count = q.shape
-        own = self._mdp.own_actions[batch.records["action"]]
+        own = self._own_actions[batch.records["action"]]
         is_explored = batch.records["explored"][:, None] >> self._explored_bit & 1
         classes = np.full((n, 3 * count), labels.unmarked, np.uint16)
         classes[:, :count] = labels.of_values(q)
@@ -159,36 +182,36 @@ class ValueTracks:
         shown = [*columns(rr.Points2D, class_ids=classes), *columns(rr.LineStrips2D, strips=bars)]
         yield Track(self._entity, batch.times(), [*scalars(q), *shown])
         rows = np.flatnonzero(batch.has_map)  # the points never change, but are cleared with the rest
-        points = np.broadcast_to(self._points, (len(rows), *self._points.shape))
         if len(rows):
+            points = repeated(self._points, len(rows))
             yield Track(self._entity, batch.times(rows), columns(rr.Points2D, positions=points))
 
 
 class MapTracks:
     """Makes a learner's map in one phase: the greatest value and the greedy moves of every placement."""
 
-    def __init__(self, path: str, labels: Labels, learner: int) -> None:
-        scene, mdp = labels.scene, labels.mdp
+    def __init__(self, root: str, phase: str, labels: Labels, learner: int) -> None:
+        scene, mdp, name = labels.scene, labels.mdp, labels.learners[learner]
         assert scene is not None
         assert scene.placements is not None
         placements = self._placements = scene.placements
-        self._learner, self._name = learner, labels.learners[learner]
-        self._path = f"{path}/map/{self._name}"
+        self._learner, self._path = learner, f"{root}/{phase}/map/{name}"
         is_joint = len(labels.learners) != len(mdp.agents)
-        self._agents = list(range(len(mdp.agents))) if is_joint else [learner]
-        names = [mdp.agents[agent] for agent in self._agents]
-        movers = [scene.mover_agents.index(name) if name in scene.mover_agents else 0 for name in names]
+        agents = list(range(len(mdp.agents))) if is_joint else [learner]
+        movers = [
+            scene.mover_agents.index(mdp.agents[i]) if mdp.agents[i] in scene.mover_agents else 0
+            for i in agents
+        ]
         self._order = placements.order(movers[0])
         self._pixel = np.argsort(self._order)[placements.pixel]
         """[S]: the pixel of each state."""
         row, column = np.divmod(np.arange(len(self._order)), placements.width)
         self._centres = np.stack((column + 0.5, row + 0.5), axis=1).astype(np.float32)
         x = (np.arange(len(movers)) - (len(movers) - 1) / 2) * 2 * _AGENT_OFFSET
-        offsets = np.stack((x, np.zeros(len(movers))), axis=1).astype(np.float32)
-        self._origins = self._centres + offsets[:, None]
+        self._origins = self._centres + np.stack((x, 0 * x), axis=1).astype(np.float32)[:, None]
         """[agents, pixels, 2]."""
         arrows, letters = [], []
-        for agent, mover in zip(self._agents, movers, strict=True):
+        for agent, mover in zip(agents, movers, strict=True):
             own = mdp.own_actions[:, agent]
             actions = np.arange(len(own)) if is_joint else np.unique(own, return_index=True)[1]
             arrows.append(scene.moves[actions, mover] * np.float32(_ARROW_SCALE))
@@ -196,53 +219,42 @@ class MapTracks:
         # The last action is that of pixels without a state, -1.
         self._arrows = np.pad(np.stack(arrows), ((0, 0), (0, 1), (0, 0)))
         self._letters = np.pad(np.stack(letters), ((0, 0), (0, 1)), constant_values=-1)
-
-    def still(self) -> Iterator[Track]:
-        """Yield what never changes."""
-        placements = self._placements
+        height, width = placements.height, placements.width
+        lines = crossing_lines(range(0, height + 1, scene.rows), range(0, width + 1, scene.columns))
         pixels = rr.components.ImageFormat(
-            width=placements.width,
-            height=placements.height,
+            width=width,
+            height=height,
             channel_datatype=rr.ChannelDatatype.F32,
             color_model=rr.ColorModel.L,
         )
-        arrows = rr.Arrows2D.from_fields(
-            origins=self._origins.reshape(-1, 2),
-            colors=[rgba(palette.agent(agent)) for agent in self._agents for _ in self._centres],
-            radii=0.06,
-            draw_order=40.0,
-        )
-        rows, width = placements.block
-        lines = crossing_lines(range(0, placements.height + 1, rows), range(0, placements.width + 1, width))
+        colours = [palette.rgb(palette.agent(agent)) for agent in agents for _ in self._order]
+        origins, red = self._origins.reshape(-1, 2), [palette.rgb(palette.BAD)]
         parts = {
-            "": rr.DepthImage.from_fields(format=pixels, colormap=rr.components.Colormap.Viridis),
-            "/moves": arrows,
-            "/here": rr.Boxes2D.from_fields(colors=[rgba(palette.BAD)], radii=0.1, draw_order=50.0),
-            "/stops": rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=45.0),
-            "/label": rr.Points2D.from_fields(radii=0.0, show_labels=True, colors=[rgba(palette.MIDTONE)]),
+            f"{root}/frame": rr.LineStrips2D(lines, colors=[(255, 255, 255)], radii=0.06, draw_order=30),
+            self._path: rr.DepthImage.from_fields(format=pixels, colormap=rr.components.Colormap.Viridis),
+            f"{self._path}/moves": rr.Arrows2D.from_fields(
+                origins=origins, colors=colours, radii=0.06, draw_order=40.0
+            ),
+            f"{self._path}/here": rr.Boxes2D.from_fields(colors=red, radii=0.1, draw_order=50.0),
+            f"{self._path}/stops": rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=45.0),
+            f"{self._path}/label": grey_text(),
         }
-        bounds = rrb.VisualBounds2D(
-            x_range=(-0.5, placements.width + 0.5), y_range=(-3.2, placements.height + 0.5)
-        )
-        name = f"{spoken(self._name)}: max Q, greedy moves"
-        view = View("values", name, rrb.Spatial2DView, {"visual_bounds": bounds})
-        frame = rr.LineStrips2D(lines, colors=[(255, 255, 255)], radii=0.06, draw_order=30)
-        yield Track(f"{self._path.rsplit('/', 3)[0]}/frame", static=[frame], view=view)
-        for part, static in parts.items():
-            yield Track(self._path + part, static=[static], view=view)
+        bounds = rrb.VisualBounds2D(x_range=(-0.5, width + 0.5), y_range=(-3.2, height + 0.5))
+        title = f"{spoken(name)}: max Q, greedy moves"
+        view = View("values", title, rrb.Spatial2DView, {"visual_bounds": bounds})
+        self.still = [Track(entity, static=[static], view=view) for entity, static in parts.items()]
+        """What never changes; the frame for both phases and all learners."""
 
     def of(self, batch: Batch) -> Iterator[Track]:
         """Yield where each step of a batch is in the map, and the maps that there are."""
-        state, path = batch.records["state"], self._path
+        state, path, placements = batch.records["state"], self._path, self._placements
         here = self._centres.take(self._pixel.take(state), axis=0)[:, None]
         yield Track(f"{path}/here", batch.times(), columns(rr.Boxes2D, centers=here))
         rows = np.flatnonzero(batch.has_map)
         if not (n := len(rows)):
             return
-        times, placements = batch.times(rows), self._placements
-        values, greedy = (
-            maps[:, self._learner][:, self._order] for maps in (batch.value_maps, batch.greedy_maps)
-        )
+        times, maps = batch.times(rows), (batch.value_maps, batch.greedy_maps)
+        values, greedy = (shown[:, self._learner][:, self._order] for shown in maps)
         with np.errstate(all="ignore"):
             low, high = np.nanmin(values, axis=1), np.nanmax(values, axis=1)
         ranges = np.stack((low, np.where(high > low, high, low + 1)), axis=1).astype(np.float64)
@@ -253,9 +265,7 @@ class MapTracks:
         vectors = self._arrows[:, greedy].swapaxes(0, 1).reshape(n, -1, 2)
         letters = self._letters[:, greedy].swapaxes(0, 1)
         is_letter = letters >= 0
-        points = np.broadcast_to(
-            self._origins - np.array([0.0, _LETTER_RISE], np.float32), (*letters.shape, 2)
-        )
+        points = repeated(self._origins - np.array([0.0, _LETTER_RISE], np.float32), n)
         stops = columns(
             rr.Points2D,
             is_letter.sum(axis=(1, 2)),
@@ -267,44 +277,9 @@ class MapTracks:
             f"as of step {time:,}\n{placements.names[context]}"
             for time, context in zip(times["step"].tolist(), contexts, strict=True)
         ]
-        where = point(n, placements.width / 2, MAP_LABEL_Y)
         yield Track(path, times, image)
-        sizes = np.full((n, 1, 2), 0.5, np.float32)
+        sizes = repeated(pairs([(0.5, 0.5)]), n)
         yield Track(f"{path}/here", times, columns(rr.Boxes2D, half_sizes=sizes))
         yield Track(f"{path}/moves", times, columns(rr.Arrows2D, vectors=vectors))
         yield Track(f"{path}/stops", times, stops)
-        yield Track(f"{path}/label", times, columns(rr.Points2D, positions=where, labels=texts(labels)))
-
-
-def table_view(mdp: Mdp) -> View:
-    """Return the view of the table of values."""
-    bottom = float(_bar_rows(mdp)[-1][-1]) + 0.9
-    bounds = rrb.VisualBounds2D(x_range=(-0.4, TABLE_WIDTH), y_range=(TABLE_TOP, bottom))
-    name = "Q-values of this state, before the move"
-    return View("values", name, rrb.Spatial2DView, {"visual_bounds": bounds})
-
-
-def table_words(root: str, mdp: Mdp) -> Track:
-    """Return the headings and names around the table of values."""
-    middle = BAR_LEFT + BAR_LENGTH / 2
-    headings = {middle: "worst to best", NUMBER_X: "Q", GREEDY_X: "greedy", CHOSEN_X: "chosen"}
-    words = []
-    for i, (rows, names) in enumerate(zip(_bar_rows(mdp), numbered_actions(mdp), strict=True)):
-        words.append((NAME_X, rows[0] - 1.15, spoken(mdp.agents[i]).upper(), palette.agent(i)))
-        words += [(NAME_X, y, name, palette.MIDTONE) for y, name in zip(rows, names, strict=True)]
-    words += [(x, -0.15, heading, palette.MIDTONE) for x, heading in headings.items()]
-    x, y, labels, colours = zip(*words, strict=True)
-    points = rr.Points2D(
-        np.stack((x, np.array(y) - LABEL_RISE), axis=1),
-        labels=labels,
-        colors=[rgba(colour) for colour in colours],
-        radii=0.0,
-        show_labels=True,
-    )
-    return Track(f"{root}/table/words", static=[points], view=table_view(mdp))
-
-
-def _bar_rows(mdp: Mdp) -> list[NDArray[np.float64]]:
-    """Return the y of each agent's rows in the table of values, from top to bottom."""
-    starts = np.cumsum((0, *mdp.action_counts)) + 1.0
-    return [np.arange(count) + starts[i] + i * _AGENT_GAP for i, count in enumerate(mdp.action_counts)]
+        yield text_track(f"{path}/label", times, (placements.width / 2, MAP_LABEL_Y), labels)

@@ -8,13 +8,12 @@ from typing import TypeVar
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.export.rerun.labels import Labels
 from runner.export.rerun.metrics import EVENTS, metric_tracks, phase_colours, series_lines
-from runner.export.rerun.q_values import MapTracks, ValueReader, ValueTracks, table_words
+from runner.export.rerun.q_values import MapTracks, ValueReader, ValueTracks
 from runner.export.rerun.scene import background, scene_of
 from runner.export.rerun.selection import Selection
 from runner.export.rerun.steps import Batch, StepTracks, grid_view
@@ -23,14 +22,12 @@ from runner.export.rerun.tracks import (
     Source,
     Track,
     cleared,
-    columns,
-    point,
-    rgba,
     scalars,
-    texts,
+    text_track,
 )
 from runner.recording import schema
 from runner.replay.steps import check_steps
+from runner.util.arrays import Records
 
 T = TypeVar("T")
 
@@ -52,35 +49,34 @@ class JobReader:
         labels = self._labels = Labels(self._mdp, self._scene, recording.agents, (low, high))
         self._phases: dict[str, tuple[StepTracks, list[ValueTracks | MapTracks]]] = {}
         """What makes the tracks of the steps, and of the values at them."""
-        maps = range(len(recording.agents) if self._scene and self._scene.placements else 0)
+        root, maps = (
+            source.root,
+            range(len(recording.agents) if self._scene and self._scene.placements else 0),
+        )
         for phase in (phase for phase, spans in selection.by_phase.items() if spans):
-            path = f"{source.root}/{phase}"
-            values: list[ValueTracks | MapTracks] = [ValueTracks(path, labels)]
-            values += [MapTracks(path, labels, i) for i in maps]
-            self._phases[phase] = StepTracks(path, phase, labels), values
+            values: list[ValueTracks | MapTracks] = [ValueTracks(root, phase, labels)]
+            values += [MapTracks(root, phase, labels, i) for i in maps]
+            self._phases[phase] = StepTracks(f"{root}/{phase}", phase, source.title, labels), values
 
     def overview(self) -> Iterator[Track]:
         """Yield all metrics, and what never changes of the steps."""
-        root, title, agents = self._source.root, self._source.title, self._recording.agents
+        root, agents = self._source.root, self._recording.agents
         yield from metric_tracks(self._source)
         if not self._phases:
             return
         yield self._labels.track(root)
-        yield table_words(root, self._mdp)
         if self._scene:
-            view = grid_view(title, self._scene)
+            view = grid_view(self._source.title, self._scene)
             yield from background(root, self._scene, view)
-            text = rr.Points2D.from_fields(radii=0.0, colors=[rgba(palette.MIDTONE)])
+            text = rr.Points2D.from_fields(radii=0.0, colors=[palette.rgb(palette.MIDTONE)])
             yield Track(f"{root}/notice/text", static=[text], view=view)
         for phase, (steps, values) in self._phases.items():
-            style = series_lines(
-                [f"reward {spoken(name)}" for name in agents], phase_colours(phase, len(agents))
-            )
+            colours = phase_colours(phase, len(agents))
+            style = series_lines([f"reward {spoken(name)}" for name in agents], colours)
             yield Track(f"{steps.path}/reward", static=[style])
             yield Track(f"{steps.path}/events", view=EVENTS)
-            yield from steps.still(title)
-            for shown in values:
-                yield from shown.still()
+            for maker in (steps, *values):
+                yield from maker.still
 
     def steps(self) -> Iterator[Track]:
         """Yield the selected steps."""
@@ -121,7 +117,7 @@ class JobReader:
                 number = block["episode"].astype(np.int64) % trials
                 yield Batch(block, after, number, *reader.values(block, evaluation.train_step))
 
-    def _blocks(self, phase: str, span: range) -> Iterator[NDArray[np.void]]:
+    def _blocks(self, phase: str, span: range) -> Iterator[Records]:
         """Yield the steps of a span, at most a batch at a time, after checking them."""
         recording, topic = self._recording, schema.PHASES[phase][0]
         for block in recording.blocks(topic, span.start, span.stop):
@@ -136,10 +132,9 @@ class JobReader:
         gaps = [(start, stop) for start, stop in zip(starts, stops, strict=True) if max(start, 1) < stop]
         if self._scene is None or not gaps:
             return
-        where = point(len(gaps), self._scene.columns / 2, self._scene.rows / 2)
-        words = texts(["no steps of this time were exported"] * len(gaps))
-        entity, begins = f"{self._source.root}/notice/text", np.array([start for start, _ in gaps])
-        yield Track(entity, {"step": begins}, columns(rr.Points2D, positions=where, labels=words))
+        entity, begins = f"{self._source.root}/notice/text", {"step": np.array([start for start, _ in gaps])}
+        words = ["no steps of this time were exported"] * len(gaps)
+        yield text_track(entity, begins, (self._scene.columns / 2, self._scene.rows / 2), words)
         yield from cleared([entity], [stop for _, stop in gaps if stop <= self.last])
 
 

@@ -21,7 +21,22 @@ from runner.environments.naming import events_in_words, states_in_words
 from runner.export.rerun.labels import Labels
 from runner.export.rerun.metrics import phase_colours, series_lines
 from runner.export.rerun.scene import Scene
-from runner.export.rerun.tracks import Times, Track, View, columns, point, rgba, scalars, texts, times_of
+from runner.export.rerun.tracks import (
+    Floats,
+    Points,
+    Times,
+    Track,
+    View,
+    columns,
+    grey_text,
+    pairs,
+    repeated,
+    scalars,
+    text_track,
+    texts,
+    times_of,
+)
+from runner.util.arrays import Ints, Records
 
 TRAIL_STEPS: Final = 5
 TITLE_Y: Final = -0.62
@@ -32,15 +47,15 @@ NO_ARRAY: Final[NDArray[Any]] = np.empty(0)
 class Batch(NamedTuple):
     """n steps of one phase, with the learners' Q-values and maps of them if they are known."""
 
-    records: NDArray[np.void]
-    episode: NDArray[np.int64]
+    records: Records
+    episode: Ints
     """[n]: training episodes; for evaluation those before it."""
-    number: NDArray[np.int64]
+    number: Ints
     """[n]: the number of the episode, or of the trial within its evaluation."""
-    values: NDArray[np.float64] = NO_ARRAY
+    values: Floats = NO_ARRAY
     """[n, sum of the agents' action counts]: the value of each agent's own actions; with a joint table the
     best over the actions of the others. Empty if they are unknown, or not exported."""
-    greedy: NDArray[np.int64] = NO_ARRAY
+    greedy: Ints = NO_ARRAY
     """[n, agents]: each agent's greedy action."""
     has_map: NDArray[np.bool_] = NO_ARRAY
     """[n]: the k steps that have maps."""
@@ -49,7 +64,7 @@ class Batch(NamedTuple):
     greedy_maps: NDArray[np.int32] = NO_ARRAY
     """[k, learners, pixels]: the learner's greedy action there; -1 for no state."""
 
-    def times(self, rows: slice | NDArray[np.int64] = slice(None)) -> Times:
+    def times(self, rows: slice | Ints = slice(None)) -> Times:
         """Return the timelines of some rows."""
         records = self.records[rows]
         return times_of(records["log_time"], episode=self.episode[rows], t=records["t"])
@@ -58,42 +73,35 @@ class Batch(NamedTuple):
 class StepTracks:
     """Makes the tracks of a phase: the grid, or without a scene states and actions as lines."""
 
-    def __init__(self, path: str, phase: str, labels: Labels) -> None:
+    def __init__(self, path: str, phase: str, title: str, labels: Labels) -> None:
         self.path, self._phase, self._labels = path, phase, labels
         self._states = states_in_words(labels.mdp)
         self._entry = cache(partial(_entry, labels.mdp))
-        self._before: NDArray[np.int64] | None = None
+        self._before: Ints | None = None
         """The last states of the batch before, as many as a trail may show."""
         self.covered: list[tuple[int, int]] = []
         """The stretches of time whose steps were sent: the first, and the one after the last."""
-
-    def still(self, title: str) -> Iterator[Track]:
-        """Yield what never changes."""
-        phase, scene, path = self._phase, self._labels.scene, self.path
-        if scene is None:
+        parts: dict[str, list[Any]] = {}
+        if scene := labels.scene:
+            view = grid_view(title, scene)
+            colours = [palette.rgb(palette.agent(i)) for i in range(len(scene.movers))]
+            radii = [shape.radius for shape in scene.shapes]
+            fills, faded = [palette.rgb(shape.colour) for shape in scene.shapes], [(*c, 120) for c in colours]
+            parts["grid/things"] = [
+                rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=50.0),
+                rr.Boxes2D.from_fields(radii=radii, colors=fills, draw_order=40.0),
+                rr.Arrows2D.from_fields(colors=colours, radii=0.035, draw_order=45.0),
+                rr.LineStrips2D.from_fields(colors=faded, radii=0.05, draw_order=30.0),
+            ]
+            parts["grid/title"] = [grey_text()]
+            goal = palette.rgb(palette.GOAL)
+            parts["grid/goal"] = [rr.Boxes2D.from_fields(colors=[goal], radii=0.04, show_labels=True)]
+        else:
             view = View("grid", f"{title}: state and action", has_focus=True)
             for name, colour in zip(("state", "action"), phase_colours(phase, 2), strict=True):
-                style = series_lines([f"{name} ({phase})"], [colour])
-                yield Track(f"{path}/{name}", static=[style], view=view)
-            return
-        shapes = [shape for _, shape in scene.shapes]
-        colours = [palette.agent(i) for i in range(len(scene.movers))]
-        things = [
-            rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=50.0),
-            rr.Boxes2D.from_fields(
-                radii=[shape.radius for shape in shapes],
-                colors=[rgba(shape.colour) for shape in shapes],
-                draw_order=40.0,
-            ),
-            rr.Arrows2D.from_fields(colors=[rgba(c) for c in colours], radii=0.035, draw_order=45.0),
-            rr.LineStrips2D.from_fields(colors=[rgba(c, 120) for c in colours], radii=0.05, draw_order=30.0),
-        ]
-        text = rr.Points2D.from_fields(radii=0.0, show_labels=True, colors=[rgba(palette.MIDTONE)])
-        goal = rr.Boxes2D.from_fields(colors=[rgba(palette.GOAL)], radii=0.04, show_labels=True)
-        view = grid_view(title, scene)
-        parts: dict[str, list[Any]] = {"things": things, "title": [text], "goal": [goal]}
-        for part, static in parts.items():
-            yield Track(f"{path}/grid/{part}", static=static, view=view)
+                parts[name] = [series_lines([f"{name} ({phase})"], [colour])]
+        self.still = [Track(f"{path}/{part}", static=static, view=view) for part, static in parts.items()]
+        """What never changes."""
 
     def of(self, batch: Batch) -> Iterator[Track]:
         """Yield the tracks of a batch of steps."""
@@ -119,30 +127,22 @@ class StepTracks:
         because a row costs more than its content.
         """
         records, labels, path = batch.records, self._labels, f"{self.path}/grid"
-        state, action, next_state = (
-            records[name].astype(np.int64) for name in ("state", "action", "next_state")
-        )
-        waiting = np.arange(len(scene.passengers)) + labels.waiting
-        classes = [
-            labels.of_movers(scene.is_carrying[state], events),
-            np.where(scene.is_carried[state], labels.riding, waiting).astype(np.uint16),
-            labels.of_t(records["t"]),
-            labels.of_rewards(records["rewards"]),
-        ]
-        points = labels.points.take(state, axis=0)
-        vectors = scene.arrows(state, action, next_state)
+        state, next_state = (records[name].astype(np.int64) for name in ("state", "next_state"))
+        points, origins = labels.points.take(state, axis=0), scene.mover_points.take(state, axis=0)
+        moved = scene.mover_points.take(next_state, axis=0) - origins
+        blocked = scene.moves.take(records["action"].astype(np.int64), axis=0)
+        vectors = np.where(moved.any(axis=2, keepdims=True), moved, blocked)
         things = [
-            *columns(rr.Points2D, positions=points, class_ids=np.concatenate(classes, axis=1)),
+            *columns(rr.Points2D, positions=points, class_ids=labels.of_steps(records, events)),
             *columns(rr.Boxes2D, centers=scene.shape_centres.take(state, axis=0)),
-            *columns(rr.Arrows2D, vectors=vectors, origins=scene.mover_points.take(state, axis=0)),
+            *columns(rr.Arrows2D, vectors=vectors, origins=origins),
             *columns(rr.LineStrips2D, strips=self._trails(scene, state, records["t"])),
         ]
         yield Track(f"{path}/things", times, things)
         # Sizes wherever the grid may have been cleared: static ones would stay visible.
         begins = records["t"] == 0
         rows = np.flatnonzero(begins | (np.diff(times["step"], prepend=-1) != 1))
-        half_sizes = np.array([shape.half_size for _, shape in scene.shapes], np.float32).reshape(-1, 2)
-        sizes = np.broadcast_to(half_sizes, (len(rows), *half_sizes.shape))
+        sizes = repeated(pairs(shape.half_size for shape in scene.shapes), len(rows))
         yield Track(f"{path}/things", batch.times(rows), columns(rr.Boxes2D, half_sizes=sizes))
         if not begins.any():
             return
@@ -153,19 +153,17 @@ class StepTracks:
             else f"EVALUATION after {trained:,} episodes, trial {trial:,}"
             for trained, trial in zip(batch.episode[begins], batch.number[begins], strict=True)
         ]
-        where = point(n, scene.columns / 2, TITLE_Y)
-        yield Track(f"{path}/title", times, columns(rr.Points2D, positions=where, labels=texts(titles)))
+        yield text_track(f"{path}/title", times, (scene.columns / 2, TITLE_Y), titles)
         if scene.goals:
-            names = np.array([scene.label(goal) for goal in scene.goals])
             goals = columns(
                 rr.Boxes2D,
                 centers=scene.goal_points[records["state"][begins]],
-                half_sizes=np.full((n, len(names), 2), 0.44, np.float32),
-                labels=np.broadcast_to(names, (n, len(names))),
+                half_sizes=repeated(pairs([(0.44, 0.44)] * len(scene.goals)), n),
+                labels=repeated(np.array([scene.labels[goal] for goal in scene.goals]), n),
             )
             yield Track(f"{path}/goal", times, goals)
 
-    def _trails(self, scene: Scene, state: NDArray[np.int64], t: NDArray[np.int64]) -> NDArray[np.float32]:
+    def _trails(self, scene: Scene, state: Ints, t: Ints) -> Points:
         """Return each mover's path over the last steps of the episode, [n, movers, TRAIL_STEPS + 1, 2]."""
         before = np.repeat(state[:1], TRAIL_STEPS) if self._before is None else self._before
         states = np.concatenate((before, state))

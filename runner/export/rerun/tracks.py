@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from runner.drawing import palette
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
-from runner.util.arrays import Array
+from runner.util.arrays import Array, Scalar
 
 APPLICATION: Final = "dualtaxi"
 MAX_ROWS: Final = 8_192
@@ -26,6 +26,9 @@ _POINT: Final = pa.list_(pa.field("item", pa.float32(), nullable=False), 2)
 _STRIP: Final = pa.list_(pa.field("item", _POINT, nullable=False))
 _BLOB: Final = pa.list_(pa.field("item", pa.uint8(), nullable=False))
 T = TypeVar("T")
+Floats = NDArray[np.float64]
+Points = NDArray[np.float32]
+"""[..., 2]: x and y."""
 Row = tuple[int, rr.AsComponents]
 """A step, and what is shown from it on."""
 Times = dict[str, Array]
@@ -191,9 +194,14 @@ def cleared(entities: Iterable[str], steps: Sequence[int]) -> Iterator[Track]:
             yield Track(entity, {"step": np.array(steps)}, columns)
 
 
-def point(n: int, x: float, y: float) -> NDArray[np.float32]:
-    """Return the same point in each of n rows, [n, 1, 2]."""
-    return np.broadcast_to(np.array([[x, y]], np.float32), (n, 1, 2))
+def repeated(row: NDArray[Scalar], n: int) -> NDArray[Scalar]:
+    """Return n rows of the same content, [n, ...]."""
+    return np.broadcast_to(row, (n, *row.shape))
+
+
+def pairs(points: Iterable[Sequence[float]]) -> Points:
+    """Return points or sizes as an array, [points, 2]."""
+    return np.array(list(points), np.float32).reshape(-1, 2)
 
 
 def texts(rows: Sequence[str]) -> NDArray[np.object_]:
@@ -201,11 +209,17 @@ def texts(rows: Sequence[str]) -> NDArray[np.object_]:
     return np.array(rows, dtype=object)[:, None]
 
 
+def text_track(entity: str, times: Times, where: tuple[float, float], rows: Sequence[str]) -> Track:
+    """Return a track of one text per row, always at the same point."""
+    positions = repeated(pairs([where]), len(rows))
+    return Track(entity, times, columns(rr.Points2D, positions=positions, labels=texts(rows)))
+
+
+def grey_text() -> rr.Points2D:
+    """Return how a text without a point is drawn."""
+    return rr.Points2D.from_fields(radii=0.0, show_labels=True, colors=[palette.rgb(palette.MIDTONE)])
+
+
 def _listed(counts: NDArray[np.int64], items: pa.Array, kind: pa.DataType | None = None) -> pa.Array:
     offsets = pa.array(np.append(0, np.cumsum(counts)).astype(np.int32))
     return pa.ListArray.from_arrays(offsets, items, type=kind)
-
-
-def rgba(colour: str, alpha: int = 255) -> tuple[int, int, int, int]:
-    """Return red, green, blue and alpha of a colour "#rrggbb"."""
-    return *palette.rgb(colour), alpha

@@ -118,7 +118,7 @@ class TestSteps:
         points = np.array(table["Arrows2D:origins"])
         for i, mover in enumerate(scene.movers):
             cells = mdp.scene_cells[steps["state"], mover]
-            for shape in [k for k, (owner, _) in enumerate(scene.shapes) if owner == i]:
+            for shape in [k for k, owner in enumerate(scene.owners) if owner == i]:
                 inside = np.floor(boxes[:, shape]).astype(int)
                 assert np.array_equal(inside[:, 1] * scene.columns + inside[:, 0], cells)
             drawn = np.floor(points[:, i]).astype(int)
@@ -186,7 +186,7 @@ def test_the_labels_of_movers_show_illegal_actions(exported):
     if scene is None or "collision" not in mdp.event_names:
         return
     labels, events = Labels(mdp, scene, exported.recording.agents), events_of(mdp, steps)
-    shown = np.array(labels.texts)[labels.of_movers(scene.is_carrying[steps["state"]], events)]
+    shown = np.array(labels.texts)[labels.of_steps(steps, events)]
     illegal = events >> mdp.event_names.index("taxi_2.illegal_pickup") & 1
     assert [("illegal pickup" in label) for label in shown[:, 1]] == illegal.astype(bool).tolist()
     assert not any("illegal pickup" in label for label in shown[illegal == 0, 1])
