@@ -118,6 +118,11 @@ class Evaluation:
     number: int = 0
     """Number of the evaluation from 0, also where a repair lost others."""
 
+    @property
+    def episodes(self) -> NDArray[np.int64]:
+        """The numbers of its trials."""
+        return np.arange(self.start, self.stop)
+
     def trial(self, number: int, where: str) -> int:
         """Return the number of a trial, counted from 0, among those of all evaluations."""
         trials = self.stop - self.start

@@ -28,17 +28,9 @@ MAX_SHOWN: Final = {
 """Views of a group in the blueprint; all are sent."""
 PLACES: Final = ("grid", "log", *MAX_SHOWN)
 """The groups of a loop's views that are no tab."""
-TRAINING_MEANS: Final = ("mean_length", "mean_penalties", "mean_return")
-"""The metrics of evaluations that training has as well."""
 PLOTS: Final = (
     *(
-        (
-            metric.heading.capitalize(),
-            (
-                *(f"train/metrics/{name}" for name in TRAINING_MEANS if name == metric.name),
-                f"eval/metrics/{metric.name}",
-            ),
-        )
+        (metric.heading.capitalize(), (f"train/metrics/{metric.name}", f"eval/metrics/{metric.name}"))
         for metric in METRICS
     ),
     ("Collisions per episode", ("train/metrics/collisions", "eval/metrics/collisions")),

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import colorsys
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
 from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.export.rerun.layout import PLOTS
-from runner.export.rerun.tracks import Source, Times, Track, View, scalars, times_of
+from runner.export.rerun.tracks import Floats, Source, Times, Track, View, scalars, times_of
 from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.metrics import METRICS
+from runner.recording.reader import Recording
+from runner.util.arrays import Array
 
 SCHEDULES: Final = ("epsilon", "step_size", "discount")
 EVENTS: Final = View(
@@ -30,110 +32,118 @@ _ONE_PHASE: Final = ("filled_percent", "reward_percent", "events", "episodes")
 """Metrics of several lines whose view shows one phase alone."""
 
 Colour = tuple[int, int, int]
+Lines = tuple[str, Times, Array, Sequence[str]]
+"""The path of an entity, its times, the values of its lines, [rows, lines], and their names."""
 
 
 def metric_tracks(source: Source) -> Iterator[Track]:
     """Yield the tracks of all metrics of a job."""
     recording, evaluations = source.recording, source.recording.metrics("eval")
-    learners, events = [spoken(name) for name in recording.agents], list(recording.mdp.event_names)
-    has_many = len(learners) > 1
     reports = sorted([*recording.metrics("train"), *evaluations], key=lambda row: int(row["log_time"]))
-    if reports:
-        times = _times(reports)
-        fields = {"mean_length": ("mean_length", ["training"])}
-        fields["percent_filled"] = ("filled_percent", learners if has_many else ["filled"])
-        fields |= {name: (name, [spoken(name)]) for name in SCHEDULES}
-        for field, (name, lines) in fields.items():
-            yield _series(source, f"train/metrics/{name}", times, _numbers(reports, field), lines)
+    learners, events = [spoken(name) for name in recording.agents], list(recording.mdp.event_names)
+    for path, times, values, names in itertools.chain(
+        _training_lines(reports, learners),
+        _evaluation_lines(evaluations, learners, events),
+        _episode_lines(recording, reports, learners, events),
+    ):
+        phase, name = path.split("/", maxsplit=1)[0], path.rsplit("/", maxsplit=1)[-1]
+        width = 1.2 if phase == "train" else 2.2
+        colours = phase_colours(phase, len(names), source.tint)
+        if name in SCHEDULES:
+            number = SCHEDULES.index(name)
+            colours = [line_colours(1 + len(SCHEDULES), source.tint)[1 + number]]
+            width = 3.0 - number  # visible on top of each other where their values are equal
+        elif name in _ONE_PHASE and len(names) > 1:
+            colours = line_colours(len(names), source.tint)
+        label = f"{recording.run_id} " if source.tint else ""
+        static = [series_lines([label + name for name in names], colours, width)]
+        options = {"plot_legend": rrb.PlotLegend(visible=True)}
+        views = [View("plots", title, options=options) for title, paths in PLOTS if path in paths]
+        yield Track(f"{source.root}/{path}", times, scalars(values), static, *views)
+    if evaluations:
+        lines = [
+            f"evaluation after {row['episode']:,} episodes: "
+            + (f"{row['success_percent']:.1f} % success, " if row["successes"] >= 0 else "")
+            + f"{row['eval_mean_length']:.1f} steps and {row['mean_penalties']:.1f} penalties per trial"
+            for row in evaluations
+        ]
+        log = rr.TextLog.columns(text=lines, level=["INFO"] * len(lines))
+        yield Track(f"{source.root}/eval/events", _times(evaluations), log, view=EVENTS)
+
+
+def _training_lines(reports: Sequence[Message], learners: Sequence[str]) -> Iterator[Lines]:
+    """Yield what reports state of training."""
+    if not reports:
+        return
+    times = _times(reports)
+    yield "train/metrics/mean_length", times, _numbers(reports, "mean_length"), ["training"]
+    filled = learners if len(learners) > 1 else ["filled"]
+    yield "train/metrics/filled_percent", times, _numbers(reports, "percent_filled"), filled
+    for name in SCHEDULES:
+        yield f"train/metrics/{name}", times, _numbers(reports, name), [spoken(name)]
     if rewards := sorted({reward for row in reports for reward in row["rewards"]}):
         shares = np.zeros((len(reports), len(rewards)))
         for k, row in enumerate(reports):
             total = max(sum(row["reward_counts"]), 1)
             for reward, count in zip(row["rewards"], row["reward_counts"], strict=True):
                 shares[k, rewards.index(reward)] = 100.0 * count / total
-        names = [f"{reward:g}" for reward in rewards]
-        yield _series(source, "train/metrics/reward_percent", times, shares, names)
-    if evaluations:
-        yield from _evaluation_tracks(source, evaluations, learners, events)
+        yield "train/metrics/reward_percent", times, shares, [f"{reward:g}" for reward in rewards]
+
+
+def _evaluation_lines(
+    evaluations: Sequence[Message], learners: Sequence[str], events: Sequence[str]
+) -> Iterator[Lines]:
+    """Yield the results of evaluations."""
+    if not evaluations:
+        return
+    times = _times(evaluations)
+    for metric in METRICS:
+        values = _numbers(evaluations, metric.field)
+        if not np.isnan(values).all():
+            names = _by_learner("evaluation", learners) if metric.per_agent else ["evaluation"]
+            yield f"eval/metrics/{metric.name}", times, values, names
+    counts = _numbers(evaluations, "events") / _numbers(evaluations, "trials")
+    if events:
+        yield "eval/metrics/events", times, counts, [spoken(event) for event in events]
+    yield from _shared_events("eval", times, events, counts)
+
+
+def _episode_lines(
+    recording: Recording, reports: Sequence[Message], learners: Sequence[str], events: Sequence[str]
+) -> Iterator[Lines]:
+    """Yield every episode, and the means over the training episodes that ended between two reports."""
     names = ["length", "penalties", *(f"return {name}" for name in learners), *events]
     ends = np.array([row["step"] for row in reports], np.int64)
     # The last row is for episodes that ended after the last report.
     sums, counts = np.zeros((len(reports) + 1, len(names))), np.zeros(len(reports) + 1)
     for phase, (_, topic) in schema.PHASES.items():
         for block in recording.blocks(topic):
-            parts = block["length"][:, None], block["penalties"][:, None], block["returns"], block["events"]
-            values = np.concatenate(parts, axis=1).astype(np.float64)
+            parts = [block[name] for name in ("length", "penalties", "returns", "events")]
+            values = np.column_stack(parts).astype(np.float64)
             number = {"episode" if phase == "train" else "trial": block["episode"]}
-            if len(block):
-                yield _series(
-                    source, f"{phase}/episodes", times_of(block["log_time"], **number), values, names
-                )
+            yield f"{phase}/episodes", times_of(block["log_time"], **number), values, names
             if phase == "train":
                 report = np.searchsorted(ends, block["last_step"].astype(np.int64) + 1)
                 np.add.at(sums, report, values)
                 counts += np.bincount(report, minlength=len(counts))
     some = np.flatnonzero(counts[:-1])
-    if len(some):  # means over the episodes that ended between reports
+    if len(some):
         means, times = sums[some] / counts[some, None], _times([reports[k] for k in some.tolist()])
-        returns = [f"training {name}" for name in learners] if has_many else ["training"]
-        yield _series(source, "train/metrics/mean_penalties", times, means[:, 1:2], ["training"])
-        yield _series(source, "train/metrics/mean_return", times, means[:, 2 : 2 + len(learners)], returns)
-        yield from _shared_events(source, "train", times, events, means[:, 2 + len(learners) :])
+        _, penalties, returns, happened = np.split(means, (1, 2, 2 + len(learners)), axis=1)
+        yield "train/metrics/mean_penalties", times, penalties, ["training"]
+        yield "train/metrics/mean_return", times, returns, _by_learner("training", learners)
+        yield from _shared_events("train", times, events, happened)
 
 
-def _evaluation_tracks(
-    source: Source, rows: Sequence[Message], learners: list[str], events: list[str]
-) -> Iterator[Track]:
-    """Yield the results of evaluations, as series and as text."""
-    times = _times(rows)
-    by_learner = [f"evaluation {name}" for name in learners] if len(learners) > 1 else ["evaluation"]
-    for metric in METRICS:
-        values = _numbers(rows, metric.field)
-        if not np.isnan(values).all():
-            names = by_learner if metric.per_agent else ["evaluation"]
-            yield _series(source, f"eval/metrics/{metric.name}", times, values, names)
-    counts = _numbers(rows, "events") / _numbers(rows, "trials")
-    if events:
-        yield _series(source, "eval/metrics/events", times, counts, [spoken(event) for event in events])
-    yield from _shared_events(source, "eval", times, events, counts)
-    lines = [
-        f"evaluation after {row['episode']:,} episodes: "
-        + (f"{row['success_percent']:.1f} % success, " if row["successes"] >= 0 else "")
-        + f"{row['eval_mean_length']:.1f} steps and {row['mean_penalties']:.1f} penalties per trial"
-        for row in rows
-    ]
-    log = rr.TextLog.columns(text=lines, level=["INFO"] * len(lines))
-    yield Track(f"{source.root}/eval/events", times, log, view=EVENTS)
-
-
-def _shared_events(
-    source: Source, phase: str, times: Times, events: list[str], counts: NDArray[np.float64]
-) -> Iterator[Track]:
+def _shared_events(phase: str, times: Times, events: Sequence[str], counts: Floats) -> Iterator[Lines]:
     """Yield the events that concern all agents, such as collisions; `counts` is [rows, events]."""
-    name = "training" if phase == "train" else "evaluation"
     for k, event in enumerate(events):
         if "." not in event:
-            yield _series(source, f"{phase}/metrics/{event}s", times, counts[:, k : k + 1], [name])
+            yield f"{phase}/metrics/{event}s", times, counts[:, [k]], [schema.PHASE_NAMES[phase]]
 
 
-def _series(
-    source: Source, path: str, times: Times, values: NDArray[np.float64], names: Sequence[str]
-) -> Track:
-    """Return the track of a metric's lines, [rows, names]."""
-    phase, name = path.split("/", maxsplit=1)[0], path.rsplit("/", maxsplit=1)[-1]
-    width = 1.2 if phase == "train" else 2.2
-    colours = phase_colours(phase, len(names), source.tint)
-    if name in SCHEDULES:
-        number = SCHEDULES.index(name)
-        colours = [line_colours(1 + len(SCHEDULES), source.tint)[1 + number]]
-        width = 3.0 - number  # visible on top of each other where their values are equal
-    elif name in _ONE_PHASE and len(names) > 1:
-        colours = line_colours(len(names), source.tint)
-    label = f"{source.recording.run_id} " if source.tint else ""
-    static = [series_lines([label + name for name in names], colours, width)]
-    options = {"plot_legend": rrb.PlotLegend(visible=True)}
-    views = [View("plots", title, options=options) for title, paths in PLOTS if path in paths]
-    return Track(f"{source.root}/{path}", times, scalars(values), static, *views)
+def _by_learner(phase: str, learners: Sequence[str]) -> list[str]:
+    return [f"{phase} {name}" for name in learners] if len(learners) > 1 else [phase]
 
 
 def line_colours(count: int, tint: str | None = None) -> list[Colour]:
@@ -171,7 +181,7 @@ def series_lines(names: Sequence[str], colours: Sequence[Colour] = (), width: fl
     )
 
 
-def _numbers(rows: Sequence[Message], field: str) -> NDArray[np.float64]:
+def _numbers(rows: Sequence[Message], field: str) -> Floats:
     return np.array([row[field] for row in rows], np.float64).reshape(len(rows), -1)
 
 

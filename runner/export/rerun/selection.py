@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.evaluations import Evaluation, evaluation_after, evaluations_of
 from runner.export.contents import require_steps, shortcomings, whole_ranges, why_no_steps
 from runner.recording import schema
 from runner.recording.reader import Recording
+from runner.util.arrays import Ints
 from runner.util.values import Ranges
 
 DEFAULT_EPISODES: Final = 20
@@ -24,6 +23,7 @@ MAX_MEMBERS: Final = 8
 """Environments of a vector that are shown in views, and drawn; the values of all are exported."""
 DEFAULT_STEPS: Final = 50_000
 """Steps at which the default selection stops growing, however long episodes are."""
+_NONE: Final[Ints] = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ class Request:
 class Episodes:
     """The steps of each episode of a phase; the last episode may not have ended."""
 
-    start: NDArray[np.int64]
+    start: Ints
     """[E]: number of the first step within the phase; in a vector that of all environments with it."""
-    stop: NDArray[np.int64]
+    stop: Ints
     """[E]: number after that of the last step; in a vector of all environments with it."""
     ended: int
 
@@ -69,11 +69,11 @@ class Episodes:
         return len(self.start)
 
     @property
-    def lengths(self) -> NDArray[np.int64]:
+    def lengths(self) -> Ints:
         """[E]: the number of steps."""
         return self.stop - self.start
 
-    def steps_of(self, numbers: NDArray[np.int64]) -> list[range]:
+    def steps_of(self, numbers: Ints) -> list[range]:
         """Return the steps of these episodes; those that follow each other, or overlap, are one range."""
         joined: list[range] = []
         starts, stops = self.start[numbers], self.stop[numbers]
@@ -113,55 +113,87 @@ class Selection:
 
 
 def select(recording: Recording, request: Request) -> Selection:
-    """Return the steps of a request."""
-    selection = Selection(warnings=shortcomings(recording), focus=_focus(recording, request))
-    if not recording.has_tables:
-        return _select_loop(recording, request, selection)
-    if request.frames:
+    """Return the steps of a request.
+
+    Raises:
+        NotInRecording: an episode or an evaluation does not exist.
+    """
+    selection, is_job = Selection(warnings=shortcomings(recording)), recording.has_tables
+    if is_job and request.frames:
         selection.warnings.append("--frames draws loops only: the run was trained here.")
-    if recording.mdp.scene is None or recording.mdp.scene_cells is None:
+    if is_job and (recording.mdp.scene is None or recording.mdp.scene_cells is None):
         selection.warnings.append("The environment has no scene: state and action are shown as series.")
-    if not recording.has_steps:
+    if is_job and not recording.has_steps:
         if not request.is_default:
             require_steps(recording, "export")
         selection.warnings.append(
             f"Only metrics are exported, as there are no steps: {why_no_steps(recording)}."
         )
         return selection
-    train, evals = episodes_of(recording, "train"), episodes_of(recording, "eval")
+    if recording.has_varying_values:
+        selection.warnings.append("Observations and actions vary in size (texts): they are not drawn.")
+    train, evals = (episodes_of(recording, phase) for phase in schema.PHASES)
     available = evaluations_with_steps(recording, train, evals)
-    numbers = _training_episodes(recording, request, train.lengths)
-    selection.train = train.steps_of(numbers)
-    chosen = {*_chosen(recording, request, available)}
-    chosen |= {*(available if request.everything else available[-1:] if request.is_default else ())}
-    evaluations = [one for one in available if one in chosen]
-    selection.evaluations = [
-        (one, steps) for one in evaluations for steps in evals.steps_of(np.arange(one.start, one.stop))
+    asked = {"train": _asked_episodes(recording, request, train.count), "eval": np.array(request.trials, int)}
+    evaluations = [
+        evaluation_after(available, after, str(recording.path)) for after in sorted(set(request.evaluations))
     ]
-    _describe(selection, request, numbers, train.count, available, evaluations)
-    if unknown := _steps_without_values(recording, selection.train):
-        selection.warnings.append(
-            f"{unknown:,} of these training steps are exported without Q-values: steps before them were "
-            "lost, and the Q-tables are unknown until the next snapshot."
-        )
+    if not (request.everything or recording.has_varying_values):
+        trials = [asked["eval"]] if request.trials else [one.episodes for one in evaluations]
+        shown = {
+            "train": train.steps_of(asked["train"]),
+            "eval": evals.steps_of(np.concatenate([_NONE, *trials])),
+        }
+        selection.focus = _focus(recording, shown)
+    numbers = asked["train"]
+    if request.is_default:
+        numbers = np.union1d(numbers, _default_episodes(train.lengths))
+    selection.train = train.steps_of(numbers)
+    if is_job:
+        evaluations += available if request.everything else available[-1:] if request.is_default else []
+        evaluations = [one for one in available if one in evaluations]
+        selection.evaluations = [
+            (one, steps) for one in evaluations for steps in evals.steps_of(one.episodes)
+        ]
+        _describe_job(selection, request, numbers, train.count, available, evaluations)
+        if unknown := _steps_without_values(recording, selection.train):
+            selection.warnings.append(
+                f"{unknown:,} of these training steps are exported without Q-values: steps before them were "
+                "lost, and the Q-tables are unknown until the next snapshot."
+            )
+        return selection
+    total, tested = recording.count(schema.TRAIN_STEP), recording.count(schema.EVAL_STEP)
+    limit = total if request.everything else DEFAULT_STEPS
+    if request.everything or (request.is_default and (total <= limit or recording.has_varying_values)):
+        selection.train = [range(min(total, limit))] if total else []
+    if request.frames:
+        _select_drawn(recording, request, selection, asked)
+    first = 0 if request.everything else max(0, tested - DEFAULT_STEPS)
+    spans = [(one, steps) for one in evaluations for steps in evals.steps_of(one.episodes)]
+    spans = [(one, range(steps.start, min(steps.stop, first))) for one, steps in spans]
+    spans.append((Evaluation(0, 0, 0, 0), range(first, tested)))
+    selection.evaluations = [(one, steps) for one, steps in spans if steps]
+    trained, evaluated = (sum(map(len, spans)) for spans in selection.by_phase.values())
+    environments = f" in {recording.environments} environments" if recording.environments > 1 else ""
+    of_evaluation = f", {evaluated:,} of {tested:,} of evaluation" if tested else ""
+    selection.exported.append(f"{trained:,} of {total:,} training steps{of_evaluation}{environments}")
+    if rest := total + tested - trained - evaluated:
+        selection.left_out.append(f"{rest:,} steps (--episodes START:STOP selects; --all: everything)")
     return selection
 
 
 def episodes_of(recording: Recording, phase: str) -> Episodes:
     """Return the episodes of a phase that have steps."""
     steps, episodes = schema.PHASES[phase]
-    total, n = recording.count(steps), recording.environments
+    total, n, records = recording.count(steps), recording.environments, recording.episodes(phase)
+    last, length = (records[name].astype(np.int64) for name in ("last_step", "length"))
     if n > 1:
-        records = recording.episodes(phase)
-        last, length = (records[name].astype(np.int64) for name in ("last_step", "length"))
         return Episodes((last - (length - 1) * n) // n * n, (last // n + 1) * n, len(records))
     first = np.full(recording.count(episodes) + 1, -1, np.int64)
-    first[0] = 0
-    for block in recording.blocks(episodes):
-        counted = block[block["episode"] < len(first) - 1]
-        number, stop = counted["episode"].astype(np.int64), counted["last_step"].astype(np.int64) + 1
-        first[number] = stop - counted["length"]
-        first[number + 1] = stop
+    first[0], number = 0, records["episode"].astype(np.int64)
+    is_counted = number < len(first) - 1
+    first[number[is_counted]] = (last + 1 - length)[is_counted]
+    first[number[is_counted] + 1] = (last + 1)[is_counted]
     # Steps of episodes that were lost in a repair count as those of the first episode after them.
     first = np.maximum.accumulate(first)
     first = first[first <= total]
@@ -193,58 +225,33 @@ def time_of(recording: Recording, phase: str, step: int) -> int:
     return int(record["log_time"]) // schema.STEP_NANOSECONDS
 
 
-def _focus(recording: Recording, request: Request) -> tuple[int, int] | None:
-    explicit = dataclasses.replace(request, with_default=False)
-    if explicit.is_default or request.everything or not recording.has_steps or recording.has_varying_values:
-        return None
-    train, evals = (episodes_of(recording, phase) for phase in schema.PHASES)
-    trials = [np.array(request.trials, np.int64)]
-    if not request.trials:
-        chosen = _chosen(recording, request, evaluations_with_steps(recording, train, evals))
-        trials += [np.arange(one.start, one.stop) for one in chosen]
-    spans = {
-        "train": train.steps_of(_training_episodes(recording, explicit, train.lengths)),
-        "eval": evals.steps_of(np.concatenate(trials)),
-    }
+def _focus(recording: Recording, shown: Mapping[str, Sequence[range]]) -> tuple[int, int] | None:
+    """Return the times of the first and the last of some steps; None without any."""
     times = [
         time_of(recording, phase, step)
-        for phase, of_phase in spans.items()
-        if of_phase
-        for step in (of_phase[0].start, of_phase[-1].stop - 1)
+        for phase, spans in shown.items()
+        if spans
+        for step in (spans[0].start, spans[-1].stop - 1)
     ]
     return (min(times), max(times)) if times else None
 
 
-def _chosen(recording: Recording, request: Request, available: Sequence[Evaluation]) -> list[Evaluation]:
-    """Return the evaluations that are asked for by number, in order."""
-    return [
-        evaluation_after(available, after, str(recording.path)) for after in sorted(set(request.evaluations))
-    ]
-
-
-def _training_episodes(
-    recording: Recording, request: Request, lengths: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Return the numbers of the training episodes of a request, ascending, given their lengths."""
-    count = len(lengths)
+def _asked_episodes(recording: Recording, request: Request, count: int) -> Ints:
+    """Return the numbers of the training episodes, of so many, that a request names, ascending."""
     if request.everything:
         return np.arange(count)
     ranges = whole_ranges(request.episodes, count, "train", str(recording.path))
-    numbers = [np.empty(0, np.int64), *(np.arange(start, stop) for start, stop in ranges)]
-    if request.every:
-        numbers.append(np.arange(0, count, request.every))
-    if request.is_default and count:
-        numbers.append(_default_episodes(lengths))
-    return np.unique(np.concatenate(numbers))
+    every = np.arange(0, count, request.every) if request.every else _NONE
+    return np.unique(np.concatenate([every, *(np.arange(start, stop) for start, stop in ranges)]))
 
 
-def _default_episodes(lengths: NDArray[np.int64], limit: int = DEFAULT_STEPS) -> NDArray[np.int64]:
+def _default_episodes(lengths: Ints, limit: int = DEFAULT_STEPS) -> Ints:
     """Return episodes evenly spread from the first to the last, as many as the limits allow."""
     for count in range(min(DEFAULT_EPISODES, len(lengths)), 1, -1):
         numbers = np.unique(np.linspace(0, len(lengths) - 1, count).round().astype(np.int64))
         if int(lengths[numbers].sum()) <= limit:
             return numbers
-    return np.unique([0, len(lengths) - 1]).astype(np.int64)
+    return np.unique([0, len(lengths) - 1]).astype(np.int64) if len(lengths) else _NONE
 
 
 def _steps_without_values(recording: Recording, ranges: Sequence[range]) -> int:
@@ -261,10 +268,10 @@ def _steps_without_values(recording: Recording, ranges: Sequence[range]) -> int:
     return unknown
 
 
-def _describe(
+def _describe_job(
     selection: Selection,
     request: Request,
-    numbers: NDArray[np.int64],
+    numbers: Ints,
     count: int,
     available: Sequence[Evaluation],
     evaluations: Sequence[Evaluation],
@@ -290,70 +297,22 @@ def _describe(
         )
 
 
-def _select_loop(recording: Recording, request: Request, selection: Selection) -> Selection:
-    """Return the steps of a loop in a request; by default all of them unless there are too many.
-
-    Raises:
-        NotInRecording: an episode or an evaluation does not exist.
-    """
-    if recording.has_varying_values:
-        selection.warnings.append("Observations and actions vary in size (texts): they are not drawn.")
-    total, tested = recording.count(schema.TRAIN_STEP), recording.count(schema.EVAL_STEP)
-    n, train = recording.environments, episodes_of(recording, "train")
-    is_short = total <= DEFAULT_STEPS or recording.has_varying_values
-    if request.everything or (request.is_default and is_short):
-        stop = total if request.everything else min(total, DEFAULT_STEPS)
-        selection.train = [range(stop)] if stop else []
-    else:
-        selection.train = train.steps_of(_training_episodes(recording, request, train.lengths))
-    if request.frames:
-        _select_drawn(recording, request, selection)
-    first = 0 if request.everything else max(0, tested - DEFAULT_STEPS)
-    evals = episodes_of(recording, "eval")
-    for one in _chosen(recording, request, evaluations_of(recording)) if request.evaluations else ():
-        steps = evals.steps_of(np.arange(one.start, one.stop))
-        selection.evaluations += [(one, range(each.start, min(each.stop, first))) for each in steps]
-    if tested:
-        selection.evaluations.append((Evaluation(0, 0, 0, 0), range(first, tested)))
-    selection.evaluations = [(one, steps) for one, steps in selection.evaluations if len(steps)]
-    first -= sum(len(steps) for _, steps in selection.evaluations[:-1])
-    shown = sum(map(len, selection.train))
-    evaluated = f", {tested - first:,} of {tested:,} of evaluation" if tested else ""
-    environments = f" in {n} environments" if n > 1 else ""
-    selection.exported.append(f"{shown:,} of {total:,} training steps{evaluated}{environments}")
-    if shown < total or first:
-        selection.left_out.append(
-            f"{total - shown + first:,} steps (--episodes START:STOP selects; --all: everything)"
-        )
-    return selection
-
-
-def _select_drawn(recording: Recording, request: Request, selection: Selection) -> None:
-    """Choose the episodes that are drawn: those that were selected, by default a few of each environment."""
+def _select_drawn(
+    recording: Recording, request: Request, selection: Selection, asked: Mapping[str, Ints]
+) -> None:
+    """Choose the episodes that are drawn: those asked for, by default a few of each environment."""
     n, total = recording.environments, 0
-    for phase in schema.PHASES:
-        if not recording.count(schema.PHASES[phase][0]):
+    shown = min(n, MAX_MEMBERS)
+    for phase, (steps, _) in schema.PHASES.items():
+        if not recording.count(steps):
             continue
-        ended = recording.episodes(phase)
         lengths = episodes_of(recording, phase).lengths // n
-        numbers = [np.empty(0, np.int64)]
-        if request.everything:
-            numbers.append(np.arange(len(lengths)))
-        elif phase == "train":
-            explicit = dataclasses.replace(request, with_default=False)
-            if not explicit.is_default:
-                numbers.append(_training_episodes(recording, explicit, lengths))
-        else:
-            numbers.append(np.array(request.trials, np.int64))
-        if request.is_default:
-            for environment in range(min(n, MAX_MEMBERS)):
-                own = (
-                    np.flatnonzero(ended["last_step"] % n == environment)
-                    if n > 1
-                    else np.arange(len(lengths))
-                )
-                if len(own):
-                    numbers.append(own[_default_episodes(lengths[own], FRAME_STEPS // min(n, MAX_MEMBERS))])
+        numbers = [np.arange(len(lengths)) if request.everything else asked[phase]]
+        for environment in range(shown) if request.is_default else ():
+            own = np.arange(len(lengths))
+            if n > 1:
+                own = np.flatnonzero(recording.episodes(phase)["last_step"] % n == environment)
+            numbers.append(own[_default_episodes(lengths[own], FRAME_STEPS // shown)])
         selection.drawn[phase] = np.unique(np.concatenate(numbers)).tolist()
         total += len(lengths)
     drawn = sum(map(len, selection.drawn.values()))
