@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from runner.analysis.diff import can_compare_steps, divergences
 from runner.analysis.diff.sections import where_in_words
@@ -38,28 +39,22 @@ def locate(run: Run, request: Request, step: StepRef | None) -> Location:
             return Location(_default_time(recording, request), request)
         require_steps(recording, "look at")
         phase = "train" if step.after is None else "eval"
-        number, more = step.episode, Request(episodes=((step.episode, step.episode + 1),))
+        number, episode = step.episode, (step.episode, step.episode + 1)
+        added: dict[str, Any] = {"episodes": (*request.episodes, episode)}
         if step.after is not None:
             train, evals = (episodes_of(recording, each) for each in schema.PHASES)
             evaluations, where = evaluations_with_steps(recording, train, evals), str(recording.path)
             number = evaluation_after(evaluations, step.after, where).trial(step.episode, where)
-            more = Request(evaluations=(step.after,), trials=(number,))
+            added = {"evaluations": (*request.evaluations, step.after), "trials": (number,)}
         steps = recording.episode_span(phase, number)
         if step.t >= len(steps):
             raise NotInRecording(
                 f"{recording.path}: found no t = {step.t} there; the episode has {len(steps)} steps, from 0."
             )
         time = time_of(recording, phase, steps[step.t])
-    if request.everything:
-        return Location(time, request)
-    added = dataclasses.replace(
-        request,
-        episodes=request.episodes + more.episodes,
-        evaluations=request.evaluations + more.evaluations,
-        trials=more.trials,
-        with_default=request.is_default,
-    )
-    return Location(time, added)
+    if not request.everything:
+        request = dataclasses.replace(request, with_default=request.is_default, **added)
+    return Location(time, request)
 
 
 def locate_divergence(runs: Sequence[Run]) -> tuple[StepRef | None, str]:

@@ -15,7 +15,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
 from runner.errors import CannotRedo
 from runner.export import pictures
@@ -46,7 +45,7 @@ from runner.recording.messages import frame_place, media_type
 from runner.recording.reader import Recording
 from runner.recording.spaces import least_number, leaves_of
 from runner.replay.steps import check_steps, environment_of, frames_every, log_times_of
-from runner.util.arrays import Array, MaskedArray
+from runner.util.arrays import Array, MaskedArray, Records
 from runner.util.extras import require
 
 MAX_BARS: Final = 16
@@ -72,6 +71,8 @@ class Member(NamedTuple):
     """Its column among the rewards."""
     parts: Mapping[str, Part] = {}
     """`observation` and `action`, if they are drawn as lines."""
+    agent: str = ""
+    """The agent's name in the recording of a game."""
 
 
 class LoopReader:
@@ -84,17 +85,16 @@ class LoopReader:
         self._source, self._root, self._selection = source, source.root, selection
         self._trust, self._stage = trust, stage
         self._scene = scene_of(recording.mdp) if recording.tabular else None
-        self._is_game = len(recording.agents) > 1
+        self._is_game, n = len(recording.agents) > 1, recording.environments
+        self._environments = [f"env_{i}" if n > 1 else "" for i in range(n)]
         if self._is_game:
             agents = enumerate(recording.agents)
-            self._members = [Member(i, entity_name(a), i, _parts(recording, a)) for i, a in agents]
+            self._members = [Member(i, entity_name(a), i, _parts(recording, a), a) for i, a in agents]
         else:
-            parts, n = {} if self._scene else _parts(recording), recording.environments
-            self._members = [Member(i, f"env_{i}" if n > 1 else "", 0, parts) for i in range(n)]
-        self._described: set[str] = set()
-        """Entities that are lines."""
-        self._pictured: dict[str, int] = {}
-        """The step of the last picture, by entity."""
+            parts = {} if self._scene else _parts(recording)
+            self._members = [Member(i, name, 0, parts) for i, name in enumerate(self._environments)]
+        self._pictured: dict[tuple[str, int], int] = {}
+        """The step of the last picture, by phase and environment."""
         self.last = 0
         """The last step that was read."""
 
@@ -103,8 +103,8 @@ class LoopReader:
         recording, root = self._recording, self._root
         for phase in schema.PHASES:
             yield from self._episodes(phase)
-            for entity, frames in grouped(self._recorded_frames(phase), FRAMES_SENT):
-                yield rows_of(entity, frames, self._frame_view(entity))
+            for environment, frames in grouped(self._recorded_frames(phase), FRAMES_SENT):
+                yield self._frames(phase, environment, frames)
         for image in recording.decoded(schema.IMAGE_TOPIC):
             name, data = entity_name(image["frame_id"]), image["data"]
             if media_type(data) not in ("image/png", "image/jpeg"):
@@ -112,24 +112,20 @@ class LoopReader:
             if data:
                 view = View("pictures", name, rrb.Spatial2DView)
                 yield rows_of(f"{root}/picture/{name}", [(_step(image["log_time"]), _picture(data))], view)
-        values = (
-            (entity_name(scalar["name"]), (scalar["log_time"], scalar["episode"], scalar["value"]))
-            for scalar in recording.decoded(schema.SCALAR_TOPIC)
-        )
+        values = ((entity_name(scalar["name"]), scalar) for scalar in recording.decoded(schema.SCALAR_TOPIC))
         for name, rows in grouped(values, MAX_ROWS):
-            log_times, episodes, numbers = (np.array(part) for part in zip(*rows, strict=True))
+            log_times, episodes, numbers = (
+                np.array([row[field] for row in rows]) for field in ("log_time", "episode", "value")
+            )
             times, view = times_of(log_times, episode=episodes), View("logged", name.replace("_", " "))
             static = [series_lines([name])]
             yield Track(f"{root}/logged/{name}", times, scalars(numbers[:, np.newaxis]), static, view)
         texts = (
-            (
-                f"{root}/log",
-                (_step(text["log_time"]), rr.TextLog(f"{text['name']}: {text['message']}", level="INFO")),
-            )
+            ("log", (_step(text["log_time"]), rr.TextLog(f"{text['name']}: {text['message']}", level="INFO")))
             for text in recording.decoded(schema.LOG_TOPIC)
         )
-        for entity, lines in grouped(texts, MAX_ROWS):
-            yield rows_of(entity, lines, LOG)
+        for name, lines in grouped(texts, MAX_ROWS):
+            yield rows_of(f"{root}/{name}", lines, LOG)
         arrays = recording.messages(schema.ARRAY_TOPIC)
         for (time, _), array in zip(arrays, recording.arrays(), strict=True):
             name, tensor = entity_name(array.name), rr.Tensor(np.atleast_1d(array.values))
@@ -147,13 +143,12 @@ class LoopReader:
                 yield labels.track(root)
                 yield from background(root, scene, grid_view(title, scene))
                 yield from grid.still
-            ends = [block["log_time"] for block in recording.blocks(schema.TRAIN_EPISODE)] if grid else []
+            trained = recording.episodes("train")["log_time"]
             for steps in self._batches(phase, spans):
                 yield from self._lines_of(phase, steps)
                 if grid:
                     number = episode = steps["episode"].astype(np.int64)
                     if phase == "eval":  # shown by the training episodes before it
-                        trained = np.concatenate([np.empty(0, np.uint64), *ends])
                         episode = np.searchsorted(trained, steps["log_time"])
                     yield from grid.of(Batch(steps, episode, number))
             if grid:
@@ -170,10 +165,10 @@ class LoopReader:
                     times = self._times(own)
                     yield self._line(phase, member, "return", times, own["returns"][:, [member.column]])
                     if member.column == 0:
-                        one = member._replace(name="") if self._is_game else member
-                        yield self._line(phase, one, "length", times, own["length"][:, np.newaxis])
+                        named = member._replace(name="") if member.agent else member
+                        yield self._line(phase, named, "length", times, own["length"][:, np.newaxis])
 
-    def _lines_of(self, phase: str, steps: NDArray[np.void]) -> Iterator[Track]:
+    def _lines_of(self, phase: str, steps: Records) -> Iterator[Track]:
         """Yield rewards, observations, actions and extras of steps."""
         recording = self._recording
         extras = recording.extras(phase).at(steps["step"])
@@ -209,7 +204,7 @@ class LoopReader:
             yield self._line(phase, member, quantity, times, numbers, names)
         elif is_given.any():
             bars = zip(times["step"][is_given].tolist(), map(rr.BarChart, numbers[is_given]), strict=True)
-            view = View("bars", " ".join(filter(None, [member.name, name])), rrb.BarChartView)
+            view = View("bars", f"{member.name} {name}".strip(), rrb.BarChartView)
             yield rows_of(self._entity(phase, member.name, quantity), list(bars), view)
 
     def _line(
@@ -221,46 +216,41 @@ class LoopReader:
         values: Array,
         names: Sequence[str] = ("",),
     ) -> Track:
-        """Return series, [rows, names]; the first also with how they are drawn, and in which view.
+        """Return series, [rows, names], with how they are drawn, and in which view.
 
         A view shows a quantity of all environments; one of several numbers those of one environment.
         """
-        recording, entity = self._recording, self._entity(phase, member.name, quantity)
-        if entity in self._described:
-            return Track(entity, times, scalars(values))
-        self._described.add(entity)
-        colours = phase_colours(phase, len(names))
-        if member.name and len(names) == 1:
-            shades = line_colours(min(len(self._members), MAX_MEMBERS))
-            colours = [shades[member.number % len(shades)]]
-        lines = names if len(names) > 1 else [" ".join(filter(None, [phase, member.name]))]
+        colours, lines = phase_colours(phase, len(names)), names
+        if len(names) == 1:
+            lines = [f"{phase} {member.name}".strip()]
+            if member.name:
+                shades = line_colours(min(len(self._members), MAX_MEMBERS))
+                colours = [shades[member.number % len(shades)]]
         style: Any = series_lines(lines, colours)
         if names == ["action"]:  # of a Discrete space: lines between such numbers mean nothing
             style = rr.SeriesPoints(names=lines, colors=colours, marker_sizes=[1.5])
         tab, title = OVERVIEW, quantity.removeprefix("extra/")
-        agent = recording.agents[member.number] if self._is_game else ""
-        actions = recording.action_names(phase, agent)
-        if quantity == "action" and 0 < len(actions) <= FEW:
-            space = recording.spaces["action"]
-            least = least_number(space["spaces"][agent] if agent else space)
+        actions = self._recording.action_names(phase, member.agent) if quantity == "action" else ()
+        if 0 < len(actions) <= FEW:
+            space = self._recording.spaces["action"]
+            least = least_number(space["spaces"][member.agent] if member.agent else space)
             title = f"action: {', '.join(f'{i} {name}' for i, name in enumerate(actions, least))}"
         if member.name and len(names) > 1:
             tab, title = title.capitalize(), f"{member.name} {title}"
         view = View(tab, title.replace("_", " "), has_focus=title not in ("return", "length"))
-        shown = view if member.number < MAX_MEMBERS else None
-        return Track(entity, times, scalars(values), [style], shown)
+        entity = self._entity(phase, member.name, quantity)
+        return Track(entity, times, scalars(values), [style], view if member.number < MAX_MEMBERS else None)
 
-    def _recorded_frames(self, phase: str) -> Iterator[tuple[str, Row]]:
-        """Yield entity and row of each recorded frame, at the step of its own environment."""
-        recording, n = self._recording, 1 if self._is_game else len(self._members)
+    def _recorded_frames(self, phase: str) -> Iterator[tuple[int, Row]]:
+        """Yield environment and row of each recorded frame, at the step of its own environment."""
+        recording, n = self._recording, len(self._environments)
         is_each_step = frames_every(recording) == 1
         for frame in recording.phase(phase).frames.decoded():
             environment, _ = frame_place(frame)
             if environment < n:
-                entity = self._frame_entity(phase, environment)
                 step = max(0, _step(frame["log_time"]) - (n - 1 - environment))
-                if self._is_later(entity, step) or not is_each_step:
-                    yield entity, (step, _picture(frame["data"]))
+                if self._is_later(phase, environment, step) or not is_each_step:
+                    yield environment, (step, _picture(frame["data"]))
 
     def _drawn_frames(self, phase: str, episodes: Sequence[int]) -> Iterator[Track]:
         """Yield pictures of episodes that the environment draws, as far as it does what was recorded."""
@@ -268,50 +258,48 @@ class LoopReader:
         sources = {number: pictures.source_of(recording, phase, self._trust, number) for number in episodes}
         notes = sorted({f"No {phase} pictures: {reason}" for _, reason in sources.values() if reason})
         chosen = [number for number, (source, _) in sources.items() if source is pictures.Source.REDRAWN]
-        number, times, entity, rows = 0, [0], "", []
+        number, times, environment, rows = 0, [0], 0, []
         try:
             for number, t, pixels in redrawn(recording, phase, chosen, self._trust) if chosen else ():
                 if t == 0:
                     times = [_step(time) for time in log_times_of(recording, phase, number)]
-                    entity = self._frame_entity(phase, environment_of(recording, phase, number))
+                    environment = environment_of(recording, phase, number)
                     self._stage(f"drawing {phase} episode {chosen.index(number) + 1:,} of {len(chosen):,}")
                 step = times[t - 1] if t else times[0] - 1
-                if self._is_later(entity, step):
+                if self._is_later(phase, environment, step):
                     rows.append((step, _picture(encoded_picture(pixels))))
                 if t == len(times) or len(rows) == FRAMES_SENT:
-                    yield rows_of(entity, rows, self._frame_view(entity))
+                    frames = self._frames(phase, environment, rows)
+                    yield frames
                     rows = []
-                if t == len(times):  # nothing is shown until the next picture
-                    n = 1 if self._is_game else len(self._members)
-                    clear = rr.Clear.columns(is_recursive=[False])
-                    yield Track(entity, {"step": np.array([step + n])}, clear)
+                    if t == len(times):  # nothing is shown until the next picture
+                        end = {"step": np.array([step + len(self._environments)])}
+                        yield Track(frames.entity, end, rr.Clear.columns(is_recursive=[False]))
         except CannotRedo as error:
             notes.append(f"No {phase} pictures from episode {number or chosen[0]} on: {error}")
         if rows:
-            yield rows_of(entity, rows, self._frame_view(entity))
+            yield self._frames(phase, environment, rows)
         for note in notes:
             self._selection.warnings.append(note)
             yield rows_of(f"{self._root}/log", [(self.last, rr.TextLog(note, level="WARN"))], LOG)
 
-    def _is_later(self, entity: str, step: int) -> bool:
+    def _is_later(self, phase: str, environment: int, step: int) -> bool:
         """Return whether a picture is later than the one before.
 
         With a picture at each step, that of a reset must not hide that of the last step.
         """
-        before, self._pictured[entity] = self._pictured.get(entity, -1), step
+        before = self._pictured.get((phase, environment), -1)
+        self._pictured[phase, environment] = step
         return before < step
+
+    def _frames(self, phase: str, environment: int, rows: Sequence[Row]) -> Track:
+        parts = [phase, *filter(None, [self._environments[environment]]), "frame"]
+        return rows_of(self._entity(*parts), rows, View(phase, " ".join(parts), rrb.Spatial2DView))
 
     def _entity(self, *parts: str) -> str:
         return "/".join([self._root, *filter(None, parts)])
 
-    def _frame_entity(self, phase: str, environment: int) -> str:
-        return self._entity(phase, "" if self._is_game else self._members[environment].name, "frame")
-
-    def _frame_view(self, entity: str) -> View:
-        phase, *rest = entity.removeprefix(f"{self._root}/").split("/")
-        return View(phase, " ".join([phase, *rest]), rrb.Spatial2DView)
-
-    def _batches(self, phase: str, spans: Sequence[range]) -> Iterator[NDArray[np.void]]:
+    def _batches(self, phase: str, spans: Sequence[range]) -> Iterator[Records]:
         """Yield the steps of all environments, at most a batch of each at a time."""
         recording, table = self._recording, self._recording.phase(phase).steps
         if table.dtype is None:  # they vary in size, so they are read from the first on
@@ -322,7 +310,7 @@ class LoopReader:
                     if len(own := block[(block["step"] >= span.start) & (block["step"] < span.stop)]):
                         yield own
             return
-        limit = max(1, min(MAX_ROWS * recording.environments, _BATCH_BYTES // table.dtype.itemsize))
+        limit = max(1, min(MAX_ROWS * len(self._environments), _BATCH_BYTES // table.dtype.itemsize))
         for span in spans:
             for start in range(span.start, span.stop, limit):
                 blocks = table.blocks(start, min(start + limit, span.stop))
@@ -333,11 +321,11 @@ class LoopReader:
                         check_steps(steps, recording.mdp, str(recording.path), "recorded")
                     yield steps
 
-    def _is_of(self, steps: Array, member: Member) -> NDArray[np.bool_]:
+    def _is_of(self, steps: Array, member: Member) -> Array:
         """Return which steps, given by number, were taken in an environment."""
-        return np.asarray(steps % self._recording.environments == member.number)
+        return np.asarray(steps % len(self._environments) == member.number)
 
-    def _times(self, records: NDArray[np.void], **timelines: Array) -> Times:
+    def _times(self, records: Records, **timelines: Array) -> Times:
         times = times_of(records["log_time"], episode=records["episode"], **timelines)
         self.last = max(self.last, int(times["step"].max()))
         return times

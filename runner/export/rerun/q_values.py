@@ -13,6 +13,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from runner.analysis.evaluations import Evaluation
 from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import numbered_actions, spoken
@@ -73,16 +74,23 @@ class ValueReader:
         self._last = (0, -1)
         """Time and context of the step before."""
 
-    def split(self, block: Records) -> Iterator[Records]:
-        """Yield a block of training steps in parts whose values are either all known or all unknown."""
+    def batches(self, block: Records, evaluation: Evaluation | None) -> Iterator[Batch]:
+        """Yield a block of an evaluation's steps, or of training in parts with known or unknown values."""
+        if evaluation:
+            trials = int(self._recording.config["evaluation"]["trials"])
+            after, number = np.full(len(block), evaluation.after), block["episode"].astype(np.int64) % trials
+            yield Batch(block, after, number, *self._values(block, evaluation.train_step))
+            return
         first = int(block["step"][0])
-        edges = [edge for start, last in self._known_ranges for edge in (start, last + 1)]
-        yield from np.split(block, [edge - first for edge in edges if 0 < edge - first < len(block)])
+        edges = [edge - first for start, last in self._known_ranges for edge in (start, last + 1)]
+        for part in np.split(block, [edge for edge in edges if 0 < edge < len(block)]):
+            episode = part["episode"].astype(np.int64)
+            yield Batch(part, episode, episode, *self._values(part))
 
-    def values(self, block: Records, train_step: int | None = None) -> tuple[Any, ...]:
-        """Return the values of a `Batch` before the update of each step of a part; nothing if unknown.
+    def _values(self, block: Records, train_step: int | None = None) -> tuple[Any, ...]:
+        """Return the values of a `Batch` before the update of each step; nothing if they are unknown.
 
-        `train_step` is the number of training steps before a block of evaluation steps.
+        `train_step` is the number of training steps before steps of an evaluation.
         """
         step = int(block["step"][0]) if train_step is None else train_step
         if not any(first <= step <= last for first, last in self._known_ranges):

@@ -27,7 +27,6 @@ from runner.export.rerun.tracks import (
 )
 from runner.recording import schema
 from runner.replay.steps import check_steps
-from runner.util.arrays import Records
 
 T = TypeVar("T")
 
@@ -101,30 +100,15 @@ class JobReader:
         yield from self._notice(sorted(covered))
 
     def _pieces(self, phase: str, reader: ValueReader) -> Iterator[Batch]:
-        """Yield the steps of a phase, at most a batch at a time."""
+        """Yield the steps of a phase, at most a batch at a time, after checking them."""
         recording, selection = self._recording, self._selection
-        if phase == "train":
-            for span in selection.train:
-                for block in self._blocks(phase, span):
-                    for part in reader.split(block):
-                        episode = part["episode"].astype(np.int64)
-                        yield Batch(part, episode, episode, *reader.values(part))
-            return
-        trials = int(recording.config["evaluation"]["trials"])
-        for evaluation, span in selection.evaluations:
-            for block in self._blocks(phase, span):
-                after = np.full(len(block), evaluation.after, np.int64)
-                number = block["episode"].astype(np.int64) % trials
-                yield Batch(block, after, number, *reader.values(block, evaluation.train_step))
-
-    def _blocks(self, phase: str, span: range) -> Iterator[Records]:
-        """Yield the steps of a span, at most a batch at a time, after checking them."""
-        recording, topic = self._recording, schema.PHASES[phase][0]
-        for block in recording.blocks(topic, span.start, span.stop):
-            for start in range(0, len(block), MAX_ROWS):
-                part = block[start : start + MAX_ROWS]
-                check_steps(part, recording.mdp, str(recording.path), schema.PHASE_NAMES[phase])
-                yield part
+        spans = [(None, span) for span in selection.train] if phase == "train" else selection.evaluations
+        for evaluation, span in spans:
+            for block in recording.blocks(schema.PHASES[phase][0], span.start, span.stop):
+                for start in range(0, len(block), MAX_ROWS):
+                    part = block[start : start + MAX_ROWS]
+                    check_steps(part, recording.mdp, str(recording.path), schema.PHASE_NAMES[phase])
+                    yield from reader.batches(part, evaluation)
 
     def _notice(self, covered: list[tuple[int, int]]) -> Iterator[Track]:
         """Yield a notice on the grid for the times of which no steps were exported."""

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from runner.drawing import palette
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
-from runner.util.arrays import Array, Scalar
+from runner.util.arrays import Array, Ints, Scalar
 
 APPLICATION: Final = "dualtaxi"
 MAX_ROWS: Final = 8_192
@@ -25,6 +25,7 @@ MAX_QUEUED: Final = 40 * MAX_ROWS
 _POINT: Final = pa.list_(pa.field("item", pa.float32(), nullable=False), 2)
 _STRIP: Final = pa.list_(pa.field("item", _POINT, nullable=False))
 _BLOB: Final = pa.list_(pa.field("item", pa.uint8(), nullable=False))
+K = TypeVar("K")
 T = TypeVar("T")
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -136,7 +137,7 @@ def times_of(log_time: ArrayLike, **timelines: Array) -> Times:
     return {"step": steps, **{name: each.astype(np.int64) for name, each in timelines.items()}}
 
 
-def columns(archetype: object, lengths: NDArray[np.int64] | None = None, **parts: Array) -> list[Column]:
+def columns(archetype: object, lengths: Ints | None = None, **parts: Array) -> list[Column]:
     """Return the columns of n rows of a class such as `rerun.Points2D`, without one object per row.
 
     The parts are, by component, text or numbers [n, instances], points [n, instances, 2], line strips
@@ -175,14 +176,14 @@ def rows_of(entity: str, rows: Sequence[Row], view: View | None = None) -> Track
     return Track(entity, {"step": np.array([step for step, _ in rows])}, made, view=view)
 
 
-def grouped(rows: Iterable[tuple[str, T]], size: int) -> Iterator[tuple[str, list[T]]]:
-    """Yield the rows of each entity together, at most `size` at a time."""
-    waiting: dict[str, list[T]] = {}
-    for entity, row in rows:
-        of_entity = waiting.setdefault(entity, [])
-        of_entity.append(row)
-        if len(of_entity) == size:
-            yield entity, waiting.pop(entity)
+def grouped(rows: Iterable[tuple[K, T]], size: int) -> Iterator[tuple[K, list[T]]]:
+    """Yield the rows of each key together, at most `size` at a time."""
+    waiting: dict[K, list[T]] = {}
+    for key, row in rows:
+        of_key = waiting.setdefault(key, [])
+        of_key.append(row)
+        if len(of_key) == size:
+            yield key, waiting.pop(key)
     yield from waiting.items()
 
 
@@ -220,6 +221,6 @@ def grey_text() -> rr.Points2D:
     return rr.Points2D.from_fields(radii=0.0, show_labels=True, colors=[palette.rgb(palette.MIDTONE)])
 
 
-def _listed(counts: NDArray[np.int64], items: pa.Array, kind: pa.DataType | None = None) -> pa.Array:
+def _listed(counts: Ints, items: pa.Array, kind: pa.DataType | None = None) -> pa.Array:
     offsets = pa.array(np.append(0, np.cumsum(counts)).astype(np.int32))
     return pa.ListArray.from_arrays(offsets, items, type=kind)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from runner.export.rerun.selection import Request, Selection, select
 from runner.export.rerun.tracks import Source, Writer, new_stream
 from runner.recording.reader import Recording
 from runner.runs.run import Run
-from runner.util.files import storage_errors
+from runner.util.files import replacing, storage_errors
 
 
 def export(
@@ -74,16 +73,11 @@ def export_runs(
 @contextlib.contextmanager
 def _saved(stream: rr.RecordingStream, path: Path) -> Iterator[None]:
     """Save everything sent to a stream as a file, which replaces another only when it is complete."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with storage_errors(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
+    with storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as temporary:
             temporary.touch()  # where no file can be created, Rerun would not raise an OSError
             stream.save(temporary)
             yield
             stream.flush()
             stream.disconnect()
-            temporary.replace(path)
-    finally:
-        if os.path.lexists(temporary):
-            temporary.unlink()

@@ -21,6 +21,7 @@ from runner.export.rerun.writing import export
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.replay.tables import TableReplay, tables_at
+from tests.runner.export.rerun_views import views_of
 
 TOPICS = {"train": schema.TRAIN_STEP, "eval": schema.EVAL_STEP}
 
@@ -230,20 +231,6 @@ def test_means_between_reports_are_of_the_episodes_that_ended_there(exported):
         if len(ended):
             assert found[time] == pytest.approx(ended["penalties"].mean())
         before = max(before, row["step"])
-
-
-def views_of(path):
-    """Return the entities of each view of an export, by its title."""
-    reader = RrdReader(str(path))
-    titles, entities = {}, {}
-    for chunk in reader.stream(store=reader.blueprints()[0]).to_chunks():
-        values = chunk.to_record_batch().to_pydict()
-        view = str(chunk.entity_path).removeprefix("/view/").partition("/")[0]
-        if "ViewBlueprint:display_name" in values:
-            titles[view] = values["ViewBlueprint:display_name"][0][0]
-        if "ViewContents:query" in values:
-            entities[view] = values["ViewContents:query"][0]
-    return {titles[view]: shown for view, shown in entities.items()}
 
 
 def test_views_show_what_was_sent(exported):

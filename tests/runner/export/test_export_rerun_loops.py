@@ -27,6 +27,7 @@ from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from tests.runner.export.making import made_otherwise
+from tests.runner.export.rerun_views import shown_ranges
 from tests.runner.loops.making import Leaving, Rooms, parallel, play, record_counting
 
 N = 3
@@ -196,20 +197,6 @@ def test_pictures_of_selected_episodes_of_a_vector_are_drawn(tmp_path):
             assert [shown[time] for time in own] == others
             cleared = exported.rows(f"/train/env_{span.start % N}/frame", "Clear:is_recursive")
             assert own[-1] + N in [step for step, flag in cleared if flag]
-
-
-def shown_ranges(path):
-    """Return the range of time that each view of an export shows, by its title."""
-    reader = RrdReader(str(path))
-    titles, ranges = {}, {}
-    for chunk in reader.stream(store=reader.blueprints()[0]).to_chunks():
-        values = chunk.to_record_batch().to_pydict()
-        view = str(chunk.entity_path).removeprefix("/view/").partition("/")[0]
-        if "ViewBlueprint:display_name" in values:
-            titles[view] = values["ViewBlueprint:display_name"][0][0]
-        if "TimeAxis:view_range" in values:
-            ranges[view] = values["TimeAxis:view_range"][0][0]
-    return {titles[view]: (range_["start"], range_["end"]) for view, range_ in ranges.items()}
 
 
 @pytest.mark.parametrize("is_vector", [False, True])
