@@ -237,7 +237,7 @@ def _focus(recording: Recording, shown: Mapping[str, Sequence[range]]) -> tuple[
 
 
 def _asked_episodes(recording: Recording, request: Request, count: int) -> Ints:
-    """Return the numbers of the training episodes, of so many, that a request names, ascending."""
+    """Return the numbers of the training episodes that a request names, ascending; `count` exist."""
     if request.everything:
         return np.arange(count)
     ranges = whole_ranges(request.episodes, count, "train", str(recording.path))
