@@ -50,16 +50,14 @@ def rerun(
     from runner.recording.reader import open_recording
 
     require_rerun("export rerun")
-    from runner.export.rerun.tracks import Source
-    from runner.export.rerun.writing import export
+    from runner.export.rerun.writing import export_runs
 
     started = time.monotonic()
     run = find_recorded(run_name, to.recordings)
     path = to.path(run.file_stem)
     require_new(path, to.force)
     with open_recording(run.recording) as recording, compilation_notice(), stage_line("exporting") as stage:
-        source = Source(recording, f"{run.title} ({run.run_id})")
-        (selection,) = export([source], selected, path, stage)
+        (selection,) = export_runs([run], [recording], selected, path, stage)
     print_selection(selection)
     took = duration(time.monotonic() - started)
     text = f"{path}  {size(path.stat().st_size)}, {selection.steps:,} steps, in {took}"

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from runner.drawing import palette
 from runner.environments.mdp import Mdp
-from runner.environments.naming import action_names, numbered_actions, spoken
+from runner.environments.naming import numbered_actions, spoken
 from runner.export.rerun.scene import Scene
 from runner.export.rerun.tracks import Column, Floats, Points, Track
 from runner.util.arrays import Ints, Records
@@ -79,12 +79,12 @@ class Labels:
         self.explored = self._add(["explored"], palette.BAD)
         self.stops: list[Ints] = []
         """For each agent, [own actions]: the letter of an action such as a pickup; -1 for a move."""
-        for agent, names in enumerate(numbered_actions(mdp)) if scene else ():
-            numbers = np.full(len(names), -1)
-            for own, action in enumerate(mdp.scene["actions"] if mdp.scene and action_names(mdp) else ()):
-                if not any(action.get("move") or ()):
+        if scene:
+            for agent, names in enumerate(numbered_actions(mdp)):
+                numbers = np.full(len(names), -1)
+                for own in scene.stops:
                     numbers[own] = self._add([names[own][0].upper()], palette.agent(agent))
-            self.stops.append(numbers)
+                self.stops.append(numbers)
         self._add_levels(*value_range)
 
     def track(self, root: str) -> Track:

@@ -93,6 +93,8 @@ class LoopReader:
         else:
             parts = {} if self._scene else _parts(recording)
             self._members = [Member(i, name, 0, parts) for i, name in enumerate(self._environments)]
+        self._described: set[str] = set()
+        """Entities that are lines."""
         self._pictured: dict[tuple[str, int], int] = {}
         """The step of the last picture, by phase and environment."""
         self.last = 0
@@ -139,7 +141,7 @@ class LoopReader:
             grid = None
             if scene and spans:
                 labels = Labels(recording.mdp, scene, recording.agents)
-                grid = StepTracks(f"{root}/{phase}", phase, title, labels)
+                grid = StepTracks(root, phase, title, labels)
                 yield labels.track(root)
                 yield from background(root, scene, grid_view(title, scene))
                 yield from grid.still
@@ -160,7 +162,8 @@ class LoopReader:
         """Yield returns and lengths: of a game one length, and the return of each agent."""
         for block in self._recording.blocks(schema.PHASES[phase][1]):
             for member in self._members:
-                own = block if self._is_game else block[self._is_of(block["last_step"], member)]
+                is_own = block["last_step"] % len(self._environments) == member.number
+                own = block if self._is_game else block[is_own]
                 if len(own):
                     times = self._times(own)
                     yield self._line(phase, member, "return", times, own["returns"][:, [member.column]])
@@ -173,7 +176,7 @@ class LoopReader:
         recording = self._recording
         extras = recording.extras(phase).at(steps["step"])
         for member in self._members:
-            is_own = self._is_of(steps["step"], member)
+            is_own = steps["step"] % len(self._environments) == member.number
             if self._is_game:
                 is_own = (steps["acted"] >> member.number & 1).astype(np.bool_)
             if not is_own.any():
@@ -216,10 +219,14 @@ class LoopReader:
         values: Array,
         names: Sequence[str] = ("",),
     ) -> Track:
-        """Return series, [rows, names], with how they are drawn, and in which view.
+        """Return series, [rows, names]; the first also with how they are drawn, and in which view.
 
         A view shows a quantity of all environments; one of several numbers those of one environment.
         """
+        entity = self._entity(phase, member.name, quantity)
+        if entity in self._described:
+            return Track(entity, times, scalars(values))
+        self._described.add(entity)
         colours, lines = phase_colours(phase, len(names)), names
         if len(names) == 1:
             lines = [f"{phase} {member.name}".strip()]
@@ -238,7 +245,6 @@ class LoopReader:
         if member.name and len(names) > 1:
             tab, title = title.capitalize(), f"{member.name} {title}"
         view = View(tab, title.replace("_", " "), has_focus=title not in ("return", "length"))
-        entity = self._entity(phase, member.name, quantity)
         return Track(entity, times, scalars(values), [style], view if member.number < MAX_MEMBERS else None)
 
     def _recorded_frames(self, phase: str) -> Iterator[tuple[int, Row]]:
@@ -320,10 +326,6 @@ class LoopReader:
                     if self._scene:
                         check_steps(steps, recording.mdp, str(recording.path), "recorded")
                     yield steps
-
-    def _is_of(self, steps: Array, member: Member) -> Array:
-        """Return which steps, given by number, were taken in an environment."""
-        return np.asarray(steps % len(self._environments) == member.number)
 
     def _times(self, records: Records, **timelines: Array) -> Times:
         times = times_of(records["log_time"], episode=records["episode"], **timelines)

@@ -14,7 +14,7 @@ import rerun.blueprint as rrb
 from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.export.rerun.layout import PLOTS
-from runner.export.rerun.tracks import Floats, Source, Times, Track, View, scalars, times_of
+from runner.export.rerun.tracks import Colour, Floats, Source, Times, Track, View, scalars, times_of
 from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.metrics import METRICS
@@ -31,7 +31,6 @@ EVENTS: Final = View(
 _ONE_PHASE: Final = ("filled_percent", "reward_percent", "events", "episodes")
 """Metrics of several lines whose view shows one phase alone."""
 
-Colour = tuple[int, int, int]
 Lines = tuple[str, Times, Array, Sequence[str]]
 """The path of an entity, its times, the values of its lines, [rows, lines], and their names."""
 

@@ -22,9 +22,11 @@ from runner.export.rerun.metrics import series_lines
 from runner.export.rerun.scene import Scene, crossing_lines
 from runner.export.rerun.steps import Batch
 from runner.export.rerun.tracks import (
+    GREY,
     Floats,
     Track,
     View,
+    agent_colours,
     columns,
     grey_text,
     pairs,
@@ -142,16 +144,15 @@ class ValueTracks:
         """[values]: the row of each value in the table, from top to bottom."""
         self._points = pairs((x, row - LABEL_RISE) for x in (NUMBER_X, GREEDY_X, CHOSEN_X) for row in y)
         """The points of each action's number, then of its mark as greedy, then of its mark as chosen."""
-        words, lines, colours = [], [], [palette.rgb(palette.agent(i)) for i in range(agents)]
-        grey = palette.rgb(palette.MIDTONE)
+        words, lines, colours = [], [], agent_colours(range(agents))
         for i, names in enumerate(numbered_actions(mdp)):
             agent, rows = spoken(mdp.agents[i]), y[self._agent == i]
             words.append((NAME_X, rows[0] - 1.15, agent.upper(), colours[i]))
-            words += [(NAME_X, row, name, grey) for row, name in zip(rows, names, strict=True)]
+            words += [(NAME_X, row, name, GREY) for row, name in zip(rows, names, strict=True)]
             lines += [f"{agent} {name}" for name in names]
         middle = BAR_LEFT + BAR_LENGTH / 2
         headings = {middle: "worst to best", NUMBER_X: "Q", GREEDY_X: "greedy", CHOSEN_X: "chosen"}
-        words += [(x, -0.15, heading, grey) for x, heading in headings.items()]
+        words += [(x, -0.15, heading, GREY) for x, heading in headings.items()]
         xs, ys, texts, tints = zip(*words, strict=True)
         points = np.stack((xs, np.array(ys) - LABEL_RISE), axis=1)
         bounds = rrb.VisualBounds2D(x_range=(-0.4, TABLE_WIDTH), y_range=(TABLE_TOP, float(y[-1]) + 0.9))
@@ -159,7 +160,7 @@ class ValueTracks:
         view = View("values", name, rrb.Spatial2DView, {"visual_bounds": bounds})
         words_style = rr.Points2D(points, labels=texts, colors=tints, radii=0.0, show_labels=True)
         style = [
-            rr.LineStrips2D.from_fields(colors=[colours[i] for i in self._agent], radii=0.22),
+            rr.LineStrips2D.from_fields(colors=agent_colours(self._agent.tolist()), radii=0.22),
             rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=40.0),
             series_lines(lines),
         ]
@@ -206,24 +207,18 @@ class MapTracks:
         self._learner, self._path = learner, f"{root}/{phase}/map/{name}"
         is_joint = len(labels.learners) != len(mdp.agents)
         agents = list(range(len(mdp.agents))) if is_joint else [learner]
-        movers = [
-            scene.mover_agents.index(mdp.agents[i]) if mdp.agents[i] in scene.mover_agents else 0
-            for i in agents
-        ]
-        self._order = placements.order(movers[0])
+        movers, agent_name = scene.mover_agents, mdp.agents[agents[0]]
+        self._order = placements.order(movers.index(agent_name) if agent_name in movers else 0)
         self._pixel = np.argsort(self._order)[placements.pixel]
         """[S]: the pixel of each state."""
         row, column = np.divmod(np.arange(len(self._order)), placements.width)
         self._centres = np.stack((column + 0.5, row + 0.5), axis=1).astype(np.float32)
-        x = (np.arange(len(movers)) - (len(movers) - 1) / 2) * 2 * _AGENT_OFFSET
+        x = (np.arange(len(agents)) - (len(agents) - 1) / 2) * 2 * _AGENT_OFFSET
         self._origins = self._centres + np.stack((x, 0 * x), axis=1).astype(np.float32)[:, None]
         """[agents, pixels, 2]."""
-        arrows, letters = [], []
-        for agent, mover in zip(agents, movers, strict=True):
-            own = mdp.own_actions[:, agent]
-            actions = np.arange(len(own)) if is_joint else np.unique(own, return_index=True)[1]
-            arrows.append(scene.moves[actions, mover] * np.float32(_ARROW_SCALE))
-            letters.append(labels.stops[agent][own[actions]])
+        actions = [mdp.own_actions[:, i] if is_joint else np.arange(mdp.action_counts[i]) for i in agents]
+        arrows = [scene.own_moves[own] * np.float32(_ARROW_SCALE) for own in actions]
+        letters = [labels.stops[agent][own] for agent, own in zip(agents, actions, strict=True)]
         # The last action is that of pixels without a state, -1.
         self._arrows = np.pad(np.stack(arrows), ((0, 0), (0, 1), (0, 0)))
         self._letters = np.pad(np.stack(letters), ((0, 0), (0, 1)), constant_values=-1)
@@ -235,7 +230,7 @@ class MapTracks:
             channel_datatype=rr.ChannelDatatype.F32,
             color_model=rr.ColorModel.L,
         )
-        colours = [palette.rgb(palette.agent(agent)) for agent in agents for _ in self._order]
+        colours = agent_colours(np.repeat(agents, len(self._order)).tolist())
         origins, red = self._origins.reshape(-1, 2), [palette.rgb(palette.BAD)]
         parts = {
             f"{root}/frame": rr.LineStrips2D(lines, colors=[(255, 255, 255)], radii=0.06, draw_order=30),
@@ -285,9 +280,8 @@ class MapTracks:
             f"as of step {time:,}\n{placements.names[context]}"
             for time, context in zip(times["step"].tolist(), contexts, strict=True)
         ]
-        yield Track(path, times, image)
-        sizes = repeated(pairs([(0.5, 0.5)]), n)
-        yield Track(f"{path}/here", times, columns(rr.Boxes2D, half_sizes=sizes))
-        yield Track(f"{path}/moves", times, columns(rr.Arrows2D, vectors=vectors))
-        yield Track(f"{path}/stops", times, stops)
+        sizes = columns(rr.Boxes2D, half_sizes=repeated(pairs([(0.5, 0.5)]), n))
+        moves = columns(rr.Arrows2D, vectors=vectors)
+        for part, shown in (("", image), ("/here", sizes), ("/moves", moves), ("/stops", stops)):
+            yield Track(path + part, times, shown)
         yield text_track(f"{path}/label", times, (placements.width / 2, MAP_LABEL_Y), labels)

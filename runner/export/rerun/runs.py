@@ -9,7 +9,6 @@ from typing import TypeVar
 import numpy as np
 import rerun as rr
 
-from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.export.rerun.labels import Labels
 from runner.export.rerun.metrics import EVENTS, metric_tracks, phase_colours, series_lines
@@ -18,6 +17,7 @@ from runner.export.rerun.scene import background, scene_of
 from runner.export.rerun.selection import Selection
 from runner.export.rerun.steps import Batch, StepTracks, grid_view
 from runner.export.rerun.tracks import (
+    GREY,
     MAX_ROWS,
     Source,
     Track,
@@ -48,18 +48,15 @@ class JobReader:
         labels = self._labels = Labels(self._mdp, self._scene, recording.agents, (low, high))
         self._phases: dict[str, tuple[StepTracks, list[ValueTracks | MapTracks]]] = {}
         """What makes the tracks of the steps, and of the values at them."""
-        root, maps = (
-            source.root,
-            range(len(recording.agents) if self._scene and self._scene.placements else 0),
-        )
+        maps = range(len(recording.agents) if self._scene and self._scene.placements else 0)
         for phase in (phase for phase, spans in selection.by_phase.items() if spans):
-            values: list[ValueTracks | MapTracks] = [ValueTracks(root, phase, labels)]
-            values += [MapTracks(root, phase, labels, i) for i in maps]
-            self._phases[phase] = StepTracks(f"{root}/{phase}", phase, source.title, labels), values
+            values: list[ValueTracks | MapTracks] = [ValueTracks(source.root, phase, labels)]
+            values += [MapTracks(source.root, phase, labels, i) for i in maps]
+            self._phases[phase] = StepTracks(source.root, phase, source.title, labels), values
 
     def overview(self) -> Iterator[Track]:
         """Yield all metrics, and what never changes of the steps."""
-        root, agents = self._source.root, self._recording.agents
+        root = self._source.root
         yield from metric_tracks(self._source)
         if not self._phases:
             return
@@ -67,12 +64,9 @@ class JobReader:
         if self._scene:
             view = grid_view(self._source.title, self._scene)
             yield from background(root, self._scene, view)
-            text = rr.Points2D.from_fields(radii=0.0, colors=[palette.rgb(palette.MIDTONE)])
+            text = rr.Points2D.from_fields(radii=0.0, colors=[GREY])
             yield Track(f"{root}/notice/text", static=[text], view=view)
-        for phase, (steps, values) in self._phases.items():
-            colours = phase_colours(phase, len(agents))
-            style = series_lines([f"reward {spoken(name)}" for name in agents], colours)
-            yield Track(f"{steps.path}/reward", static=[style])
+        for steps, values in self._phases.values():
             yield Track(f"{steps.path}/events", view=EVENTS)
             for maker in (steps, *values):
                 yield from maker.still
@@ -84,9 +78,10 @@ class JobReader:
         covered, reader = [], ValueReader(self._recording, self._scene)
         for phase, (steps, values) in self._phases.items():
             parts = [f"{steps.path}/{part}" for part in ("q", "map", "grid")]
-            are_values_shown = False
+            names = [f"reward {spoken(name)}" for name in self._recording.agents]
+            style, are_values_shown = [series_lines(names, phase_colours(phase, len(names)))], False
             for batch in _prefetched(_batches(self._pieces(phase, reader))):
-                yield Track(f"{steps.path}/reward", batch.times(), scalars(batch.records["rewards"]))
+                yield Track(f"{steps.path}/reward", batch.times(), scalars(batch.records["rewards"]), style)
                 yield from steps.of(batch)
                 if len(batch.values):
                     for shown in values:

@@ -5,7 +5,7 @@ Coordinates are cells: x to the right, y down, the first cell from (0, 0) to (1,
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
@@ -17,7 +17,7 @@ from runner.drawing.svg import VEHICLES, wall_ends
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names
 from runner.environments.scene import SceneDescription
-from runner.export.rerun.tracks import Track, View, pairs
+from runner.export.rerun.tracks import GREY, Track, View, pairs
 from runner.util.arrays import Ints
 
 _SPACING: Final = 0.34
@@ -92,14 +92,19 @@ class Scene:
         """[S, movers]: 1 where a mover carries something."""
         self.is_carried = carriers[:, self.passengers] >= 0
         """[S, passengers]: whether something carries the passenger."""
-        self.moves = np.zeros((mdp.joint_actions, len(self.movers), 2), np.float32)
-        """[J, movers, 2]: a short arrow for each mover's own action; zero for an action that is no move."""
+        moves: list[Sequence[int]] = [(0, 0)] * max(mdp.action_counts)
+        self.stops: list[int] = []
+        """Actions of an agent that are no moves, such as a pickup, as far as actions have names."""
         if action_names(mdp) is not None:
-            moves = pairs((action.get("move") or (0, 0))[::-1] for action in description["actions"])
-            for i, agent in enumerate(self.mover_agents):
-                if agent in mdp.agents:
-                    own = mdp.own_actions[:, mdp.agents.index(agent)]
-                    self.moves[:, i] = moves[own] * _BLOCKED_ARROW
+            moves = [action.get("move") or (0, 0) for action in description["actions"]]
+            self.stops = [own for own, move in enumerate(moves) if not any(move)]
+        self.own_moves = pairs(move[::-1] for move in moves) * np.float32(_BLOCKED_ARROW)
+        """[own actions, 2]: a short arrow for an agent's action; zero for an action that is no move."""
+        self.moves = np.zeros((mdp.joint_actions, len(self.movers), 2), np.float32)
+        """[J, movers, 2]: the arrow of each mover's own action."""
+        for i, agent in enumerate(self.mover_agents):
+            if agent in mdp.agents:
+                self.moves[:, i] = self.own_moves[mdp.own_actions[:, mdp.agents.index(agent)]]
 
     @cached_property
     def placements(self) -> Placements | None:
@@ -155,13 +160,13 @@ class Placements:
 
 def background(root: str, scene: Scene, view: View) -> Iterator[Track]:
     """Yield cells, walls and landmarks."""
-    rows, columns, grey = scene.rows, scene.columns, palette.rgb(palette.MIDTONE)
+    rows, columns = scene.rows, scene.columns
     lines = crossing_lines(range(rows + 1), range(columns + 1))
     border = [(0, 0), (columns, 0), (columns, rows), (0, rows), (0, 0)]
     walls: list[Any] = [border, *map(wall_ends, scene.description["walls"])]
     parts: dict[str, Any] = {
-        "cells": rr.LineStrips2D(lines, colors=[(*grey, 90)], radii=0.008, draw_order=10),
-        "walls": rr.LineStrips2D(walls, colors=[grey], radii=0.05, draw_order=25),
+        "cells": rr.LineStrips2D(lines, colors=[(*GREY, 90)], radii=0.008, draw_order=10),
+        "walls": rr.LineStrips2D(walls, colors=[GREY], radii=0.05, draw_order=25),
     }
     if marks := scene.description["landmarks"]:
         # A line 0.46 wide around this square and along its diagonal fills a cell.

@@ -27,6 +27,7 @@ from runner.export.rerun.tracks import (
     Times,
     Track,
     View,
+    agent_colours,
     columns,
     grey_text,
     pairs,
@@ -73,8 +74,9 @@ class Batch(NamedTuple):
 class StepTracks:
     """Makes the tracks of a phase: the grid, or without a scene states and actions as lines."""
 
-    def __init__(self, path: str, phase: str, title: str, labels: Labels) -> None:
-        self.path, self._phase, self._labels = path, phase, labels
+    def __init__(self, root: str, phase: str, title: str, labels: Labels) -> None:
+        path = self.path = f"{root}/{phase}"
+        self._phase, self._labels = phase, labels
         self._states = states_in_words(labels.mdp)
         self._entry = cache(partial(_entry, labels.mdp))
         self._before: Ints | None = None
@@ -84,7 +86,7 @@ class StepTracks:
         parts: dict[str, list[Any]] = {}
         if scene := labels.scene:
             view = grid_view(title, scene)
-            colours = [palette.rgb(palette.agent(i)) for i in range(len(scene.movers))]
+            colours = agent_colours(range(len(scene.movers)))
             radii = [shape.radius for shape in scene.shapes]
             fills, faded = [palette.rgb(shape.colour) for shape in scene.shapes], [(*c, 120) for c in colours]
             parts["grid/things"] = [

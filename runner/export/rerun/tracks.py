@@ -27,6 +27,8 @@ _STRIP: Final = pa.list_(pa.field("item", _POINT, nullable=False))
 _BLOB: Final = pa.list_(pa.field("item", pa.uint8(), nullable=False))
 K = TypeVar("K")
 T = TypeVar("T")
+Colour = tuple[int, int, int]
+GREY: Final[Colour] = palette.rgb(palette.MIDTONE)
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
 """[..., 2]: x and y."""
@@ -216,9 +218,14 @@ def text_track(entity: str, times: Times, where: tuple[float, float], rows: Sequ
     return Track(entity, times, columns(rr.Points2D, positions=positions, labels=texts(rows)))
 
 
+def agent_colours(agents: Iterable[int]) -> list[Colour]:
+    """Return the colours of agents, or of their movers, by number."""
+    return [palette.rgb(palette.agent(i)) for i in agents]
+
+
 def grey_text() -> rr.Points2D:
     """Return how a text without a point is drawn."""
-    return rr.Points2D.from_fields(radii=0.0, show_labels=True, colors=[palette.rgb(palette.MIDTONE)])
+    return rr.Points2D.from_fields(radii=0.0, show_labels=True, colors=[GREY])
 
 
 def _listed(counts: Ints, items: pa.Array, kind: pa.DataType | None = None) -> pa.Array:

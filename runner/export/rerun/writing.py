@@ -39,13 +39,14 @@ def export(
             readers.append((Writer(stream, source, selection.focus, reader.last), reader))
         for writer, reader in readers:
             writer.send(reader.overview())
+        writers = [writer for writer, _ in readers]
         are_jobs = all(source.recording.has_tables for source in sources)
         if are_jobs:  # before the steps; active, as a viewer has arranged the metrics by itself
-            stream.send_blueprint(blueprint([writer for writer, _ in readers]))
+            stream.send_blueprint(blueprint(writers))
         for writer, reader in readers:
             writer.send(reader.steps())
         if not are_jobs:  # their views follow from steps
-            stream.send_blueprint(blueprint([writer for writer, _ in readers]))
+            stream.send_blueprint(blueprint(writers))
     return selections
 
 
@@ -57,16 +58,13 @@ def export_runs(
     stage: Callable[[str], None] = lambda _: None,
 ) -> list[Selection]:
     """Write runs and their opened recordings as `export` does; several have different colours."""
-    sources = [
-        Source(recording, f"{run.title} ({run.run_id})")
-        for run, recording in zip(runs, recordings, strict=True)
-    ]
-    if len(runs) > 1:
-        colours = itertools.cycle(palette.COMPARED)
-        sources = [
-            dataclasses.replace(source, root=f"/{run.run_id}", tint=next(colours))
-            for source, run in zip(sources, runs, strict=True)
-        ]
+    colours = itertools.cycle(palette.COMPARED)
+    sources = []
+    for run, recording in zip(runs, recordings, strict=True):
+        source = Source(recording, f"{run.title} ({run.run_id})")
+        if len(runs) > 1:
+            source = dataclasses.replace(source, root=f"/{run.run_id}", tint=next(colours))
+        sources.append(source)
     return export(sources, request, path, stage)
 
 
