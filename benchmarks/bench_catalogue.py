@@ -23,7 +23,7 @@ from runner.util.files import CACHE_VARIABLE
 
 LISTED, RECORDED = 10_000, 1_000
 SMALL = ("episodes=30", "env.kwargs={max_episode_steps: 40}", "evaluation.every=10", "evaluation.trials=5")
-FILTER = "status:finished config.discount:>0.5 NOT tag:keep"
+FILTER = 'status == "finished" and config.discount > 0.5 and "keep" not in tags'
 DISK = """
 import sys
 from pathlib import Path

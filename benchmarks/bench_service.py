@@ -17,7 +17,7 @@ MEDIAN: Final = (60, 20)
 NINETY_NINTH: Final = (300, 100)
 """Targets in milliseconds: at least, and aim."""
 SEARCHES: Final = [
-    f"/api/v1/runs?filter=name:experiment{k}%20config.discount:%3E0.{k}&sort=-success_percent"
+    f"/api/v1/runs?filter=name=='experiment{k}'%20and%20config.discount%3E0.{k}&sort=-success_percent"
     for k in range(1, 38)
 ]
 """Different searches, because a response is cached for five seconds."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -112,10 +113,12 @@ def _shipped(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
 
 
 def _filter_words(_ctx: click.Context, incomplete: str) -> Mapping[str, str]:
-    if incomplete.startswith("status:"):
-        return {f"status:{status}": "" for status in columns.STATUSES}
-    words = {f"{name}:": field.meaning for name, field in columns.FIELDS.items()}
-    return words | {columns.SETTING: "a value of the configuration, such as config.discount"}
+    before = re.sub(r"[\w.]*$", "", incomplete)
+    if re.search(r"\bstatus *[!=]= *[\"']$", before):
+        return {f"{before}{status}{before[-1]}": "" for status in columns.STATUSES}
+    words = {name: field.meaning for name, field in columns.FIELDS.items()}
+    words[columns.SETTING] = "a value of the configuration, such as config.discount"
+    return {before + word: meaning for word, meaning in words.items()}
 
 
 def _settings(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:

@@ -1,161 +1,28 @@
-"""The quantities of a job's training: their names in expressions, and their values after each step.
-
-q[STATE, ACTION]       a Q-value; max(q[STATE]) and min(q[STATE]) those of a state
-greedy[STATE]          the greedy action
-greedy_success[STATE]  whether the greedy path from there has an event of success within the step limit
-visits[STATE]          how often a step began in the state; visits[STATE, ACTION] with this action
-step, episode          numbers of the training step and of its episode
-reward                 of the training step
-epsilon                the probability of exploring at the training step
-
-With a table for each agent, `q.taxi_1[...]`, `reward.taxi_1`, `greedy.taxi_1[...]` and `visits.taxi_1[...]`
-are the agent's own; `greedy[...]` and `visits[...]` are then of joint actions.
-"""
+"""The values of a job's quantities after each training step; `runner.debugging.expressions` names them."""
 
 from __future__ import annotations
 
-import ast
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.config import from_mapping
-from runner.debugging.expressions import Array, Columns, Parser, Term
-from runner.environments.naming import actions_in_words, numbered_actions, states_in_words
-from runner.errors import RecordingError, RunnerError, nearest
+from runner.debugging.expressions import JOINT, TABLE_NAMES, Array, Columns, Quantity
+from runner.errors import RecordingError, RunnerError
 from runner.learning.learner import rules_of
 from runner.learning.watching import Changes, Watch, explorations
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.tables import TableReplay
 
-NAMES: Final = ("q", "greedy", "greedy_success", "visits", "step", "episode", "reward", "epsilon")
-_INDEXED: Final = NAMES[:4]
-JOINT: Final = -1
-"""Stands for the learner of a joint action."""
 MAX_CELLS: Final = 4_096
 """The most Q-values of an expression."""
 MAX_PATH_STATES: Final = 1 << 24
 """The most states of all greedy paths of an expression."""
 _VALUES_AT_ONCE: Final = 1 << 20
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """What is read after each step."""
-
-    name: str
-    learner: int = 0
-    """`JOINT` for joint actions."""
-    state: int = -1
-    action: int = -1
-    """-1 for all."""
-
-
-class JobVocabulary:
-    """Finds the quantities that an expression names; `quantities` lists them."""
-
-    def __init__(self, recording: Recording) -> None:
-        self._mdp = recording.mdp
-        self._learners = recording.agents
-        self._learns = from_mapping(recording.config).algorithm != "random"
-        self._joint = [str(name) for name in actions_in_words(self._mdp)]
-        self._own = numbered_actions(self._mdp) if len(self._learners) > 1 else [self._joint]
-        self._state_names = [str(name) for name in states_in_words(self._mdp)]
-        self.quantities: dict[Quantity, None] = {}
-
-    @property
-    def states(self) -> tuple[tuple[int, str], ...]:
-        """The states of the quantities, with their names."""
-        numbers = sorted({each.state for each in self.quantities if each.state >= 0})
-        return tuple((number, self._state_names[number]) for number in numbers)
-
-    def resolve(self, parser: Parser, node: ast.expr) -> Term:
-        """Return the quantity that a node names."""
-        head = node.value if isinstance(node, ast.Subscript) else node
-        base = head.value if isinstance(head, ast.Attribute) else head
-        if not isinstance(base, ast.Name) or base.id not in NAMES:
-            base_text = parser.text_of(base)
-            hint = nearest(base_text, NAMES)
-            raise parser.error(base, f"found {base_text[:60]}, expected one of {', '.join(NAMES)}.{hint}")
-        name, agent = base.id, head.attr if isinstance(head, ast.Attribute) else None
-        self._check_algorithm(parser, base, name)
-        learner = self._learner(parser, head, name, agent)
-        if name not in _INDEXED:
-            if isinstance(node, ast.Subscript):
-                raise parser.error(node, f"found {name} with an index, expected {name} alone.")
-            return self._term(Quantity(name, learner))
-        if not isinstance(node, ast.Subscript):
-            example = f"{name}[STATE, ACTION]" if name == "q" else f"{name}[STATE]"
-            raise parser.error(node, f"found {parser.text_of(node)} without a state, expected {example}.")
-        return self._term(Quantity(name, learner, *self._place(parser, node, name, learner)))
-
-    def _check_algorithm(self, parser: Parser, node: ast.expr, name: str) -> None:
-        if name in _INDEXED[:3] and not self._learns:
-            raise parser.error(
-                node,
-                f"found {name}, but random agents learn no Q-values; visits and reward remain.",
-            )
-        if name == "greedy_success":
-            if not self._mdp.success_events:
-                raise parser.error(node, "found greedy_success, but the environment names no success events.")
-            if (self._mdp.probability[..., 1:] > 0).any():
-                raise parser.error(
-                    node,
-                    "found greedy_success, but actions of this environment have several outcomes, so that a "
-                    "greedy path is not one path; greedy[STATE] is the action in each state.",
-                )
-
-    def _learner(self, parser: Parser, node: ast.expr, name: str, agent: str | None) -> int:
-        several = len(self._learners) > 1
-        expected = " or ".join(f"{name}.{each}" for each in self._learners)
-        if agent is not None:
-            if name not in ("q", "greedy", "visits", "reward"):
-                raise parser.error(node, f"found {name} of an agent, expected {name} alone.")
-            if agent not in self._learners:
-                hint = nearest(agent, self._learners)
-                raise parser.error(node, f"found {name}.{agent}, expected {expected}.{hint}")
-            return self._learners.index(agent)
-        if several and name in ("q", "reward"):
-            raise parser.error(node, f"found {name} of {len(self._learners)} agents, expected {expected}.")
-        return JOINT if several else 0
-
-    def _place(self, parser: Parser, node: ast.Subscript, name: str, learner: int) -> tuple[int, int]:
-        """Return the state and the action of an index; action -1 if it has none."""
-        parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
-        takes = 2 if name in ("q", "visits") else 1
-        if not 1 <= len(parts) <= takes:
-            raise parser.error(
-                node,
-                f"found {len(parts)} values, expected {'STATE, ACTION' if takes == 2 else 'STATE'}.",
-            )
-        state = parser.number_of(parts[0], self._state_names, "state")
-        if len(parts) == 1:
-            return state, -1
-        return state, parser.number_of(parts[1], self._actions(learner), "action")
-
-    def _actions(self, learner: int) -> list[str]:
-        return self._joint if learner == JOINT else self._own[learner]
-
-    def _term(self, quantity: Quantity) -> Term:
-        self.quantities[quantity] = None
-        kind: Literal["number", "condition", "row", "action"] = "number"
-        if quantity.name == "greedy_success":
-            kind = "condition"
-        elif quantity.name == "greedy":
-            kind = "action"
-        elif quantity.name == "q" and quantity.action < 0:
-            kind = "row"
-        return Term(
-            kind,
-            lambda columns: columns[quantity],
-            self._actions(quantity.learner) if kind == "action" else (),
-            quantity.name in ("visits", "step", "episode"),
-        )
 
 
 class JobColumns:
@@ -186,7 +53,7 @@ class JobColumns:
         self._visits = {each: 0 for each in quantities if each.name == "visits"}
         if self._visits:
             self._count_visits(recording, start)
-        self._replay = TableReplay(recording, start) if names & set(_INDEXED[:3]) else None
+        self._replay = TableReplay(recording, start) if names & set(TABLE_NAMES) else None
         self._last = self._first()
 
     def _new_watch(self) -> Watch:

@@ -5,7 +5,7 @@
     for interval in runner.when(run, "max(q[300]) > 20", every=True).intervals:
         print(interval.start.step, interval.end and interval.end.step)
 
-`runner.debugging.quantities` lists what an expression may contain.
+`runner.debugging.expressions` lists what an expression may contain.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ import numpy as np
 from runner.analysis.sections import Grid, Section, html
 from runner.analysis.step_reference import EXPECTED_OF_TRAINING, StepRef, parse_step, training_step
 from runner.archive.places import at_hand
-from runner.debugging.expressions import Array, Columns, Expression, Parser, Term
-from runner.debugging.quantities import JobColumns, JobVocabulary, check_lost
+from runner.debugging.expressions import Array, Columns, Expression, JobParser, Series
+from runner.debugging.quantities import JobColumns, check_lost
 from runner.errors import RunnerError
 from runner.export.contents import require_steps
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
+from runner.util.expressions import CONDITION
 from runner.util.humanize import UNKNOWN, counted
 from runner.util.values import Json
 
@@ -158,14 +159,14 @@ def when_in(
     It lists at most `limit` intervals.
     """
     recording.require_job("`when`", "A loop has no Q-tables; `dualtaxi plot` shows what it logged.")
-    vocabulary = JobVocabulary(recording)
-    parsed = Parser(expression, vocabulary.resolve).parse()
+    parser = JobParser(expression, recording)
+    parsed = parser.parse()
     require_steps(recording, "search")
     start = 0 if first is None else _step_number(recording, first)
     stop = recording.count(schema.TRAIN_STEP) if last is None else _step_number(recording, last) + 1
     if start >= stop:
         raise RunnerError(f"found first step {start:,} and last step {stop - 1:,}, expected them in order.")
-    columns = JobColumns(recording, list(vocabulary.quantities), max(start - 1, 0))
+    columns = JobColumns(recording, list(parser.quantities), max(start - 1, 0))
     for block in recording.blocks(schema.TRAIN_STEP, start - 1, start) if start else ():
         deque(columns.take(block, 0), maxlen=0)  # what was known before the first step
     terms = parsed.terms
@@ -184,7 +185,7 @@ def when_in(
         count=search.count,
         steps=search.steps if every else None,
         last=search.last,
-        states=vocabulary.states,
+        states=parser.states,
     )
 
 
@@ -239,13 +240,13 @@ def _search(
     return _Found(moments, count, steps + stop * holds, _moment(block[-1], parts, 0, 0))
 
 
-def _values(term: Term, columns: Columns) -> Array:
+def _values(term: Series, columns: Columns) -> Array:
     """Return the values of a term in all rows of the columns."""
     rows = len(next(iter(columns.values())))
     return np.broadcast_to(term.evaluate(columns), rows)
 
 
-def _moment(step: np.void, parts: Sequence[tuple[Term, Array]], before: int, after: int) -> Moment:
+def _moment(step: np.void, parts: Sequence[tuple[Series, Array]], before: int, after: int) -> Moment:
     have_values = [not any(np.isnan(column[row]) for _, column in parts) for row in (before, after)]
     values = [
         Value(
@@ -258,8 +259,8 @@ def _moment(step: np.void, parts: Sequence[tuple[Term, Array]], before: int, aft
     return Moment(int(step["step"]), int(step["episode"]), int(step["t"]), tuple(values))
 
 
-def _scalar(term: Term, value: np.float64 | np.bool_, is_known: bool) -> Scalar:
-    if term.kind == "condition":
+def _scalar(term: Series, value: np.float64 | np.bool_, is_known: bool) -> Scalar:
+    if term.kind == CONDITION:
         return bool(value) if is_known else None
     if np.isnan(value):
         return None

@@ -42,8 +42,8 @@ RUN_PAGES: Final = {
 PAGES: Final = (
     "/",
     "/runs",
-    "/runs?filter=name:pole",
-    "/runs?filter=status:nosuch",
+    '/runs?filter=name == "pole"',
+    '/runs?filter=status == "nosuch"',
     "/runs/nosuchrun",
     "/compare?run={cooperative}&run={other}",
     "/compare?run={cooperative}&run={competitive}",

@@ -69,7 +69,11 @@ class Shop(contextlib.ExitStack):
         self.served = self.enter_context(Served(self.recordings))
         self.served.post("/jobs", "name: queued\nmode: cooperative\nepisodes: 20\nseed: 0\n")
         self.served.until(lambda jobs: jobs[1]["state"] == "finished", 600)
-        until(bool, lambda: self.served.get("/runs?filter=name:queued AND status:finished")["runs"], 600)
+        until(
+            bool,
+            lambda: self.served.get("/runs?filter=name == 'queued' and status == 'finished'")["runs"],
+            600,
+        )
         patch.setenv("DUALTAXI_RECORDINGS", str(self.recordings))
         return self
 

@@ -51,13 +51,14 @@ def label_command(
     """Change the name, note and tags of RUN, and show them.
 
     They are stored in labels.json next to the recording, which stays as it is. A run tagged `keep` is never
-    removed by rm or prune. `dualtaxi ls tag:TAG` and `dualtaxi ls note:WORD` find labelled runs.
+    removed by rm or prune. `dualtaxi ls '"TAG" in tags'` and `dualtaxi ls '"WORD" in note'` find labelled
+    runs.
 
     Examples:
       dualtaxi label @latest --name patient --tag keep --tag figure-3
       dualtaxi label patient --note 'the step size of the paper'
       dualtaxi label k3v9m2xq --note - < observations.txt
-      dualtaxi ls --quiet name:quick | xargs -I{} dualtaxi label {} --tag first-try
+      dualtaxi ls --quiet 'name == "quick"' | xargs -I{} dualtaxi label {} --tag first-try
     """
     run = find(run_name, recordings)
     missing = sorted(set(untags) - set(run.tags))
@@ -95,7 +96,7 @@ def du_command(
 
     Examples:
       dualtaxi du
-      dualtaxi du status:finished age:>30d --limit 5
+      dualtaxi du 'status == "finished" and age > "30d"' --limit 5
     """
     from runner.runs.catalogue.filters import parse
     from runner.runs.catalogue.index import look

@@ -107,9 +107,9 @@ def ls_command(
 ) -> None:
     """List the runs that match FILTER, or all, newest first.
 
-    A filter consists of words, searched for in id, name, configuration, tags and note; of FIELD:VALUE,
-    FIELD:>VALUE and FIELD:[LOW TO HIGH]; of AND, OR, NOT and parentheses. Text must match as a whole, with
-    the wildcards * and ?; FIELD:* matches every run that has the field. The fields:
+    A filter is a list of words, searched for in id, name, configuration, tags and note, or a condition in
+    Python's syntax: comparisons of fields, "TEXT" in FIELD, FIELD in ("A", "B"), like(FIELD, "A*"),
+    FIELD is None, and, or, not, arithmetic, max(), min(), abs(). The fields:
 
     \b
       id name config seed status tag note created age episodes steps success_percent
@@ -125,10 +125,10 @@ def ls_command(
 
     Examples:
       dualtaxi ls
-      dualtaxi ls tutorial NOT tag:keep
-      dualtaxi ls 'status:finished config.discount:>0.9' --sort -success_percent --limit 5
-      dualtaxi ls 'created:[2026-01-01 TO *] (seed:<3 OR age:<12h)' --columns id,seed,config,digest
-      dualtaxi ls --quiet name:quick
+      dualtaxi ls tutorial
+      dualtaxi ls 'status == "finished" and config.discount > 0.9' --sort -success_percent --limit 5
+      dualtaxi ls 'created >= "2026-01-01" and (seed < 3 or age < "12h")' --columns id,seed,config,digest
+      dualtaxi ls --quiet '"tutorial" and "keep" not in tags'
     """  # noqa: D301 - Click's mark for preformatted text
     from runner.runs.catalogue.filters import parse
 
@@ -151,7 +151,7 @@ def ls_command(
     for problem in problems[:MAX_PROBLEMS]:
         say(capitalised(problem))
     if len(problems) > MAX_PROBLEMS:
-        say(f"{len(problems) - MAX_PROBLEMS:,} more runs are damaged: `dualtaxi ls status:damaged`.")
+        say(f"{len(problems) - MAX_PROBLEMS:,} more runs are damaged: `dualtaxi ls 'status == \"damaged\"'`.")
     _print_remainder(listed, total, offset, chosen, recordings)
 
 

@@ -58,7 +58,7 @@ def rm_command(
     Examples:
       dualtaxi rm k3v9m2xq p7
       dualtaxi rm @latest --dry-run
-      dualtaxi ls --quiet status:failed | xargs dualtaxi rm --yes
+      dualtaxi ls --quiet 'status == "failed"' | xargs dualtaxi rm --yes
     """
     from runner.runs.catalogue.removal import plan
 
@@ -105,7 +105,7 @@ def prune_command(
 
     Examples:
       dualtaxi prune --older-than 30d --keep-last 5 --status interrupted --dry-run
-      dualtaxi prune 'config:quick success_percent:<50' --yes
+      dualtaxi prune 'config == "quick" and success_percent < 50' --yes
       dualtaxi prune --explanations --dry-run
     """
     from runner.runs.catalogue.filters import parse, seconds_of

@@ -26,16 +26,16 @@ STATUSES: Final = ("running", "finished", "interrupted", "failed", "archived", "
 class Kind(enum.Enum):
     """How a filter compares the values of a column; the text says what it expects."""
 
-    START = "the beginning of it"
-    TEXT = "the whole of it; * and ? stand for any"
+    START = "a text in quotes; like() finds it by its beginning"
+    TEXT = "a text in quotes; like() takes the wildcards * and ?"
     STATUS = "one of " + ", ".join(STATUSES)
-    PROSE = "a part of it"
-    TAGS = "one of them"
+    PROSE = "a text in quotes; TEXT in FIELD finds a part of it"
+    TAGS = "a text in quotes, as in TEXT in tags"
     WHOLE = "a whole number"
     NUMBER = "a number"
-    SIZE = "a number of bytes, or 10MB, 1.5GB"
-    DATE = "a date such as 2026-01-31, or 2026-01-31T10:00 (UTC)"
-    AGE = "a time span such as 90s, 12h, 30d or 2w, with < or >"
+    SIZE = 'a number of bytes, or "10MB", "1.5GB"'
+    DATE = 'a date such as "2026-01-31", or "2026-01-31T10:00" (UTC)'
+    AGE = 'a time span such as "90s", "12h", "30d" or "2w", with < or >'
 
 
 TEXT_KINDS: Final = (Kind.START, Kind.TEXT, Kind.STATUS, Kind.PROSE, Kind.TAGS)

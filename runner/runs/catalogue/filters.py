@@ -1,48 +1,51 @@
-"""Filters: the Lucene query syntax, parsed by luqum, as conditions on the index.
+"""Filters: expressions over the columns of a run, as conditions on the index; or words to search for.
 
-    status:finished AND config.discount:>0.9 NOT tag:keep
-    created:[2026-01-01 TO *] (name:tutorial* OR seed:{0 TO 9])
+    status == "finished" and config.discount > 0.9 and "keep" not in tags
+    created >= "2026-01-01" and (like(name, "tutorial*") or 0 < seed <= 9)
     patient
 
-Adjacent words are joined by AND, which binds less than a written AND or OR. A word without a field is
-searched for in id, name, configuration's name, tags and note. Case is ignored. A missing value matches no
-comparison, so that its NOT does. Values of a filter reach SQL only as parameters.
+Words are searched for in id, name, configuration's name, tags and note; so is a text alone in an expression.
+Case is ignored. A missing value matches no comparison, so that its `not` does, as does `!=`. Values of a
+filter reach SQL only as parameters.
 """
 
 from __future__ import annotations
 
+import ast
 import functools
 import glob
 import math
 import re
-from collections.abc import Sequence
+import sys
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Final
+from itertools import accumulate
+from typing import Any, Final
 
 from runner.errors import RunnerError, nearest
-from runner.runs.catalogue.columns import FIELDS, SETTING, STATUSES, TEXT_KINDS, Column, Kind, field_of
+from runner.runs.catalogue.columns import SETTING, STATUSES, TEXT_KINDS, Column, Kind, field_of
 from runner.runs.catalogue.rows import SEED_SHIFT, Sql
-from runner.util.values import is_utf8
+from runner.util.expressions import CONDITION, NUMBER, TEXT, Operation, Parser, Term
 
-if TYPE_CHECKING:
-    from luqum.tree import Item
-
-MAX_LENGTH: Final = 10_000
-"""Characters of a filter."""
-MAX_DEPTH: Final = 50
-"""How deep the parentheses of a filter may be nested."""
-
-_PIECE: Final = re.compile(r"\\(.)|([*?])|([^\\*?]+)|(\\)", re.DOTALL)
-_PLACE: Final = re.compile(
-    r"(?:Syntax error in input : )?\s*(.*?)(?: at (?:position (\d+)|the end))!?", re.DOTALL
-)
-_MISTAKEN: Final = {"and": "AND", "or": "OR", "not": "NOT", "&&": "AND", "||": "OR", "&": "AND", "|": "OR"}
-_COMPARISON: Final = re.compile(r"([A-Za-z_][\w.-]*)\s*([<>]=?|!=|==?)(.*)", re.DOTALL)
-_OPPOSITE: Final = {"<": ">", "<=": ">=", ">": "<", ">=": "<="}
-_SPAN: Final = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|d|w)")
+MAX_DEPTH: Final = 16
+"""How deep parentheses may be nested in SQL: SQLite's parser may have a stack of 100 entries."""
+_SIGNS: Final = re.compile(r"""["'()\[\]{}<>=!:,&|]""")
+_WORDS: Final = frozenset(("and", "or", "not", "in", "is", "AND", "OR", "NOT"))
+"""A text with none of these signs and words is no expression, but words to search for."""
+_OLD: Final = re.compile(r"""(?<![^\s(+-])([A-Za-z_][\w.-]*):([<>]=?)?([\[{]|"[^"]*"|[^\s()]*)""")
+"""A term in the Lucene syntax of former versions: `seed:3`, `age:<12h`, and where `steps:[1 TO 9}` begins."""
+_FLIPPED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
+    ast.Lt: ast.Gt,
+    ast.LtE: ast.GtE,
+    ast.Gt: ast.Lt,
+    ast.GtE: ast.LtE,
+}
+_ITEM: Final = re.compile(r"""\[["']?([^]"']*)["']?\]""")
+"""A part of a path in brackets: `config["lambda"]`, `config.branches[0]`."""
+_NUMBERS: Final = (Kind.NUMBER, Kind.SIZE, Kind.AGE)
+_SEEDS: Final = range(2 * SEED_SHIFT)
+_AMOUNT: Final = re.compile(r"(\d{1,15}(?:\.\d+)?)\s*([a-z]*)", re.IGNORECASE)
 _SECONDS: Final = {"s": 1, "m": 60, "min": 60, "h": 3600, "d": 86400, "w": 7 * 86400}
-_SIZE: Final = re.compile(r"(\d+(?:\.\d+)?)\s*([kMGT]?)B?", re.IGNORECASE)
 _BYTES: Final = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
 
 
@@ -57,8 +60,7 @@ class Filter:
 
     def also(self, condition: Sql) -> Filter:
         """Return the filter for rows that match another condition as well."""
-        own = [] if self.condition is None else [self.condition]
-        return Filter(_joined("AND", [condition, *own]), self.settings)
+        return Filter(_sql("({} AND {})", condition, self.condition or Sql("TRUE")), self.settings)
 
 
 ANY_RUN: Final = Filter(None)
@@ -73,215 +75,245 @@ def parse(text: str, now: datetime | None = None) -> Filter:
     Raises:
         RunnerError: it is no filter, or has an unknown field; the message shows the place.
     """
-    if not text.strip():
-        return ANY_RUN
-    if not is_utf8(text):
-        raise RunnerError(f"filter: found {text[:100]!r}, expected text in UTF-8.")
-    if len(text) > MAX_LENGTH:
-        raise RunnerError(f"filter: found {len(text):,} characters, expected at most {MAX_LENGTH:,}.")
-    from luqum.exceptions import ParseError
-    from luqum.parser import parser
-
-    try:
-        tree = parser.parse(text)
-    except ParseError as error:
-        raise _syntax_error(text, str(error)) from None
-    except ArithmeticError:  # of a weight that is no number
-        raise RunnerError("filter: found '^' or '~' and no number; put such a text in quotes.") from None
-    translation = _Translation(text, now or datetime.now(UTC))
-    return Filter(translation.condition(tree), frozenset(translation.settings))
+    return FilterParser(text, now or datetime.now(UTC)).parse() if text.strip() else ANY_RUN
 
 
-class _Translation:
-    """The translation of a filter's tree into a condition."""
+@dataclass(frozen=True)
+class Part(Term):
+    """A part of a filter in SQL."""
+
+    sql: Sql
+    column: Column | None = None
+    """The column, if it is one alone."""
+    stored: Sql = Sql("")  # noqa: RUF009 - frozen
+    """Its value as it is stored."""
+
+
+class FilterParser(Parser[Part]):
+    """Parses one filter."""
+
+    what = "filter"
+    example = 'status == "finished"'
+    max_length = max_nodes = 10_000
+    max_number = sys.float_info.max
+    operations = {  # noqa: RUF012 - declared in the base class
+        ast.And: "({} AND {})",
+        ast.Or: "({} OR {})",
+        ast.Not: "(NOT {})",
+        ast.UAdd: "{}",
+        ast.USub: "(- {})",
+        ast.Add: "({} + {})",
+        ast.Sub: "({} - {})",
+        ast.Mult: "({} * {})",
+        ast.Div: "(1.0 * {} / {})",
+        ast.Lt: "COALESCE({} < {}, 0)",
+        ast.LtE: "COALESCE({} <= {}, 0)",
+        ast.Gt: "COALESCE({} > {}, 0)",
+        ast.GtE: "COALESCE({} >= {}, 0)",
+        ast.Eq: "COALESCE({} = {}, 0)",
+        "max": "MAX({}, {})",
+        "min": "MIN({}, {})",
+        "abs": "ABS(1.0 * {})",  # of an integer it may overflow
+        "like": "matches({}, {})",
+    }
+    expected = "expected comparisons, and, or, not, in, is, + - * /, max(), min(), abs() and like()"
 
     def __init__(self, text: str, now: datetime) -> None:
-        self._text, self._now = text, now
-        self.settings: set[str] = set()
+        super().__init__(text)
+        self._now = now
+        self._settings: set[str] = set()
+        self._selects = False
 
-    def condition(self, item: Item, field: Column | None = None, depth: int = 0) -> Sql:
-        """Return the condition of a node on a field, or on the whole run."""
-        from luqum import tree
+    def parse(self) -> Filter:
+        """Return the parsed filter."""
+        if _SIGNS.search(self.text) or _WORDS & set(self.text.split()):
+            condition = self.whole()
+            if not self._selects:
+                raise RunnerError(f"filter: found {self.text}, expected a field in it.")
+            if max(accumulate((sign == "(") - (sign == ")") for sign in condition.sql.text)) > MAX_DEPTH:
+                raise RunnerError("filter: is nested too deeply.")
+        else:
+            condition = self.joined(CONDITION, ast.And, list(map(self._anywhere, self.text.split())))
+        return Filter(condition.sql, frozenset(self._settings))
 
-        if depth > MAX_DEPTH:
-            raise RunnerError(f"filter: is nested more than {MAX_DEPTH} deep.")
-        within = functools.partial(self.condition, field=field, depth=depth + 1)
-        match item:
-            case tree.Prohibit() if field is not None and isinstance(item.a, tree.Word):
-                return self._compare(field, "=", item, "-" + item.a.value)
-            case tree.Not() | tree.Prohibit():
-                negated = within(item.a)
-                return Sql(f"NOT {negated.text}", negated.values)
-            case tree.Plus() | tree.Group() | tree.FieldGroup():
-                return within(item.children[0])
-            case tree.BaseOperation():
-                how = "OR" if isinstance(item, tree.OrOperation) else "AND"
-                return _joined(how, [within(part) for part in item.children])
-            case tree.SearchField():
-                return self.condition(item.expr, self._field(item, field), depth + 1)
-        return self._anywhere(item) if field is None else self._leaf(item, field)
+    def syntax_error(self, error: SyntaxError) -> RunnerError:
+        """Return the error for a text that is no syntax, with the new form of Lucene's syntax."""
+        for term in _OLD.finditer(self.text):
+            try:
+                message = f"found {term[0]}, expected {_new_form(*term.groups())}"
+            except RunnerError as unknown:
+                message = str(unknown)
+                if "Did you mean" not in message:
+                    continue
+            return self.marked(term.start(), len(term[0]), message)
+        if "decimal" in error.msg:
+            error.msg += " (a date, an age or a size is put in quotes)"
+        return super().syntax_error(error)
 
-    def _leaf(self, item: Item, field: Column) -> Sql:
-        from luqum import tree
+    def fixed(self, value: float | str) -> Part:
+        """Return a number or a text as a parameter; True and False are conditions."""
+        kind = {bool: CONDITION, str: TEXT}.get(type(value), NUMBER)
+        if kind == NUMBER and not -SEED_SHIFT <= value < SEED_SHIFT:  # type: ignore[operator]
+            value = float(value)
+        return Part(kind, Sql("?", (value,)))
 
-        match item:
-            case tree.Word() | tree.Phrase():
-                return self._compare(field, "=", item, item.value)
-            case tree.From() | tree.To():
-                sign = (">" if isinstance(item, tree.From) else "<") + ("=" if item.include else "")
-                return self._compare(field, sign, item, item.a.value)
-            case tree.Range():
-                low, high = (
-                    "-" + end.a.value if isinstance(end, tree.Prohibit) else str(end.value)
-                    for end in (item.low, item.high)
-                )
-                ends = (
-                    (low, ">=" if item.include_low else ">", item.low),
-                    (high, "<=" if item.include_high else "<", item.high),
-                )
-                parts = [self._compare(field, sign, at, end) for end, sign, at in ends if end != "*"]
-                return _joined("AND", parts) if parts else self._compare(field, "=", item, "*")
-        raise self._unexpected(item)
+    def applied(self, kind: str, operation: Operation, *parts: Part) -> Part:
+        """Return an operation on one or two terms."""
+        return Part(kind, _sql(self.operations[operation], *(part.sql for part in parts)))
 
-    def _field(self, item: Item, outer: Column | None) -> Column:
-        if outer is not None:
-            raise self._error(
-                item,
-                f"found {item.name}: after {outer.name}:, expected a value; one that holds ':' in quotes",
-            )
-        if item.name.startswith(SETTING):
-            self.settings.add(item.name.removeprefix(SETTING))
-            return Column(item.name, Kind.TEXT, "a value of the configuration")
-        try:
-            return field_of(item.name)
-        except RunnerError as error:
-            raise self._error(item, str(error).removesuffix(".")) from None
+    def condition(self, node: ast.expr) -> Part:
+        """Return a condition; a text alone is searched for."""
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            return self._anywhere(glob.escape(node.value))
+        return super().condition(node)
 
-    def _anywhere(self, item: object) -> Sql:
-        """Return the condition that a word is in the id, the names, the tags or the note of a run."""
-        from luqum import tree
-
-        if isinstance(item, tree.From | tree.To | tree.Range):
-            raise self._error(item, "found a comparison, expected a field before it, as in seed:>3")
-        if not isinstance(item, tree.Word | tree.Phrase):
-            raise self._unexpected(item)
-        if item.value in _MISTAKEN:
-            meant = _MISTAKEN[item.value]
-            raise self._error(item, f"found {item.value!r}, expected {meant}; or the word in quotes")
-        compared = _COMPARISON.fullmatch(item.value)
-        if compared and (compared[1] in FIELDS or compared[1].startswith(SETTING)):
-            sign = compared[2].strip("=!") + ("=" if compared[2] in ("<=", ">=") else "")
-            before = "NOT " if compared[2] == "!=" else ""
-            raise self._error(
-                item, f"found {item.value!r}, expected {before}{compared[1]}:{sign}{compared[3] or 'VALUE'}"
-            )
-        return Sql("matches(words, ?)", (f"*{_pattern(item.value)}*",))
-
-    def _compare(self, field: Column, sign: str, item: Item, value: str) -> Sql:
-        """Return the condition that a field compares so with a value; `item` is its place in the text."""
-        try:
-            if field.name.startswith(SETTING):
-                condition = _setting_condition(field.name.removeprefix(SETTING), sign, value)
-            else:
-                column = field.stored[0]
-                if sign == "=" and value == "*":
-                    not_empty = f" AND {column} != ''" if field.kind in TEXT_KINDS else ""
-                    return Sql(f"({column} IS NOT NULL{not_empty})")
-                condition = _condition(field, column, sign, value, self._now)
-        except ValueError as error:
-            raise self._error(item, f"{field.name}: found {value!r}, expected {error}") from None
-        return Sql(
-            f"(COALESCE({condition.text}, 0) = 1)", condition.values
-        )  # false, not unknown, where there is no value
-
-    def _unexpected(self, item: Item) -> RunnerError:
-        found = str(item).strip()
-        return self._error(
-            item, f"found {found!r}, expected a word, a text in quotes, a comparison or a range"
+    def call(self, node: ast.Call, name: str) -> Part:
+        """Return the term of a call; like() matches wildcards."""
+        if name != "like":
+            return super().call(node, name)
+        match node.args, node.keywords:
+            case [field, ast.Constant(value=str() as pattern)], []:
+                return self._matching(field, self.term(field), pattern)
+        raise self.error(
+            node, 'expected like() of a field and a text with * ? [abc], as in like(name, "a*").'
         )
 
-    def _error(self, item: Item, message: str) -> RunnerError:
-        return _error_at(self._text, item.pos or 0, message)
+    def compared(self, node: ast.Compare, left: ast.expr, operator: type[ast.cmpop], right: ast.expr) -> Part:
+        """Return the condition that compares a column with a constant, or two numbers."""
+        if operator is ast.In:
+            if not (isinstance(left, ast.Constant) and isinstance(left.value, str)):
+                raise self.error(left, f'found {self.text_of(left)}, expected a text, as in "keep" in tags.')
+            term, pattern = self.term(right), glob.escape(left.value)
+            is_tags = term.column and term.column.kind is Kind.TAGS
+            return self._matching(right, term, pattern if is_tags else f"*{pattern}*")
+        if isinstance(left, ast.Constant):
+            left, operator, right = right, _FLIPPED.get(operator, operator), left
+        term, value = self.term(left), right.value if isinstance(right, ast.Constant) else right
+        column = term.column
+        if operator is ast.Is:
+            if column is None or value is not None:
+                raise self.error(node, "found `is`, expected FIELD is None, or ==.")
+            return Part(CONDITION, _sql("({} IS NULL)", term.stored))
+        if column is None or (term.kind == NUMBER and not isinstance(value, str | bool | None)):
+            return super().compared(node, left, operator, right)
+        try:
+            return self._compared_column(node, term, column, operator, value)
+        except ValueError as error:
+            found = f"{column.name}: found {self.text_of(right)}, expected {error}"
+            raise self.error(right, found if found.endswith("?") else f"{found}.") from None
+
+    # --- columns ----------------------------------------------------------------------------------------
+
+    def named(self, node: ast.expr) -> Part:
+        """Return a column."""
+        name = _ITEM.sub(r".\1", self.text_of(node))
+        try:
+            column = _column(name)
+        except RunnerError as error:
+            raise self.error(node, f"{error} A text is put in quotes.") from None
+        self._selects = True
+        if column.name.startswith(SETTING):
+            path = column.name.removeprefix(SETTING)
+            self._settings.add(path)
+            at = setting_path(path)
+            stored, kind = Sql("json_extract(settings, ?)", (at,)), Sql("json_type(settings, ?)", (at,))
+            number = _sql("CASE WHEN {} IN ('integer', 'real') THEN {} END", kind, stored)
+            return Part(NUMBER, number, column, stored)
+        sql = stored = Sql(column.stored[0])
+        if column.kind is Kind.AGE:
+            sql = Sql(f"((? - {sql.text}) / 1000.0)", (self._now.timestamp() * 1000,))
+        elif column.kind in TEXT_KINDS:
+            stored = Sql(f"NULLIF({sql.text}, '')")
+        return Part(NUMBER if column.kind in _NUMBERS else column.name, sql, column, stored)
+
+    def _compared_column(
+        self, node: ast.Compare, term: Part, column: Column, operator: type[ast.cmpop], value: Any
+    ) -> Part:
+        """Return the condition that a column compares so with a value that is no plain number.
+
+        Raises:
+            ValueError: the value is not of the column's kind; the message says what is expected.
+        """
+        kind = column.kind
+        assert kind is not None
+        is_equal = operator is ast.Eq
+        if term.kind == NUMBER and kind in TEXT_KINDS and is_equal and not isinstance(value, str):
+            types = {None: "null", True: "true", False: "false"}
+            path = setting_path(column.name.removeprefix(SETTING))
+            return Part(CONDITION, Sql("(json_type(settings, ?) IS ?)", (path, types[value])))
+        if kind in TEXT_KINDS and isinstance(value, str):
+            if not is_equal:
+                raise self.error(node, f"{column.name}: text has no order, expected == or !=.")
+            if kind is Kind.STATUS and value.casefold() not in STATUSES:
+                raise ValueError(f"{kind.value}.{nearest(value, STATUSES)}".removesuffix("."))
+            return self._matching(node, term, glob.escape(value))
+        if kind is Kind.AGE and is_equal:
+            raise ValueError(kind.value)
+        first, last = map(self.fixed, _range_of(kind, value))
+        if is_equal:
+            from_first = self.applied(CONDITION, ast.GtE, term, first)
+            return self.applied(CONDITION, ast.And, from_first, self.applied(CONDITION, ast.LtE, term, last))
+        return self.applied(CONDITION, operator, term, first if operator in (ast.Lt, ast.GtE) else last)
+
+    def _matching(self, node: ast.expr, term: Part, pattern: str) -> Part:
+        """Return the condition that a column of text matches a pattern of `fnmatch`."""
+        if term.column is None or term.column.kind not in TEXT_KINDS:
+            raise self.error(node, f"found {self.text_of(node)}, expected a field of text.")
+        return Part(CONDITION, _sql(self.operations["like"], term.stored, Sql("?", (pattern,))))
+
+    def _anywhere(self, pattern: str) -> Part:
+        """Return the condition that a word is in the id, the names, the tags or the note of a run."""
+        self._selects = True
+        return Part(CONDITION, Sql("matches(words, ?)", (f"*{pattern}*",)))
 
 
-def _syntax_error(text: str, message: str) -> RunnerError:
-    """Return the error for a text that is no filter, given the parser's message."""
-    match = _PLACE.fullmatch(message)
-    if match is None:
-        return RunnerError(f"filter: {message}")
-    what = " ".join(match[1].split())
-    at = int(match[2]) if match[2] else len(text)
-    if "maybe due to unmatched" in what:
-        what = "ends where a value or a ')' is expected"
-    elif text[at : at + 1] == "-":
-        what += "; a negative number is put in quotes"
-    elif text[at : at + 1] == '"':
-        what = "a quote that is not closed"
-    return _error_at(text, at, what)
+def _new_form(field: str, operator: str | None, value: str) -> str:
+    """Return a term in Lucene's syntax as an expression."""
+    kind, text = _column(field).kind, value if value.startswith('"') else f'"{value or "VALUE"}"'
+    if value == "*":
+        return f"{field} is not None"
+    if value in ("[", "{"):
+        return f"LOW <= {field} <= HIGH"
+    if kind not in TEXT_KINDS or field.startswith(SETTING):
+        value = {"true": "True", "false": "False", "null": "None"}.get(value, value)
+        is_plain = re.fullmatch(r"-?[\d.]+(e\d+)?|True|False|None", value)
+        return f"{field} {operator or '=='} {value if is_plain else text}"
+    if kind in (Kind.TAGS, Kind.PROSE):
+        return f"{text} in {field}"
+    if kind is Kind.START:
+        text = f'{text[:-1]}*"'
+    if kind is Kind.START or set("*?") & set(value):
+        return f"like({field}, {text})"
+    return f"{field} == {text}"
 
 
-def _error_at(text: str, at: int, message: str) -> RunnerError:
-    """Return an error that shows the place in the filter."""
-    start = max(0, at - 60)
-    shown = text[start : at + 40].replace("\n", " ").replace("\t", " ")
-    end = "" if message.endswith("?") else "."
-    return RunnerError(f"filter: {message}{end}\n  {shown}\n  {' ' * (at - start)}^")
+def _column(name: str) -> Column:
+    if name.startswith(SETTING):
+        return Column(name, Kind.TEXT, "a value of the configuration")
+    return field_of(name)
 
 
-def _joined(how: str, parts: Sequence[Sql]) -> Sql:
-    """Return conditions joined in pairs, so that many of them do not nest deeply."""
-    if len(parts) == 1:
-        return parts[0]
-    middle = len(parts) // 2
-    first, second = _joined(how, parts[:middle]), _joined(how, parts[middle:])
-    return Sql(f"({first.text} {how} {second.text})", first.values + second.values)
+def _sql(template: str, *parts: Sql) -> Sql:
+    """Return a template with the texts of its parts, and their values."""
+    values = tuple(value for part in parts for value in part.values)
+    return Sql(template.format(*(part.text for part in parts)), values)
 
 
-def _plain(value: str) -> str:
-    """Return the text of a word or a phrase, without quotes and backslashes."""
-    if len(value) > 1 and value[0] == value[-1] == '"':
-        value = value[1:-1]
-    return re.sub(r"\\(.)", r"\1", value, flags=re.DOTALL)
-
-
-def _pattern(value: str) -> str:
-    """Return a word as a pattern for `matches`; * and ? are wildcards unless quoted or escaped."""
-    if len(value) > 1 and value[0] == value[-1] == '"':
-        return glob.escape(_plain(value))
-    pieces = (match.groups() for match in _PIECE.finditer(value))
-    return "".join(wild or glob.escape(escaped or plain or stray) for escaped, wild, plain, stray in pieces)
-
-
-def _condition(field: Column, column: str, sign: str, value: str, now: datetime) -> Sql:
-    """Return the condition that a column compares so with a value.
+def _range_of(kind: Kind, value: object) -> tuple[float, float]:
+    """Return the first and the last number in a column that a value of a filter stands for.
 
     Raises:
-        ValueError: the value is not of the field's kind; the message says what is expected.
+        ValueError: it is not of the column's kind; so do the functions below.
     """
-    plain = _plain(value)
-    match field.kind:
-        case Kind.WHOLE:
-            return Sql(f"{column} {sign} ?", (seed_of(plain) - SEED_SHIFT,))
-        case Kind.NUMBER | Kind.SIZE:
-            bound = size_of(plain) if field.kind is Kind.SIZE else number_of(plain)
-            return Sql(f"{column} {sign} ?", (bound,))
-        case Kind.DATE:
-            start, stop = date_span(plain)
-            if sign == "=":
-                return Sql(f"({column} >= ? AND {column} < ?)", (start, stop))
-            return Sql(f"{column} {sign[0].replace('>', '>=')} ?", (start if sign in ("<", ">=") else stop,))
-        case Kind.AGE:
-            then = int((now.timestamp() - seconds_of(plain)) * 1000)
-            if sign == "=":
-                raise ValueError(f"{Kind.AGE.value}, as in {field.name}:<{value}")
-            return Sql(f"{column} {_OPPOSITE[sign]} ?", (then,))
-    assert field.kind is not None
-    if sign != "=":
-        raise ValueError(f"{field.kind.value}: text has no order")
-    if field.kind is Kind.STATUS and not set("*?") & set(value) and plain.casefold() not in STATUSES:
-        raise ValueError(f"{field.kind.value}.{nearest(plain, STATUSES)}".removesuffix("."))
-    before, after = {Kind.PROSE: ("*", "*"), Kind.START: ("", "*")}.get(field.kind, ("", ""))
-    return Sql(f"matches({column}, ?)", (f"{before}{_pattern(value)}{after}",))
+    if kind is Kind.WHOLE:
+        if type(value) is not int or value not in _SEEDS:
+            raise ValueError(f"{kind.value} from 0 to {_SEEDS[-1]}")
+        return value - SEED_SHIFT, value - SEED_SHIFT
+    reads = {Kind.DATE: date_range, Kind.SIZE: size_of, Kind.AGE: seconds_of}
+    if kind not in reads or not isinstance(value, str):
+        raise ValueError(kind.value)
+    number = reads[kind](value)
+    return number if isinstance(number, tuple) else (number, number)
 
 
 def setting_path(path: str) -> str:
@@ -289,62 +321,17 @@ def setting_path(path: str) -> str:
     return '$."' + path.replace("\\", "").replace('"', "") + '"'
 
 
-def _setting_condition(path: str, sign: str, value: str) -> Sql:
-    """Return the condition that a value of the configuration compares so."""
-    kind, setting = "json_type(settings, ?)", "json_extract(settings, ?)"
-    at, plain = setting_path(path), _plain(value)
-    try:
-        number = number_of(plain)
-    except ValueError:
-        number = None
-    if sign != "=" and number is None:
-        raise ValueError("a number: text has no order")
-    numeric = Sql(f"({kind} IN ('integer', 'real') AND {setting} {sign} ?)", (at, at, number))
-    if sign != "=":
-        return numeric
-    if value == "*":
-        return Sql(f"({kind} IS NOT NULL)", (at,))
-    as_text = Sql(f"({kind} = 'text' AND matches({setting}, ?))", (at, at, _pattern(value)))
-    if number is not None:
-        return _joined("OR", [as_text, numeric])
-    named = [Sql(f"{kind} = ?", (at, plain))] if plain in ("true", "false", "null") else []
-    return _joined("OR", [as_text, *named])
-
-
-def number_of(text: str) -> int | float:
-    """Return a finite number; a whole one exactly, if SQLite can hold it.
-
-    Raises:
-        ValueError: it is none; so do the functions below.
-    """
-    if re.fullmatch(r"[+-]?\d{1,18}", text, re.ASCII):
-        return int(text)
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number) or "_" in text:
-        raise ValueError(Kind.NUMBER.value)
-    return number
-
-
-def seed_of(text: str) -> int:
-    """Return a seed: a whole number from 0 to 2^64 - 1."""
-    if not re.fullmatch(r"\d{1,20}", text, re.ASCII) or int(text) >= 2 * SEED_SHIFT:
-        raise ValueError(f"{Kind.WHOLE.value} from 0 to {2 * SEED_SHIFT - 1}")
-    return int(text)
-
-
 def size_of(text: str) -> float:
     """Return a number of bytes: `1500`, `10MB`, `1.5 GB`."""
-    match = _SIZE.fullmatch(text)
-    if match is None:
+    match = _AMOUNT.fullmatch(text)
+    unit = match[2].lower().removesuffix("b") if match else None
+    if match is None or unit not in _BYTES:
         raise ValueError(Kind.SIZE.value)
-    return float(match[1]) * _BYTES[match[2].lower()]
+    return float(match[1]) * _BYTES[unit]
 
 
-def date_span(text: str) -> tuple[int, int]:
-    """Return first and next millisecond since 1970 of a day, minute, second or millisecond, in UTC."""
+def date_range(text: str) -> tuple[int, int]:
+    """Return first and last millisecond since 1970 of a day, minute, second or millisecond, in UTC."""
     try:
         moment = datetime.fromisoformat(text)
         moment = moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
@@ -352,14 +339,14 @@ def date_span(text: str) -> tuple[int, int]:
     except (ValueError, OverflowError):
         raise ValueError(Kind.DATE.value) from None
     if re.fullmatch(r"\d{4}-\d{2}-\d{2}", text):
-        return start, start + 86_400_000
-    return start, start + (1 if "." in text else 1000 if text.count(":") > 1 else 60_000)
+        return start, start + 86_399_999
+    return start, start + (0 if "." in text else 999 if text.count(":") > 1 else 59_999)
 
 
 def seconds_of(text: str) -> float:
     """Return a time span in seconds: `90s`, `12h`, `30d`, `2w`."""
-    match = _SPAN.fullmatch(text)
-    if match is None or len(match[1]) > 12:
+    match = _AMOUNT.fullmatch(text)
+    if match is None or match[2] not in _SECONDS:
         raise ValueError(Kind.AGE.value)
     return float(match[1]) * _SECONDS[match[2]]
 

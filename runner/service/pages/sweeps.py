@@ -89,7 +89,7 @@ async def sweep(
         own = [job for job in jobs.store.jobs() if job.kind == "sweep" and job.name == name]
         parameters = [f"config.{path}" for path in read_sweep(name, state.folder).file.parameters]
         columns = ",".join(["id", "seed", "status", "success_percent", "mean_length", *parameters])
-        query = {"filter": f'tag:"{tag_of(name)}"', "columns": columns}
+        query = {"filter": f"{json.dumps(tag_of(name))} in tags", "columns": columns}
         values = {
             "name": name,
             "runs": state.runs,
@@ -141,7 +141,7 @@ def _state_of(name: str, folders: tuple[Path, ...], catalogue: Catalogue) -> _Sw
     folder = next((folder for folder in folders if name in sweeps_in(folder)), None)
     if folder is None:
         raise RunNotFound(f"no sweep {name!r}: the page of sweeps lists those there are.")
-    chosen = parse(f'tag:"{tag_of(name)}"')
+    chosen = parse(f"{json.dumps(tag_of(name))} in tags")
     rows = catalogue.read(lambda index: index.select(chosen))
     files = sorted(
         (entry.name, facts.st_size, facts.st_mtime_ns)
@@ -153,7 +153,7 @@ def _state_of(name: str, folders: tuple[Path, ...], catalogue: Catalogue) -> _Sw
 
 
 def _tagged(catalogue: Catalogue, name: str) -> int:
-    chosen = parse(f'tag:"{tag_of(name)}"')
+    chosen = parse(f"{json.dumps(tag_of(name))} in tags")
     return catalogue.read(lambda index: index.count(chosen))
 
 

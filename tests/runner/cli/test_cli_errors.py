@@ -36,7 +36,8 @@ def test_several_problems_follow_the_word_error(command, bad):
     ("words", "message"),
     [
         (["show", "nosuch"], "no run 'nosuch'"),
-        (["ls", "status:::"], "unexpected ':'"),
+        (["ls", "status:finished"], 'expected status == "finished"'),
+        (["ls", "seed ="], "equality is =="),
         (["ls", "--nope"], "--nope"),
         (["shwo"], "Did you mean 'show'?"),
         (["push"], "Did you mean 'remote push'?"),

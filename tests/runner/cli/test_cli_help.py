@@ -140,8 +140,9 @@ def test_the_module_can_be_run():
     [
         (["run", "quick", "--set"], "evaluation.tr", ["evaluation.trials="]),
         (["run", "quick", "--set"], "disc", ["discount="]),
-        (["ls"], "mean_l", ["mean_length:"]),
-        (["ls", "seed:1"], "status:fi", ["status:finished"]),
+        (["ls"], "mean_l", ["mean_length"]),
+        (["ls"], 'status == "fi', ['status == "finished"']),
+        (["ls"], "seed < 3 and mean_l", ["seed < 3 and mean_length"]),
         (["config", "copy"], "qu", ["quick"]),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else value,

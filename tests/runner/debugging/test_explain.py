@@ -345,7 +345,7 @@ def test_prune_removes_what_was_trained_but_what_is_kept(tmp_path):
     assert "Nothing was removed" in shown.stderr
     assert other.recording.is_file()
     assert command("prune", "--explanations").exit_code == 2  # nobody to ask
-    assert command("prune", "--explanations", "status:failed", "--yes").exit_code == 2
+    assert command("prune", "--explanations", 'status == "failed"', "--yes").exit_code == 2
     removed = command("prune", "--explanations", "--yes")
     assert removed.exit_code == 0, removed.output
     assert f"Run {kept.run_id} stays" in removed.stderr

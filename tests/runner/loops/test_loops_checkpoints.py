@@ -167,7 +167,7 @@ def test_removing_runs_removes_contents_that_no_other_run_refers_to(tmp_path):
     left_over.write_bytes(b"by a process that was killed")
     for path in (left_over, tmp_path / ".store/runs" / second.folder.name):
         os.utime(path, (0, 0))
-    assert dualtaxi(tmp_path, "prune", "name:three", "--yes").exit_code == 0
+    assert dualtaxi(tmp_path, "prune", 'name == "three"', "--yes").exit_code == 0
     assert not left_over.exists()
     assert not third.folder.exists()
     assert objects(tmp_path) == []

@@ -64,7 +64,7 @@ def test_what_changes_is_seen_at_once(folder):
     assert (found[runs[0].run_id]["status"], found[runs[0].run_id]["episodes"]) == ("finished", 5)
     assert (found[runs[1].run_id]["name"], found[runs[1].run_id]["tags"]) == ("patient", "keep")
     assert found[more.run_id]["bytes"] == 3
-    assert ids(folder, "tag:keep note:why") == [runs[1].run_id]
+    assert ids(folder, '"keep" in tags and "why" in note') == [runs[1].run_id]
 
 
 def test_only_what_changed_is_read(folder):
@@ -75,7 +75,7 @@ def test_only_what_changed_is_read(folder):
     with contextlib.closing(open_index(pytest.fail)) as database:
         (difference,) = Folders(database, [str(folder)]).differences()
     assert difference.changed == [changed.run_id]
-    assert ids(folder, "status:failed") == [changed.run_id]
+    assert ids(folder, 'status == "failed"') == [changed.run_id]
 
 
 def test_a_change_within_the_same_moment_is_not_missed(folder):
@@ -99,8 +99,8 @@ from_mapping({'name': 'some', 'episodes': 5}), 1); print(flush=True); sys.stdin.
     aged(folder)
     assert [row["status"] for row in rows(folder)[0]] == ["running"]
     process.communicate(b"")
-    assert ids(folder, "status:running") == []
-    assert len(ids(folder, "status:interrupted")) == 1
+    assert ids(folder, 'status == "running"') == []
+    assert len(ids(folder, 'status == "interrupted"')) == 1
 
 
 def test_a_run_is_found_in_the_recording_alone_and_keeps_its_labels(folder, recorded):
@@ -185,7 +185,8 @@ for turn in range(3):
     run = create_run(folder, config, number)
     change_labels(folder / "shared", lambda was: Labels(was.name, (*was.tags, f"p{number}.{turn}"), was.note))
     run.update(status="finished", summary={"episodes": 5})
-    found = look([folder], lambda index: index.select(parse(f"id:{run.run_id} status:finished")), sys.exit)
+    chosen = parse(f'id == "{run.run_id}" and status == "finished"')
+    found = look([folder], lambda index: index.select(chosen), sys.exit)
     assert [row["id"] for row in found] == [run.run_id]
 """
 

@@ -253,7 +253,7 @@ def test_a_replay_has_the_space_of_its_picture_and_facts_before_scripts_run(page
 
 
 def test_two_runs_are_chosen_in_the_table_and_replayed_in_step(page):
-    browser = page("/runs?filter=name:first OR name:second")
+    browser = page("/runs?filter=name in ('first', 'second')")
     for box in browser.find_elements(By.NAME, "run"):
         box.click()
     browser.find_element(By.CSS_SELECTOR, "[data-compare]").click()

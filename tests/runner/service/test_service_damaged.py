@@ -110,11 +110,11 @@ def test_no_value_in_a_run_file_hides_the_run_or_prevents_its_removal(recordings
     assert sorted(run["run_id"] for run in json.loads(listed.stdout)["runs"]) == sorted(ids)
     assert shown(many, "ls").exit_code == 0
     assert shown(many, "prune", "--keep-last", "0", "--dry-run").exit_code == 0
-    damaged = shown(many, "ls", "--quiet", "status:damaged").stdout.split()
+    damaged = shown(many, "ls", "--quiet", 'status == "damaged"').stdout.split()
     assert len(damaged) > len(ids) / 3
     assert shown(many, "rm", "--yes", damaged[0]).exit_code == 0
     assert shown(many, "prune", "--status", "damaged", "--yes").exit_code == 0
-    assert shown(many, "ls", "--quiet", "status:damaged").stdout == ""
+    assert shown(many, "ls", "--quiet", 'status == "damaged"').stdout == ""
 
 
 def test_a_damaged_run_has_a_message(recordings, client):

@@ -28,7 +28,7 @@ def test_labels_are_changed_by_a_form(client):
     assert client.post("/runs/first/labels", data=fields, follow_redirects=False).status_code == 303
     page = page_of(client, "/runs/renamed")
     assert "&lt;b&gt;bold&lt;/b&gt;\nand more" in page
-    assert "filter=tag:keep" in page
+    assert "filter=%22keep%22%20in%20tags" in page
     assert client.get("/api/v1/runs/renamed").json()["tags"] == ["good", "keep"]
     answer = client.post("/runs/renamed/labels", data=fields | {"tags": "$$"}, headers=ACCEPT_HTML)
     assert answer.status_code == 400

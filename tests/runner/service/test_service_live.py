@@ -80,7 +80,7 @@ def test_the_row_of_a_running_loop_has_its_episodes_and_return(connect, settings
     client = connect(settings)
 
     def row():
-        found = client.get("/api/v1/runs", params={"filter": "name:growing"}).json()["runs"]
+        found = client.get("/api/v1/runs", params={"filter": 'name == "growing"'}).json()["runs"]
         return found[0] if found else {"episodes": None}
 
     with runner.record(make("CartPole-v1"), recordings, name="growing") as env:

@@ -35,16 +35,16 @@ def test_the_first_page_is_the_runs(client):
 
 
 def test_runs_are_searched_sorted_and_their_columns_chosen(client):
-    page = page_of(client, "/runs?filter=name:second&columns=name,config.discount&sort=-name")
+    page = page_of(client, "/runs?filter=name=='second'&columns=name,config.discount&sort=-name")
     assert "1 of 2 run" in page
     assert re.search(r"<a[^>]*>second</a></td><td>0.99</td>", page)
     assert "first</a>" not in page
 
 
 def test_the_caret_of_a_wrong_filter_stands_under_its_place_in_a_fixed_width(client):
-    page = page_of(client, "/runs?filter=status:finishd", 400)
+    page = page_of(client, "/runs?filter=status=='finishd'", 400)
     assert "Did you mean &#39;finished&#39;?</p>" in page
-    assert "<pre>  status:finishd\n         ^</pre>" in page
+    assert "<pre>  status==&#39;finishd&#39;\n          ^^^^^^^^^</pre>" in page
 
 
 def test_the_page_notes_when_not_all_evaluations_are_shown(client, monkeypatch):
@@ -68,7 +68,9 @@ def test_a_search_keeps_the_columns_and_their_order(client):
     )
 
 
-@pytest.mark.parametrize("query", ["filter=status:", "sort=bogus", "columns=bogus"])
+@pytest.mark.parametrize(
+    "query", ["filter=status:finished", "filter=status%3D%3D", "sort=bogus", "columns=bogus"]
+)
 def test_an_invalid_filter_is_explained(client, query):
     page = page_of(client, f"/runs?{query}", 400)
     assert 'role="alert"' in page
@@ -375,4 +377,4 @@ def test_pages_link_a_run_with_its_branches(client, recordings):
 
 
 def test_some_of_the_runs_are_counted_in_the_plural(client):
-    assert "1 of 2 runs" in page_of(client, "/runs?filter=name:first")
+    assert "1 of 2 runs" in page_of(client, "/runs?filter=name=='first'")

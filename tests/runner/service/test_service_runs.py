@@ -23,11 +23,17 @@ def test_the_list_equals_ls(client, recordings):
 
 
 def test_filter_sort_columns_and_paging_equal_ls(client, recordings):
-    params = {"filter": "status:finished", "sort": "-seed", "columns": "id,seed", "limit": 1, "offset": 1}
+    params = {
+        "filter": 'status == "finished"',
+        "sort": "-seed",
+        "columns": "id,seed",
+        "limit": 1,
+        "offset": 1,
+    }
     page = client.get("/api/v1/runs", params=params).json()
     assert page["runs"] == _ls(
         recordings,
-        "status:finished",
+        'status == "finished"',
         "--sort",
         "-seed",
         "--columns",
