@@ -74,7 +74,7 @@ ADDRESSES: Final = (
 
 COMMANDS: Final = (
     "ls",
-    "ls name:pole",
+    "ls 'name == \"pole\"'",
     "ls --json",
     "show cooperative@latest",
     "show competitive",
@@ -128,7 +128,7 @@ COMMANDS: Final = (
     "label pole",
     "label pole --json",
     "du --limit 0",
-    "du name:po* --limit 1",
+    "du 'like(name, \"po*\")' --limit 1",
     "du --json",
     "rm pole --dry-run",
     "prune --keep-last 0 --dry-run",
