@@ -106,7 +106,7 @@ class RunDetails:
             "seconds": summary.seconds,
             "recorded_seconds": None if self.clock is None else self.clock.duration,
             "steps_a_second": None if self.clock is None else self.clock.steps_a_second,
-            "processes": [shard._asdict() for shard in self.shards],
+            "processes": [vars(shard) for shard in self.shards],
             "config": dict(self.config),
             "provenance": dict(self.provenance),
             "success_events": list(self.success_events),

@@ -6,27 +6,28 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Final
+from typing import Annotated, Final
 
 from blake3 import blake3
+from msgspec import Meta
 
 from runner.archive.layout import FORMAT, MANIFEST, VERSION
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.digest import combined_digest
 from runner.util.files import hash_of
-from runner.util.values import JsonView, is_whole
+from runner.util.stored import stored_as
+from runner.util.values import JsonView
 
 MAX_MANIFEST_BYTES: Final = 1 << 20
-_MAX_SIZE: Final = 2**53
 
 
 @dataclass(frozen=True)
 class Entry:
     """A file of an archive, or the messages of a topic: size or number, and BLAKE3."""
 
-    size: int
-    blake3: str
+    size: Annotated[int, Meta(ge=0, le=2**53)]
+    blake3: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]
 
 
 @dataclass(frozen=True)
@@ -83,24 +84,13 @@ def read_manifest(data: bytes, where: str) -> Manifest:
                 f"{where}: found an archive of version {values['version']!r}, expected {VERSION}: it takes "
                 "another version of dualtaxi to restore it; its tables can be read all the same."
             )
-        manifest = Manifest(dict(values["run"]), _entries(values["topics"]), _entries(values["files"]))
+        manifest = stored_as(Manifest, values, f"{where}: is not the manifest of an archive")
         _check(manifest)
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise RecordingError(f"{where}: is not the manifest of an archive ({error}).") from error
     if manifest.to_json() != data:
         raise RecordingError(f"{where}: does not match its seal: it was changed, and the archive is damaged.")
     return manifest
-
-
-def _entries(values: JsonView) -> dict[str, Entry]:
-    entries = {name: Entry(entry["size"], entry["blake3"]) for name, entry in values.items()}
-    for name, entry in entries.items():
-        sound = (
-            is_whole(entry.size, 0, _MAX_SIZE) and isinstance(entry.blake3, str) and len(entry.blake3) == 64
-        )
-        if not sound or int(entry.blake3, 16) < 0:
-            raise ValueError(f"its entry of {name!r} is invalid")
-    return entries
 
 
 def _check(manifest: Manifest) -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from runner.environments.scene import SceneDescription, scene_mistake
 from runner.errors import EnvironmentNotUsable
 from runner.util.arrays import Array
+from runner.util.stored import Count
 from runner.util.values import JsonView, is_text, is_whole
 
 Indices = NDArray[np.integer[Any]]
@@ -51,9 +52,9 @@ class EnvironmentDescription(TypedDict):
 
     env_id: str
     kwargs: JsonView
-    step_limit: int
+    step_limit: Count
     agents: Sequence[str]
-    action_counts: Sequence[int]
+    action_counts: Sequence[Count]
     event_names: Sequence[str]
     success_events: Sequence[str]
     penalty_below: float | None

@@ -224,7 +224,7 @@ class _Fold:
             | names
             | seeded
             | {"seed": str(self._run.seed), "created": self._run.created_text, "environments": "1"}
-            | {"spaces": self._spaces(), "shards": json.dumps([shard._asdict() for shard in shards])}
+            | {"spaces": self._spaces(), "shards": json.dumps([vars(shard) for shard in shards])}
         )
 
     def _spaces(self) -> str:

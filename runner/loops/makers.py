@@ -37,7 +37,7 @@ from runner.loops.wrappers import (
     wrapper_fields,
     wrappers_as_fields,
 )
-from runner.recording.maker import FUNCTION_NAME, MAX_SPEC, EnvironmentMaker, VectorMaker
+from runner.recording.maker import FUNCTION_NAME, MAX_SPEC, EnvironmentMaker, Registered, VectorMaker
 from runner.replay.games import MultiAgent, Turns
 from runner.replay.makers import class_name, layers_of
 from runner.replay.scripts import MAIN
@@ -137,7 +137,7 @@ def _spec_fields(spec: EnvSpec) -> tuple[dict[str, object], str]:
     return fields, registered_by
 
 
-def _registered(spec: object) -> dict[str, object]:
+def _registered(spec: object) -> Registered:
     """Return the arguments and the step limit that are registered for the id of a specification."""
     known = gymnasium.registry.get(spec.id) if isinstance(spec, EnvSpec) else None
     if known is None:

@@ -9,13 +9,15 @@ import difflib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Annotated, Final
 
 import zstandard
+from msgspec import Meta
 
 from runner.errors import RecordingError
 from runner.recording.metadata import json_object
 from runner.recording.records import MAX_METADATA_BYTES
+from runner.util.stored import stored_as
 from runner.util.values import is_utf8
 
 CODE_RECORD: Final = "provenance/code"
@@ -32,7 +34,7 @@ _MAX_WINDOW: Final = 1 << 23
 class Code:
     """The sources of a run, without secrets."""
 
-    files: Mapping[str, str] = field(default_factory=dict)
+    files: Annotated[Mapping[str, str], Meta(max_length=MAX_FILES)] = field(default_factory=dict)
     """Path, relative to the repository or to the script's folder, to text."""
     new: tuple[str, ...] = ()
     """The paths in `files` that the commit does not have; all of them without a commit."""
@@ -62,14 +64,12 @@ def parse_code(data: bytes, where: str) -> Code:
     except zstandard.ZstdError as error:
         raise RecordingError(f"{where}: {CODE_ATTACHMENT} is damaged ({error}).") from error
     values = json_object(text, f"{where}: {CODE_ATTACHMENT}")
-    files, new, patch = (values.get(key) for key in ("files", "new", "patch"))
-    if not (isinstance(files, dict) and isinstance(new, list) and isinstance(patch, str)):
-        raise RecordingError(f"{where}: {CODE_ATTACHMENT} is damaged: expected files, new and patch.")
-    if len(files) > MAX_FILES or not all(map(_is_path, files)):
+    code = stored_as(Code, values, f"{where}: {CODE_ATTACHMENT} is damaged")
+    if not all(map(_is_path, code.files)):
         raise RecordingError(f"{where}: {CODE_ATTACHMENT} is damaged: found a path that is not relative.")
-    if not all(isinstance(text, str) for text in files.values()) or not set(map(str, new)) <= files.keys():
-        raise RecordingError(f"{where}: {CODE_ATTACHMENT} is damaged: found a file that is no text.")
-    return Code(files, tuple(map(str, new)), patch)
+    if not set(code.new) <= code.files.keys():
+        raise RecordingError(f"{where}: {CODE_ATTACHMENT} is damaged: found a new file without its text.")
+    return code
 
 
 def _is_path(path: str) -> bool:

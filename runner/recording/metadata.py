@@ -23,18 +23,18 @@ from runner.environments.mdp import (
     from_parts,
 )
 from runner.environments.scene import scene_mistake
-from runner.errors import RecordingError, shortened
+from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import topic_dtype
 from runner.recording.index import Index
 from runner.recording.maker import MAKER_RECORD, EnvironmentMaker
 from runner.recording.packed_arrays import pack_array, unpack_array
 from runner.recording.records import MAX_METADATA_BYTES
-from runner.recording.run_file import Check
 from runner.recording.schema import Topic
 from runner.recording.spaces import dtype_of, leaves_of
 from runner.recording.writer import RecordingFile, storage_error
 from runner.util.arrays import Array
+from runner.util.stored import stored_as
 from runner.util.values import MAX_JSON_DEPTH, Json, JsonView, is_too_deep, is_whole, without_surrogates
 
 REQUIRED_RECORDS: Final = frozenset({"run", "config", "provenance"})
@@ -60,30 +60,6 @@ class RecordedEnvironment(EnvironmentDescription):
 
     arrays: Sequence[str]
     """The names of the arrays, each an attachment; empty without a transition table."""
-
-
-def _each(fits: Callable[[object], bool]) -> Callable[[object], bool]:
-    return lambda value: isinstance(value, list) and all(map(fits, value))
-
-
-def _is_str(value: object) -> bool:
-    return isinstance(value, str)
-
-
-def _is_amount(value: object) -> bool:
-    return is_whole(value, 0, 2**63 - 1)
-
-
-_NAMES: Final = Check(_each(_is_str), "a list of texts")
-_ENVIRONMENT: Final = {
-    **dict.fromkeys(("arrays", "event_names", "success_events", "agents"), _NAMES),
-    "action_counts": Check(_each(_is_amount), "a list of whole numbers"),
-    "env_id": Check(_is_str, "a text"),
-    "kwargs": Check(lambda value: isinstance(value, Mapping), "an object"),
-    "step_limit": Check(_is_amount, "a whole number from 0 up"),
-    "penalty_below": Check(lambda value: value is None or type(value) in (int, float), "a number or null"),
-}
-"""What each value of `environment.json` but the scene must be."""
 
 
 # --- the run ------------------------------------------------------------------------------------------
@@ -271,17 +247,13 @@ def environment_description(text: bytes, path: str) -> RecordedEnvironment:
     Raises:
         RecordingError: a value is missing or impossible.
     """
-    description = json_object(text, f"{path}: environment.json")
-    for key, check in _ENVIRONMENT.items():
-        if key not in description or not check.fits(description[key]):
-            found = shortened(repr(description[key]), 60) if key in description else "nothing"
-            raise RecordingError(
-                f"{path}: environment.json: found {found} as {key}, expected {check.expected}."
-            )
-    mistake = scene_mistake(description.get("scene"), None, None, 0)
+    where = f"{path}: environment.json"
+    description = {"scene": None} | json_object(text, where)
+    stored_as(RecordedEnvironment, description, where)
+    mistake = scene_mistake(description["scene"], None, None, 0)
     if mistake is not None:
-        raise RecordingError(f"{path}: environment.json: {mistake}.")
-    return cast(RecordedEnvironment, {"scene": None} | description)
+        raise RecordingError(f"{where}: {mistake}.")
+    return cast(RecordedEnvironment, description)  # as it was written, to be compared
 
 
 def environment_of(description: RecordedEnvironment, attachment: Callable[[str], bytes], path: str) -> Mdp:

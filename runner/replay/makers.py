@@ -339,7 +339,9 @@ def why_not_redone(recording: Recording, trust: bool = False) -> str:
         return "A part of the recording was lost, and what follows depends on it."
     first, reason = 0, ""
     for shard in recording.shards:
-        phases = [phase for phase, n in zip(schema.PHASES, shard[-2:], strict=True) if n]
+        phases = [
+            phase for phase, n in zip(schema.PHASES, (shard.train_steps, shard.eval_steps), strict=True) if n
+        ]
         for maker in (recording.maker_of(phase, first) for phase in phases):
             if maker is not None and is_whole_vector(maker):
                 return (

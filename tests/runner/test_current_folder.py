@@ -20,7 +20,7 @@ import runner
 
 DEPENDENCIES = """
     PIL av blake3 click cloudpickle dualtaxi fastapi filelock google gymnasium isal jinja2 llvmlite lz4
-    matplotlib mcap numba numpy optuna platformdirs psutil pyarrow pydantic pygame rich runner scipy
+    matplotlib mcap msgspec numba numpy optuna platformdirs psutil pyarrow pydantic pygame rich runner scipy
     sitecustomize sklearn typing_extensions usercustomize uvicorn yaml zstandard
 """
 HOSTILE = """\
