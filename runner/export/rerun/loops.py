@@ -145,7 +145,7 @@ class LoopReader:
                 yield labels.track(root)
                 yield from background(root, scene, grid_view(title, scene))
                 yield from grid.still
-            trained = recording.episodes("train")["log_time"]
+            trained = recording.episodes("train")["log_time"] if scene else ()
             for steps in self._batches(phase, spans):
                 yield from self._lines_of(phase, steps)
                 if grid:

@@ -152,33 +152,16 @@ def select(recording: Recording, request: Request) -> Selection:
     if is_job:
         evaluations += available if request.everything else available[-1:] if request.is_default else []
         evaluations = [one for one in available if one in evaluations]
-        selection.evaluations = [
-            (one, steps) for one in evaluations for steps in evals.steps_of(one.episodes)
-        ]
+    selection.evaluations = [(one, steps) for one in evaluations for steps in evals.steps_of(one.episodes)]
+    if is_job:
         _describe_job(selection, request, numbers, train.count, available, evaluations)
         if unknown := _steps_without_values(recording, selection.train):
             selection.warnings.append(
                 f"{unknown:,} of these training steps are exported without Q-values: steps before them were "
                 "lost, and the Q-tables are unknown until the next snapshot."
             )
-        return selection
-    total, tested = recording.count(schema.TRAIN_STEP), recording.count(schema.EVAL_STEP)
-    limit = total if request.everything else DEFAULT_STEPS
-    if request.everything or (request.is_default and (total <= limit or recording.has_varying_values)):
-        selection.train = [range(min(total, limit))] if total else []
-    if request.frames:
-        _select_drawn(recording, request, selection, asked)
-    first = 0 if request.everything else max(0, tested - DEFAULT_STEPS)
-    spans = [(one, steps) for one in evaluations for steps in evals.steps_of(one.episodes)]
-    spans = [(one, range(steps.start, min(steps.stop, first))) for one, steps in spans]
-    spans.append((Evaluation(0, 0, 0, 0), range(first, tested)))
-    selection.evaluations = [(one, steps) for one, steps in spans if steps]
-    trained, evaluated = (sum(map(len, spans)) for spans in selection.by_phase.values())
-    environments = f" in {recording.environments} environments" if recording.environments > 1 else ""
-    of_evaluation = f", {evaluated:,} of {tested:,} of evaluation" if tested else ""
-    selection.exported.append(f"{trained:,} of {total:,} training steps{of_evaluation}{environments}")
-    if rest := total + tested - trained - evaluated:
-        selection.left_out.append(f"{rest:,} steps (--episodes START:STOP selects; --all: everything)")
+    else:
+        _complete_loop(recording, request, selection, asked)
     return selection
 
 
@@ -295,6 +278,28 @@ def _describe_job(
             f"the trials of {len(rest):,} evaluations (--evaluations {rest[-1]} includes the one "
             f"after {rest[-1]:,} episodes; --all: everything)"
         )
+
+
+def _complete_loop(
+    recording: Recording, request: Request, selection: Selection, asked: Mapping[str, Ints]
+) -> None:
+    """Add all steps of a loop if there are few, its last steps of evaluation, and episodes to draw."""
+    total, tested = recording.count(schema.TRAIN_STEP), recording.count(schema.EVAL_STEP)
+    limit = total if request.everything else DEFAULT_STEPS
+    if request.everything or (request.is_default and (total <= limit or recording.has_varying_values)):
+        selection.train = [range(min(total, limit))] if total else []
+    if request.frames:
+        _select_drawn(recording, request, selection, asked)
+    first = 0 if request.everything else max(0, tested - DEFAULT_STEPS)
+    earlier = [(one, range(steps.start, min(steps.stop, first))) for one, steps in selection.evaluations]
+    spans = [*earlier, (Evaluation(0, 0, 0, 0), range(first, tested))]
+    selection.evaluations = [(one, steps) for one, steps in spans if steps]
+    trained, evaluated = (sum(map(len, spans)) for spans in selection.by_phase.values())
+    environments = f" in {recording.environments} environments" if recording.environments > 1 else ""
+    of_evaluation = f", {evaluated:,} of {tested:,} of evaluation" if tested else ""
+    selection.exported.append(f"{trained:,} of {total:,} training steps{of_evaluation}{environments}")
+    if rest := total + tested - trained - evaluated:
+        selection.left_out.append(f"{rest:,} steps (--episodes START:STOP selects; --all: everything)")
 
 
 def _select_drawn(
