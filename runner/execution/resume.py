@@ -29,11 +29,11 @@ from runner.execution.verify import differing_environment
 from runner.learning.learner import Learner, NamedTables
 from runner.recording import schema
 from runner.recording.code import CODE_RECORD
+from runner.recording.index import Index
 from runner.recording.integrity import may_be_cut, survey
 from runner.recording.liveness import owner
 from runner.recording.metadata import REQUIRED_RECORDS
 from runner.recording.reader import Recording, open_recording
-from runner.recording.records import Contents
 from runner.recording.reference import Reference
 from runner.recording.writer import RecordingFile, storage_error
 from runner.replay.trust import require_may_train
@@ -133,7 +133,7 @@ def _resume(run: Run, accept_changes: bool, report: Report, stop: Stop, trust: b
     try:
         with _opened(path, contents, job, run, learner, changes) as file, open_recording(path) as recording:
             reference = Reference(recording, without_steps=job.config.recording.steps == "none")
-            is_recorded = any(entry.name == CODE_RECORD for entry in contents.metadata)
+            is_recorded = CODE_RECORD in contents.metadata
             code = CodeCollector(run.folder.parent, job.config.recording.code and not is_recorded)
             recorder = recorder_for(job, learner, file, reference, beat=code.beat(run, file))
             session = _ResumedSession(recording, reference, job, learner, recorder, report, stop)
@@ -152,20 +152,20 @@ def _mark_failed(run: Run, error: BaseException) -> None:
             now.update(status="failed", summary={"error": truncated_message(error)})
 
 
-def _place(run: Run, described: bool) -> tuple[Path, Contents]:
+def _place(run: Run, described: bool) -> tuple[Path, Index]:
     """Return the file to continue, and its undamaged contents: the recording, or its replacement.
 
     Args:
         described: whether the recording has the job's description.
     """
     if not run.recording.is_file():
-        return run.recording, Contents()
+        return run.recording, Index()
     contents = survey(run.recording)
     if may_be_cut(run.recording, contents) and (described or not contents.chunks):
         return run.recording, contents
     replacement = run.recording.with_suffix(_REPLACEMENT)
-    contents = survey(replacement) if replacement.is_file() else Contents()
-    return replacement, contents if may_be_cut(replacement, contents) else Contents()
+    contents = survey(replacement) if replacement.is_file() else Index()
+    return replacement, contents if may_be_cut(replacement, contents) else Index()
 
 
 def _job(run: Run) -> tuple[Job, bool]:
@@ -200,10 +200,10 @@ def _first_tables(job: Job, run: Run, mdp: Mdp) -> list[NamedTables] | None:
 
 @contextlib.contextmanager
 def _opened(
-    path: Path, contents: Contents, job: Job, run: Run, learner: Learner, changes: Differences
+    path: Path, contents: Index, job: Job, run: Run, learner: Learner, changes: Differences
 ) -> Iterator[RecordingFile]:
     """Open the file to continue: cut after its undamaged contents, or new if it has no description."""
-    described = bool(contents.chunks) and {entry.name for entry in contents.metadata} >= REQUIRED_RECORDS
+    described = bool(contents.chunks) and contents.metadata.keys() >= REQUIRED_RECORDS
     with storage_errors(path):
         if not described:
             path.unlink(missing_ok=True)
@@ -212,7 +212,7 @@ def _opened(
         if not described:
             describe(file, job, run, learner)
         if described or changes:
-            number = 1 + sum(entry.name.startswith("resume/") for entry in contents.metadata)
+            number = 1 + sum(name.startswith("resume/") for name in contents.metadata)
             accepted = {key: f"{then} -> {now}" for key, (then, now) in changes.items()}
             note = {**provenance(), "accepted_changes": json.dumps(accepted, sort_keys=True)}
             try:

@@ -11,14 +11,13 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from typing import Final
+from typing import Final, NamedTuple
 
 import lz4.frame
 import numpy as np
 import zstandard
 from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
@@ -46,22 +45,31 @@ Packed = Callable[[str, bytes | memoryview], bytes | memoryview | None]
 """Returns records packed with a compression, if they were packed before."""
 
 
-@dataclass(frozen=True)
-class ChunkSummary:
-    """A chunk's entry in the summary of a file, and its messages."""
+class ChunkEntry(NamedTuple):
+    """The place of a chunk, and what it declares."""
 
-    index: ChunkIndex
+    offset: int
+    length: int
+    """Bytes of the record, its head included."""
+    uncompressed_size: int
+    start_time: int
+    end_time: int
     channel: int
-    messages: int
+    """The channel of its messages; 0 if neither its message index nor its messages were read."""
+    compression: bytes = b""
+    messages: int = 0
+    """The number of its messages; 0 if they were not read."""
+    index_length: int = 0
+    """Bytes of the message index record after it; 0 if it has none."""
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """An encoded chunk: its MCAP records, and its summary, but for where it is in the file."""
+    """An encoded chunk: its MCAP records, and its entry without its place and that of its index."""
 
     record: bytes
     index: bytes
-    summary: ChunkSummary
+    entry: ChunkEntry
 
 
 def encode_chunk(
@@ -91,8 +99,8 @@ def encode_chunk(
     record = b"".join((RECORD_HEAD.pack(Opcode.CHUNK, len(head) + len(data)), head, data))
     indexed = has_message_index(topic, packing.index == "message")
     index = message_index(topic.channel, log_times, offsets) if indexed else b""
-    entry = ChunkIndex(len(record), 0, name, len(data), end, 0, {}, start, size)
-    return Chunk(record, index, ChunkSummary(entry, topic.channel, len(log_times)))
+    entry = ChunkEntry(0, len(record), size, start, end, topic.channel, name.encode(), len(log_times))
+    return Chunk(record, index, entry)
 
 
 def has_message_index(topic: Topic, indexed: bool) -> bool:

@@ -1,30 +1,51 @@
-"""The index of a recording: read from its summary, or found by walking its records.
+"""The index of a recording: read from its summary, or found by walking its records; and its summary.
 
 A file declares sizes and offsets; each is compared with the file's own size before it is used. What is kept
-in memory is bounded whatever the file declares: 34 bytes a chunk, and few names.
+in memory is bounded whatever the file declares: 46 bytes a chunk, and few names.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from io import BytesIO
-from typing import BinaryIO, Final, NamedTuple, TypeVar
+from typing import BinaryIO, Final, TypeVar
 
 import numpy as np
 from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, Footer, Header, MetadataIndex, Schema, Statistics
+from mcap.records import (
+    AttachmentIndex,
+    Channel,
+    DataEnd,
+    Footer,
+    Header,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
 from mcap.writer import MCAP0_MAGIC
 
-from runner.errors import RecordingError
+from runner.errors import CutOff, RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
-from runner.recording.chunks import CHUNK_HEAD, MAX_CHUNK_BYTES
-from runner.recording.records import IN_DATA, MAX_NAME_BYTES, MAX_NAMED, check_unpacked_size, record_heads
-from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, TOPIC_OF
+from runner.recording.chunks import CHUNK_HEAD, MAX_CHUNK_BYTES, ChunkEntry
+from runner.recording.messages import file_descriptor_set
+from runner.recording.records import (
+    LARGE,
+    MAX_NAME_BYTES,
+    MAX_NAMED,
+    MAX_RECORD_BYTES,
+    RawRecord,
+    bytes_of,
+    check_unpacked_size,
+    prefixed,
+    raw_records,
+)
+from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, TOPIC_OF, Topic
 from runner.util.arrays import Records
 
 K = TypeVar("K")
@@ -32,38 +53,23 @@ T = TypeVar("T")
 
 MAX_CHUNKS: Final = 1 << 21
 """The most chunks that a recording is read with: a chunk of steps holds 256 or more."""
-MAX_RECORD_BYTES: Final = 1 << 16
-"""The largest record of a summary, schema or channel; the recorder's are below 4 kB."""
 _PIECE: Final = 1 << 20
 _CHUNK_INDEX_HEAD: Final = struct.Struct("<QQQQI")
 _OFFSET_ENTRY: Final = struct.Struct("<HQ")
-FOOTER_HEAD: Final = struct.Struct("<BQQQ")
+_SUMMARY_OFFSET: Final = struct.Struct("<BQBQQ")
+_FOOTER_HEAD: Final = struct.Struct("<BQQQ")
 """The part of the footer that its checksum covers: opcode, length, starts of summary and summary offsets."""
-FOOTER_BODY_BYTES: Final = 20
-_TAIL_BYTES: Final = RECORD_HEAD.size + FOOTER_BODY_BYTES + len(MCAP0_MAGIC)
+_FOOTER_BODY_BYTES: Final = 20
+_TAIL_BYTES: Final = RECORD_HEAD.size + _FOOTER_BODY_BYTES + len(MCAP0_MAGIC)
 
-
-class ChunkEntry(NamedTuple):
-    """The place of a chunk, and what it declares."""
-
-    offset: int
-    length: int
-    """Bytes of the record, its head included."""
-    uncompressed_size: int
-    start_time: int
-    end_time: int
-    channel: int
-    """The channel of its messages, by its message index; 0 if it has none."""
-
-
-_ENTRY: Final = struct.Struct("<QIIQQH")
+_ENTRY: Final = struct.Struct("<QIIQQH4sII")
 _ENTRY_COLUMNS: Final = np.dtype(
-    list(zip(ChunkEntry._fields, ("<u8", "<u4", "<u4", "<u8", "<u8", "<u2"), strict=True))
+    list(zip(ChunkEntry._fields, ("<u8", "<u4", "<u4", "<u8", "<u8", "<u2", "S4", "<u4", "<u4"), strict=True))
 )
 
 
 class ChunkTable:
-    """The chunks of a recording in the order of the file, 34 bytes each."""
+    """The chunks of a recording in the order of the file, 46 bytes each."""
 
     def __init__(self) -> None:
         self._packed = bytearray()
@@ -74,6 +80,9 @@ class ChunkTable:
     def __getitem__(self, k: int) -> ChunkEntry:
         return ChunkEntry(*_ENTRY.unpack_from(self._packed, k * _ENTRY.size))
 
+    def __iter__(self) -> Iterator[ChunkEntry]:
+        return map(ChunkEntry._make, _ENTRY.iter_unpack(self._packed))
+
     def append(self, entry: ChunkEntry) -> None:
         """Add a chunk after the last one.
 
@@ -83,16 +92,16 @@ class ChunkTable:
         where = f"the chunk at {entry.offset}"
         if entry.length > MAX_CHUNK_BYTES or entry.uncompressed_size > MAX_CHUNK_BYTES:
             size = max(entry.length, entry.uncompressed_size)
-            raise RecordingError(f"{where} declares {size:,} bytes, expected at most {MAX_CHUNK_BYTES:,}.")
+            raise RecordingError(f"{where} declares {size:,} bytes, expected at most {MAX_CHUNK_BYTES:,}")
         if (
             entry.length < RECORD_HEAD.size + CHUNK_HEAD.size + 8
             or entry.uncompressed_size < MESSAGE_HEAD.size
         ):
-            raise RecordingError(f"{where} declares fewer bytes than a chunk with a message has.")
+            raise RecordingError(f"{where} declares fewer bytes than a chunk with a message has")
         if len(self) and entry.offset < sum(self[len(self) - 1][:2]):
-            raise RecordingError(f"{where} overlaps the one before it in the index.")
+            raise RecordingError(f"{where} overlaps the one before it in the index")
         if len(self) == MAX_CHUNKS:
-            raise RecordingError(f"has more than {MAX_CHUNKS:,} chunks, the most that a recording may have.")
+            raise RecordingError(f"has more than {MAX_CHUNKS:,} chunks, the most that a recording may have")
         self._packed += _ENTRY.pack(*entry)
 
     def set_channel(self, channel: int) -> None:
@@ -105,9 +114,13 @@ class ChunkTable:
         if last.channel or channel not in TOPIC_OF:
             raise RecordingError(
                 f"chunk at {last.offset}: found messages of channel {channel}"
-                f"{f' and {last.channel}' if last.channel else ''}, expected those of one topic."
+                f"{f' and {last.channel}' if last.channel else ''}, expected those of one topic"
             )
-        self._packed[-_ENTRY.size :] = _ENTRY.pack(*last._replace(channel=channel))
+        self.replace_last(last._replace(channel=channel))
+
+    def replace_last(self, entry: ChunkEntry) -> None:
+        """Replace what is known of the last chunk."""
+        self._packed[-_ENTRY.size :] = _ENTRY.pack(*entry)
 
     @property
     def columns(self) -> Records:
@@ -117,7 +130,7 @@ class ChunkTable:
 
 @dataclass
 class Index:
-    """The places of a recording's records."""
+    """The places of a recording's records, up to `end`."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, bytes] = field(default_factory=dict)
@@ -125,12 +138,175 @@ class Index:
     chunks: ChunkTable = field(default_factory=ChunkTable)
     attachments: dict[str, tuple[int, int]] = field(default_factory=dict)
     """Name to (offset, length) of the record."""
+    media_types: dict[str, str] = field(default_factory=dict)
+    """Media type of each attachment, by name."""
     metadata: dict[str, tuple[int, int]] = field(default_factory=dict)
     message_counts: dict[int, int] = field(default_factory=dict)
     """Messages by channel, as the summary counts them; empty without one."""
     finished: bool = False
     end: int = 0
     """Offset after the last whole record of the data section."""
+    size: int = 0
+    """Bytes of the file."""
+    reason: str = ""
+    """Why its records were not read to the end of the data section; empty if they were."""
+
+    @property
+    def topics(self) -> list[Topic]:
+        """The topics of its channels."""
+        return [topic for topic in ALL_TOPICS if topic.channel in self.channels]
+
+    def check_unpacked_size(self, path: str) -> None:
+        """Refuse a file whose chunks declare far more bytes than those of any recording of its size.
+
+        Raises:
+            RecordingError: they do.
+        """
+        unpacked = int(self.chunks.columns["uncompressed_size"].sum(dtype=np.uint64)) if self.chunks else 0
+        check_unpacked_size(self.size, unpacked, path)
+
+    def add(self, raw: RawRecord) -> None:
+        """Add a record of the data section, of which the beginning suffices, or of the summary.
+
+        Raises:
+            RecordingError: it cannot be read, or contradicts those before it.
+        """
+        if raw.length > MAX_RECORD_BYTES and raw.kind not in LARGE:
+            raise RecordingError(
+                f"the record at {raw.offset} declares {raw.length:,} bytes, "
+                f"expected at most {MAX_RECORD_BYTES:,}"
+            )
+        match raw.kind:
+            case Opcode.CHUNK:
+                head = raw.body[: CHUNK_HEAD.size].ljust(CHUNK_HEAD.size, b"\0")
+                start, end, unpacked, _, _ = CHUNK_HEAD.unpack(head)
+                self.chunks.append(ChunkEntry(*raw.place, unpacked, start, end, 0))
+            case Opcode.MESSAGE_INDEX:
+                self.chunks.set_channel(int.from_bytes(raw.body[:2], "little"))
+            case Opcode.CHUNK_INDEX:
+                entry = _chunk_entry(raw)
+                self._check_place("chunk", *entry[:2])
+                self.chunks.append(entry)
+            case Opcode.METADATA:
+                self.add_metadata(_text(raw, 0)[0], raw.place)
+            case Opcode.METADATA_INDEX:
+                metadata = _parse(MetadataIndex, raw)
+                self._check_place("metadata", metadata.offset, metadata.length)
+                self.add_metadata(metadata.name, (metadata.offset, metadata.length))
+            case Opcode.ATTACHMENT:
+                name, at = _text(raw, 16)
+                self.add_attachment(name, raw.place, _text(raw, at)[0])
+            case Opcode.ATTACHMENT_INDEX:
+                attachment = _parse(AttachmentIndex, raw)
+                self._check_place("attachment", attachment.offset, attachment.length)
+                place = attachment.offset, attachment.length
+                self.add_attachment(attachment.name, place, attachment.media_type)
+            case Opcode.SCHEMA:
+                schema = _parse(Schema, raw)
+                _add_once(self.schemas, schema.id, schema.data, "schema")
+            case Opcode.CHANNEL:
+                channel = _parse(Channel, raw)
+                _add_once(self.channels, channel.id, channel, "channel")
+            case Opcode.STATISTICS:
+                self.message_counts = dict(_parse(Statistics, raw).channel_message_counts)
+            case Opcode.HEADER if raw.offset != len(MCAP0_MAGIC):
+                raise RecordingError(f"found a second header at {raw.offset}")
+
+    def add_metadata(self, name: str, place: tuple[int, int]) -> None:
+        """Add the (offset, length) of a metadata record."""
+        _add_once(self.metadata, name, place, "metadata")
+
+    def add_attachment(self, name: str, place: tuple[int, int], media_type: str) -> None:
+        """Add the (offset, length) of an attachment."""
+        _add_once(self.attachments, name, place, "attachment")
+        self.media_types[name] = media_type
+
+    def _check_place(self, what: str, offset: int, length: int) -> None:
+        if offset < len(MCAP0_MAGIC) or length < RECORD_HEAD.size or offset + length > self.end:
+            raise RecordingError(
+                f"the index points to {what} of {length} bytes at {offset}, outside the data"
+            )
+
+    def take_records(self, stream: BinaryIO) -> None:
+        """Add the records of the data section, up to the last whole one, by their beginnings.
+
+        Raises:
+            RecordingError: one cannot be read, or contradicts those before it.
+        """
+        self.end = len(MCAP0_MAGIC)
+        for raw in raw_records(stream, self.end, self.size):
+            if not raw.is_data or (raw.is_message_index and not self.chunks):
+                return
+            self.add(raw)
+            self.end = raw.end
+
+    def _take_summary(self, stream: BinaryIO, footer: Footer) -> None:
+        """Add the records of the summary section, after comparing its checksum."""
+        start, end = footer.summary_start, self.size - _TAIL_BYTES
+        if not len(MCAP0_MAGIC) < start <= footer.summary_offset_start <= end:
+            raise RecordingError(f"the footer points to a summary at {start}, outside the file; try `repair`")
+        fields = _FOOTER_HEAD.pack(Opcode.FOOTER, _FOOTER_BODY_BYTES, start, footer.summary_offset_start)
+        if crc32(fields, checksum(stream, start, end)) != footer.summary_crc:
+            raise RecordingError(f"the summary at {start} does not match its checksum; try `repair`")
+        self.finished, self.end = True, start
+        for raw in raw_records(stream, start, end):
+            self.add(raw)
+            start = raw.end
+        if start != end:
+            raise RecordingError(f"found {end - start} stray bytes at {start}, expected a record")
+
+    def tail(self, topics: Sequence[Topic], crc: int) -> bytes:
+        """Return the end of a finished recording, after its data: data end, summary, footer, magic.
+
+        Args:
+            topics: those that it has channels for.
+            crc: the checksum of the file up to `end`.
+        """
+        data_end = bytes_of(DataEnd(crc))
+        start = self.end + len(data_end)
+        schemas, channels = schemas_and_channels(tuple(topics))
+        attachments = (
+            _attachment_index(name, *place, self.media_types[name])
+            for name, place in self.attachments.items()
+        )
+        groups = [
+            (Opcode.SCHEMA, schemas),
+            (Opcode.CHANNEL, channels),
+            (Opcode.STATISTICS, bytes_of(self._statistics(topics))),
+            (Opcode.CHUNK_INDEX, b"".join(map(_chunk_index, self.chunks))),
+            (Opcode.ATTACHMENT_INDEX, b"".join(attachments)),
+            (
+                Opcode.METADATA_INDEX,
+                b"".join(_metadata_index(name, *place) for name, place in self.metadata.items()),
+            ),
+        ]
+        summary, offsets = bytearray(), bytearray()
+        for opcode, data in groups:
+            if data:
+                at = start + len(summary)
+                offsets += _SUMMARY_OFFSET.pack(Opcode.SUMMARY_OFFSET, 17, opcode, at, len(data))
+            summary += data
+        footer = _FOOTER_HEAD.pack(Opcode.FOOTER, _FOOTER_BODY_BYTES, start, start + len(summary))
+        crc = crc32(footer, crc32(summary + offsets))
+        return b"".join((data_end, summary, offsets, footer, struct.pack("<I", crc), MCAP0_MAGIC))
+
+    def _statistics(self, topics: Sequence[Topic]) -> Statistics:
+        chunks = self.chunks.columns
+        counts = {
+            topic.channel: int(chunks["messages"][chunks["channel"] == topic.channel].sum())
+            for topic in ALL_TOPICS
+        }
+        return Statistics(
+            attachment_count=len(self.attachments),
+            channel_count=len(topics),
+            channel_message_counts={channel: n for channel, n in counts.items() if n},
+            chunk_count=len(chunks),
+            message_count=sum(counts.values()),
+            metadata_count=len(self.metadata),
+            message_start_time=int(chunks["start_time"].min()) if len(chunks) else 0,
+            message_end_time=int(chunks["end_time"].max(initial=0)),
+            schema_count=len({topic.message for topic in topics}),
+        )
 
 
 def read_index(stream: BinaryIO, path: str) -> Index:
@@ -139,18 +315,48 @@ def read_index(stream: BinaryIO, path: str) -> Index:
     Raises:
         RecordingError: it is not a dualtaxi recording, or is damaged before its first chunk.
     """
-    size = stream.seek(0, 2)
+    index = Index(size=stream.seek(0, 2))
     try:
-        _check_beginning(stream)
-        footer = _footer(stream, size)
-        index = _from_records(stream, size) if footer is None else _from_summary(stream, footer, size)
+        check_beginning(stream)
+        footer = _footer(stream, index.size)
+        if footer is None:
+            index.take_records(stream)
+        else:
+            index._take_summary(stream, footer)
         if not index.channels:
-            raise RecordingError("the recording was cut off before its first message.")
+            raise RecordingError("the recording was cut off before its first message")
     except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from error
-    unpacked = int(index.chunks.columns["uncompressed_size"].sum(dtype=np.uint64)) if index.chunks else 0
-    check_unpacked_size(size, unpacked, path)
+        raise RecordingError(f"{path}: {error}.") from error
+    index.check_unpacked_size(path)
     return index
+
+
+def check_beginning(stream: BinaryIO) -> int:
+    """Refuse a file that is not an MCAP file, or that of another program; return where its header ends.
+
+    Raises:
+        CutOff: its header is cut off or damaged.
+        RecordingError: it is such a file, or is empty.
+    """
+    stream.seek(0)
+    magic = stream.read(len(MCAP0_MAGIC))
+    if not magic:
+        raise RecordingError("found an empty file, expected a recording")
+    if magic != MCAP0_MAGIC:
+        error = CutOff if MCAP0_MAGIC.startswith(magic) else RecordingError
+        raise error(f"found {magic!r} at its start, expected an MCAP file: not a dualtaxi recording")
+    header = next(raw_records(stream, len(MCAP0_MAGIC), stream.seek(0, 2)), None)
+    if header is None or header.kind != Opcode.HEADER:
+        raise CutOff(f"the Header record at {len(MCAP0_MAGIC)} cannot be read")
+    try:
+        profile = _parse(Header, header).profile
+    except RecordingError as error:
+        raise CutOff(str(error)) from error
+    if profile != PROFILE:
+        raise RecordingError(
+            f"found an MCAP file of profile {profile!r}, expected {PROFILE!r}: not a dualtaxi recording"
+        )
+    return header.end
 
 
 def checksum(stream: BinaryIO, start: int, end: int) -> int:
@@ -162,20 +368,26 @@ def checksum(stream: BinaryIO, start: int, end: int) -> int:
     return crc
 
 
-def _check_beginning(stream: BinaryIO) -> None:
-    stream.seek(0)
-    beginning = stream.read(len(MCAP0_MAGIC) + RECORD_HEAD.size)
-    if not beginning:
-        raise RecordingError("found an empty file, expected a recording.")
-    if not beginning.startswith(MCAP0_MAGIC):
-        raise RecordingError(f"found {beginning[:8]!r} at its start, expected an MCAP file.")
-    opcode, length = RECORD_HEAD.unpack(beginning[len(MCAP0_MAGIC) :].ljust(RECORD_HEAD.size, b"\0"))
-    header = _parse(Header, stream.read(min(length, 4096)), len(MCAP0_MAGIC))
-    if opcode != Opcode.HEADER or header.profile != PROFILE:
-        raise RecordingError(
-            f"found an MCAP file of profile {header.profile!r}, expected {PROFILE!r}: "
-            "not a dualtaxi recording."
+@cache
+def schemas_and_channels(topics: tuple[Topic, ...]) -> tuple[bytes, bytes]:
+    """Return the schema and channel records of a recording with these topics, which follow its header."""
+    used = {topic.message for topic in topics}
+    schemas = [
+        Schema(id=number, name=message.full_name, encoding="protobuf", data=file_descriptor_set(message))
+        for number, message in enumerate(MESSAGES, start=1)
+        if message in used
+    ]
+    channels = [
+        Channel(
+            id=topic.channel,
+            topic=topic.name,
+            message_encoding="protobuf",
+            metadata={},
+            schema_id=1 + MESSAGES.index(topic.message),
         )
+        for topic in sorted(topics, key=lambda topic: topic.channel)
+    ]
+    return bytes_of(*schemas), bytes_of(*channels)
 
 
 def _footer(stream: BinaryIO, size: int) -> Footer | None:
@@ -185,158 +397,88 @@ def _footer(stream: BinaryIO, size: int) -> Footer | None:
     stream.seek(size - _TAIL_BYTES)
     tail = stream.read(_TAIL_BYTES)
     head, body = tail[: RECORD_HEAD.size], tail[RECORD_HEAD.size :]
-    if not tail.endswith(MCAP0_MAGIC) or RECORD_HEAD.unpack(head) != (Opcode.FOOTER, FOOTER_BODY_BYTES):
+    if not tail.endswith(MCAP0_MAGIC) or RECORD_HEAD.unpack(head) != (Opcode.FOOTER, _FOOTER_BODY_BYTES):
         return None
     return Footer.read(ReadDataStream(BytesIO(body)))
 
 
-def _from_summary(stream: BinaryIO, footer: Footer, size: int) -> Index:
-    """Return the index in the summary section, after comparing its checksum."""
-    start, end = footer.summary_start, size - _TAIL_BYTES
-    if not len(MCAP0_MAGIC) < start <= footer.summary_offset_start <= end:
-        raise RecordingError(f"the footer points to a summary at {start}, outside the file; try `repair`.")
-    fields = FOOTER_HEAD.pack(Opcode.FOOTER, FOOTER_BODY_BYTES, start, footer.summary_offset_start)
-    if crc32(fields, checksum(stream, start, end)) != footer.summary_crc:
-        raise RecordingError(f"the summary at {start} does not match its checksum; try `repair`.")
-    index = Index(finished=True, end=start)
-    for opcode, offset, body in _records(stream, start, end):
-        _add_summary_record(index, opcode, offset, body, start)
-    return index
-
-
-def _add_summary_record(index: Index, opcode: int, offset: int, body: bytes, data_end: int) -> None:
-    if opcode == Opcode.CHUNK_INDEX:
-        chunk = _chunk_entry(body, offset)
-        _check_place("chunk", chunk.offset, chunk.length, data_end)
-        index.chunks.append(chunk._replace(channel=0))
-        if chunk.channel:
-            index.chunks.set_channel(chunk.channel)
-    elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-        _add_schema_or_channel(index, opcode, offset, body)
-    elif opcode == Opcode.STATISTICS:
-        index.message_counts = dict(_parse(Statistics, body, offset).channel_message_counts)
-    elif opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
-        is_metadata = opcode == Opcode.METADATA_INDEX
-        entry = _parse(MetadataIndex if is_metadata else AttachmentIndex, body, offset)
-        what = "metadata" if is_metadata else "attachment"
-        _check_place(what, entry.offset, entry.length, data_end)
-        places = index.metadata if is_metadata else index.attachments
-        _add_once(places, entry.name, (entry.offset, entry.length), what)
-
-
-def _from_records(stream: BinaryIO, size: int) -> Index:
-    """Return the index of an unfinished file, up to the last whole record."""
-    index = Index(end=len(MCAP0_MAGIC))
-    for opcode, offset, length in record_heads(stream, size):
-        if opcode not in IN_DATA or (opcode == Opcode.MESSAGE_INDEX and not index.chunks):
-            break
-        _add_record(index, stream, opcode, offset, length)
-        index.end = offset + RECORD_HEAD.size + length
-    return index
-
-
-def _add_record(index: Index, stream: BinaryIO, opcode: int, offset: int, length: int) -> None:
-    """Add one record of the data section to the index; the stream is at its body."""
-    if opcode == Opcode.CHUNK:
-        head = stream.read(min(length, CHUNK_HEAD.size)).ljust(CHUNK_HEAD.size, b"\0")
-        start, end, unpacked, _, _ = CHUNK_HEAD.unpack(head)
-        index.chunks.append(ChunkEntry(offset, RECORD_HEAD.size + length, unpacked, start, end, 0))
-    elif opcode == Opcode.MESSAGE_INDEX:
-        (channel,) = struct.unpack("<H", stream.read(min(length, 2)).ljust(2, b"\0"))
-        index.chunks.set_channel(channel)
-    elif opcode == Opcode.METADATA:
-        name = _name(stream.read(min(length, 4 + MAX_NAME_BYTES)), 0, offset)
-        _add_once(index.metadata, name, (offset, RECORD_HEAD.size + length), "metadata")
-    elif opcode == Opcode.ATTACHMENT:
-        name = _name(stream.read(min(length, 20 + MAX_NAME_BYTES)), 16, offset)
-        _add_once(index.attachments, name, (offset, RECORD_HEAD.size + length), "attachment")
-    elif opcode != Opcode.HEADER:
-        _check_length(length, offset)
-        _add_schema_or_channel(index, opcode, offset, stream.read(length))
-    elif offset != len(MCAP0_MAGIC):
-        raise RecordingError(f"found a second header at {offset}.")
-
-
-def _add_schema_or_channel(index: Index, opcode: int, offset: int, body: bytes) -> None:
-    if opcode == Opcode.CHANNEL:
-        channel = _parse(Channel, body, offset)
-        _add_once(index.channels, channel.id, channel, "channel")
-        return
-    schema = _parse(Schema, body, offset)
-    _add_once(index.schemas, schema.id, schema.data, "schema")
-
-
-def _records(stream: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
-    at = stream.seek(start)
-    while at < end:
-        available = end - at - RECORD_HEAD.size
-        if available < 0:
-            raise RecordingError(f"found {end - at} stray bytes at {at}, expected a record.")
-        opcode, length = RECORD_HEAD.unpack(stream.read(RECORD_HEAD.size))
-        if length > available:
-            raise RecordingError(f"the record at {at} declares {length} bytes, {available} are there.")
-        _check_length(length, at)
-        yield opcode, at, stream.read(length)
-        at += RECORD_HEAD.size + length
-
-
-def _check_length(length: int, offset: int) -> None:
-    if length > MAX_RECORD_BYTES:
-        raise RecordingError(
-            f"the record at {offset} declares {length:,} bytes, expected at most {MAX_RECORD_BYTES:,}."
-        )
-
-
-def _chunk_entry(body: bytes, offset: int) -> ChunkEntry:
+def _chunk_entry(raw: RawRecord) -> ChunkEntry:
     """Return the entry in a ChunkIndex record: there are thousands, so not by the library's reader."""
+    body = raw.body
     try:
-        start, end, chunk_offset, length, map_bytes = _CHUNK_INDEX_HEAD.unpack_from(body)
+        start, end, offset, length, map_bytes = _CHUNK_INDEX_HEAD.unpack_from(body)
         map_start, map_end = _CHUNK_INDEX_HEAD.size, _CHUNK_INDEX_HEAD.size + map_bytes
         channels = [channel for channel, _ in _OFFSET_ENTRY.iter_unpack(body[map_start:map_end])]
-        at = map_end + 8
-        (name_length,) = struct.unpack_from("<I", body, at)
-        (uncompressed,) = struct.unpack_from("<Q", body, at + 4 + name_length + 8)
+        (name_length,) = struct.unpack_from("<I", body, map_end + 8)
+        (uncompressed,) = struct.unpack_from("<Q", body, map_end + 12 + name_length + 8)
     except struct.error as error:
-        raise RecordingError(f"the ChunkIndex record at {offset} cannot be read.") from error
-    if len(channels) > 1 or channels == [0]:
+        raise RecordingError(f"the ChunkIndex record at {raw.offset} cannot be read") from error
+    if len(channels) > 1 or not TOPIC_OF.keys() >= set(channels):
         raise RecordingError(
-            f"the ChunkIndex record at {offset} names {len(channels)} channels, expected that of one topic."
+            f"the ChunkIndex record at {raw.offset} names {len(channels)} channels, "
+            "expected that of one topic"
         )
-    return ChunkEntry(chunk_offset, length, uncompressed, start, end, channels[0] if channels else 0)
+    return ChunkEntry(offset, length, uncompressed, start, end, channels[0] if channels else 0)
 
 
-def _parse(kind: type[T], body: bytes, offset: int) -> T:
+def _chunk_index(entry: ChunkEntry) -> bytes:
+    """Return the ChunkIndex record of a chunk."""
+    name = entry.compression.rstrip(b"\0")
+    after = entry.offset + entry.length
+    indexed = _OFFSET_ENTRY.pack(entry.channel, after) if entry.index_length else b""
+    place = entry.start_time, entry.end_time, entry.offset, entry.length
+    packed = entry.length - RECORD_HEAD.size - CHUNK_HEAD.size - len(name) - 8
+    return _record(
+        Opcode.CHUNK_INDEX,
+        _CHUNK_INDEX_HEAD.pack(*place, len(indexed)),
+        indexed,
+        struct.pack("<QI", entry.index_length, len(name)),
+        name,
+        struct.pack("<QQ", packed, entry.uncompressed_size),
+    )
+
+
+def _metadata_index(name: str, offset: int, length: int) -> bytes:
+    return _record(Opcode.METADATA_INDEX, struct.pack("<QQ", offset, length), prefixed(name))
+
+
+def _attachment_index(name: str, offset: int, length: int, media_type: str) -> bytes:
+    texts = prefixed(name) + prefixed(media_type)
+    size = length - RECORD_HEAD.size - 2 * 8 - len(texts) - 8 - 4  # its times, data length and checksum
+    return _record(Opcode.ATTACHMENT_INDEX, struct.pack("<QQQQQ", offset, length, 0, 0, size), texts)
+
+
+def _record(opcode: Opcode, *parts: bytes) -> bytes:
+    return b"".join((RECORD_HEAD.pack(opcode, sum(map(len, parts))), *parts))
+
+
+def _parse(kind: type[T], raw: RawRecord) -> T:
     try:
-        return kind.read(ReadDataStream(BytesIO(body)))  # type: ignore[attr-defined, no-any-return]
+        return kind.read(ReadDataStream(BytesIO(raw.body)))  # type: ignore[attr-defined, no-any-return]
     except (McapError, struct.error, UnicodeDecodeError, ValueError) as error:
-        raise RecordingError(f"the {kind.__name__} record at {offset} cannot be read.") from error
+        raise RecordingError(f"the {kind.__name__} record at {raw.offset} cannot be read") from error
 
 
-def _name(body: bytes, at: int, offset: int) -> str:
-    """Return the text at `at` in a record's body, which its length precedes."""
+def _text(raw: RawRecord, at: int) -> tuple[str, int]:
+    """Return the text at `at` in a record's body, which its length precedes, and where it ends."""
     try:
-        (length,) = struct.unpack_from("<I", body, at)
-        name = body[at + 4 : at + 4 + length]
-        if len(name) == length:
-            return name.decode()
+        (length,) = struct.unpack_from("<I", raw.body, at)
+        end = at + 4 + length
+        if end <= len(raw.body):
+            return raw.body[at + 4 : end].decode(), end
     except (struct.error, UnicodeDecodeError) as error:
-        raise RecordingError(f"the record at {offset} has no readable name.") from error
-    raise RecordingError(f"the record at {offset} declares a name of {length:,} bytes.")
+        raise RecordingError(f"the record at {raw.offset} has no readable name") from error
+    raise RecordingError(f"the record at {raw.offset} declares a name of {length:,} bytes")
 
 
 def _add_once(known: dict[K, T], key: K, value: T, what: str) -> None:
     """Add an entry; a file may have one of each key, and not too many."""
     if key in known:
-        raise RecordingError(f"has {what} {key!r} twice.")
+        raise RecordingError(f"has {what} {key!r} twice")
     if len(known) == {"channel": len(ALL_TOPICS), "schema": len(MESSAGES)}.get(what, MAX_NAMED):
         raise RecordingError(
-            f"has more than {len(known):,} {what} records, the most that a recording may have."
+            f"has more than {len(known):,} {what} records, the most that a recording may have"
         )
     if isinstance(key, str) and len(key) > MAX_NAME_BYTES:
-        raise RecordingError(f"has {what} with a name of {len(key):,} letters.")
+        raise RecordingError(f"has {what} with a name of {len(key):,} letters")
     known[key] = value
-
-
-def _check_place(what: str, offset: int, length: int, end: int) -> None:
-    if offset < len(MCAP0_MAGIC) or length < RECORD_HEAD.size or offset + length > end:
-        raise RecordingError(f"the index points to {what} of {length} bytes at {offset}, outside the data.")

@@ -10,39 +10,28 @@ import contextlib
 import itertools
 import operator
 import os
-import struct
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import BinaryIO
 
-from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, MetadataIndex
 from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import CutOff, RecordingError
 from runner.recording import schema
 from runner.recording.blocks import RECORD_HEAD
-from runner.recording.chunks import MAX_CHUNK_BYTES, has_message_index, message_index
+from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry, has_message_index, message_index
+from runner.recording.index import Index, check_beginning, checksum, schemas_and_channels
 from runner.recording.records import (
-    MAX_NAME_BYTES,
-    MAX_NAMED,
-    UNREADABLE,
-    Contents,
+    MetadataRecord,
+    RawRecord,
     ReadChunk,
     Report,
     asks_for_indexes,
-    attachment_of,
-    check_unpacked_size,
-    declared_bytes,
-    metadata_of,
-    read_chunk,
+    read_record,
     walk,
 )
-from runner.recording.writer import RecordingFile, schemas_and_channels
 from runner.util.files import open_regular
-
-N = TypeVar("N", AttachmentIndex, MetadataIndex)
 
 
 def refuse_foreign(path: Path) -> None:
@@ -51,29 +40,14 @@ def refuse_foreign(path: Path) -> None:
     Raises:
         RecordingError: it is such a file, or cannot be read.
     """
-    try:
-        with open_regular(path) as stream:
-            start = stream.read(4096)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
-    if not start:
-        raise RecordingError(
-            f"{path}: found an empty file, expected a recording; `dualtaxi resume` starts it."
-        )
-    if not start.startswith(MCAP0_MAGIC[: len(start)]):
-        raise RecordingError(
-            f"{path}: found {start[:8]!r} at its start, expected an MCAP file: not a dualtaxi recording."
-        )
-    head = start[len(MCAP0_MAGIC) :]
-    if len(head) < 13 or head[0] != Opcode.HEADER:
-        return
-    (length,) = struct.unpack_from("<I", head, 9)
-    profile = head[13 : 13 + length]
-    if length < len(head) and profile != schema.PROFILE.encode():
-        raise RecordingError(
-            f"{path}: found an MCAP file of profile {profile.decode(errors='replace')!r}, expected "
-            f"{schema.PROFILE!r}: not a dualtaxi recording."
-        )
+    with _reading(path) as stream:
+        try:
+            check_beginning(stream)
+        except CutOff:
+            return
+        except RecordingError as error:
+            advice = "" if stream.seek(0, 2) else "; `dualtaxi resume` starts it"
+            raise RecordingError(f"{path}: {error}{advice}.") from error
 
 
 def check_integrity(path: Path, report: Report = lambda *_: None) -> None:
@@ -115,15 +89,18 @@ def is_merely_cut_off(path: Path) -> bool:
     return expected.startswith(found)
 
 
-def survey(path: Path, keep_result: bool = False, report: Report = lambda *_: None) -> Contents:
+def survey(path: Path, keep_result: bool = False, report: Report = lambda *_: None) -> Index:
     """Return what of a recording is good to the last byte, from its beginning to the first damaged record.
 
     Args:
         keep_result: whether a `result` record counts; when a recording is resumed, it is written again.
     """
     with _reading(path) as stream:
-        contents = Contents(size=stream.seek(0, 2))
-        check_unpacked_size(contents.size, declared_bytes(stream, contents.size, str(path)), str(path))
+        contents = Index(size=stream.seek(0, 2))
+        declared = Index(size=contents.size)
+        with contextlib.suppress(RecordingError):
+            declared.take_records(stream)
+        declared.check_unpacked_size(str(path))
         try:
             _check_beginning(stream)
             _take_records(stream, contents, keep_result, report)
@@ -132,13 +109,13 @@ def survey(path: Path, keep_result: bool = False, report: Report = lambda *_: No
     return contents
 
 
-def may_be_cut(path: Path, contents: Contents) -> bool:
+def may_be_cut(path: Path, contents: Index) -> bool:
     """Return whether nothing is missing among the good records, and nothing good comes after them.
 
     Args:
         contents: its good records, as `survey` found them.
     """
-    if any(entry.name == "repair" for entry in contents.metadata):
+    if "repair" in contents.metadata:
         return False
     if not contents.reason:
         return True
@@ -171,104 +148,84 @@ def _beginnings() -> tuple[bytes, ...]:
 
 def _check_beginning(stream: BinaryIO) -> None:
     """Compare magic, header, schemas and channels; only the library's version may differ."""
-    stream.seek(0)
-    start = stream.read(len(MCAP0_MAGIC) + RECORD_HEAD.size)
-    if start[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
-        raise RecordingError(f"found {start[:8]!r} at 0, expected the MCAP magic")
-    opcode, length = RECORD_HEAD.unpack(start[len(MCAP0_MAGIC) :].ljust(RECORD_HEAD.size, b"\0"))
-    stream.seek(len(MCAP0_MAGIC) + RECORD_HEAD.size + min(length, 4096))
-    if opcode != Opcode.HEADER or not stream.read(max(map(len, _beginnings()))).startswith(_beginnings()):
+    stream.seek(check_beginning(stream))
+    if not stream.read(max(map(len, _beginnings()))).startswith(_beginnings()):
         raise RecordingError("found other schemas or channels than every recording begins with")
 
 
-def _take_records(stream: BinaryIO, contents: Contents, keep_result: bool, report: Report) -> None:
+def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: Report) -> None:
     """Note the good records of the data section.
 
     Raises:
         RecordingError: one is damaged, or the file ends before the data section does.
     """
-    indexed, is_taken = True, False
+    indexed = True
     chunk: ReadChunk | None = None
-    """The last chunk, if an index may follow; `is_taken` if it need not."""
-    for opcode, at, body in walk(stream, contents.size):
-        if opcode == Opcode.DATA_END:
+    """The record before, if it is a chunk that an index may follow."""
+    for raw in walk(stream, contents.size):
+        if raw.ends_data:
             return
-        report(at, contents.size)
-        try:
-            if chunk is not None and (opcode == Opcode.MESSAGE_INDEX or not is_taken):
-                _take_index(contents, chunk, opcode, at, body)
-                chunk = None
-            elif opcode == Opcode.CHUNK:
-                chunk = _checked_chunk(body, at)
-                is_taken = not has_message_index(schema.TOPIC_OF[chunk.summary.channel], indexed)
-                if not is_taken:
-                    continue
-                contents.chunks.append(chunk.summary)
-                chunk = chunk if indexed else None  # earlier versions wrote an index of extras too
-            elif opcode == Opcode.METADATA:
-                name, entries = metadata_of(body)
-                if name == "result" and not keep_result:
-                    continue
-                if name == "config":
-                    indexed = asks_for_indexes(entries)
-                _note(
-                    contents.metadata,
-                    MetadataIndex(offset=at, length=RECORD_HEAD.size + len(body), name=name),
-                )
-            elif opcode == Opcode.ATTACHMENT:
-                name, media_type, data = attachment_of(body, at)
-                entry = AttachmentIndex(at, RECORD_HEAD.size + len(body), 0, 0, len(data), name, media_type)
-                _note(contents.attachments, entry)
-            elif opcode == Opcode.CHANNEL:
-                contents.channels.append(struct.unpack_from("<H", body)[0])
-            elif opcode not in (Opcode.HEADER, Opcode.SCHEMA):
-                raise RecordingError(f"found a record of kind {opcode} at {at}, expected none there")
-        except UNREADABLE as error:
-            raise RecordingError(f"the record at {at} cannot be read") from error
-        contents.end = at + RECORD_HEAD.size + len(body)
+        report(raw.offset, contents.size)
+        is_due = chunk is not None and has_message_index(chunk.topic, indexed)
+        if chunk is not None and (raw.is_message_index or is_due):
+            entry = _with_index(chunk, raw)
+            if is_due:
+                contents.chunks.append(entry)
+            else:
+                contents.chunks.replace_last(entry)
+            chunk, contents.end = None, raw.end
+            continue
+        if not raw.is_data or raw.is_message_index:
+            raise RecordingError(f"found a record of kind {raw.kind} at {raw.offset}, expected none there")
+        record, chunk = read_record(raw), None
+        if isinstance(record, ReadChunk):
+            _check_times(record)
+            chunk = record._replace(body=b"")
+            del record  # memory that is free for the next record makes a survey a third quicker
+            if has_message_index(chunk.topic, indexed):
+                continue
+            contents.chunks.append(chunk.entry)
+            chunk = chunk if indexed else None  # earlier versions wrote an index of extras too
+        elif isinstance(record, MetadataRecord) and record.name == "result" and not keep_result:
+            continue
+        else:
+            contents.add(raw)
+            if isinstance(record, MetadataRecord) and record.name == "config":
+                indexed = asks_for_indexes(record.entries)
+        contents.end = raw.end
     raise RecordingError(f"the file ends at {contents.size}, in the middle of the data")
 
 
-def _checked_chunk(body: bytes, at: int) -> ReadChunk:
-    """Return a chunk whose times are those of its messages."""
-    chunk = read_chunk(body, at)
-    found = chunk.summary.index.message_start_time, chunk.summary.index.message_end_time
+def _check_times(chunk: ReadChunk) -> None:
+    """Check that the times of a chunk are those of its messages."""
+    found = chunk.entry.start_time, chunk.entry.end_time
     expected = int(chunk.times[0]), int(chunk.times[-1])
     if found != expected:
         raise RecordingError(
-            f"chunk at {at}: found times {found[0]} to {found[1]}, expected {expected[0]} to {expected[1]}"
+            f"chunk at {chunk.offset}: found times {found[0]} to {found[1]}, "
+            f"expected {expected[0]} to {expected[1]}"
         )
-    return chunk._replace(body=b"")  # memory that is free for the next record makes a survey a third quicker
 
 
-def _take_index(contents: Contents, chunk: ReadChunk, opcode: int, at: int, body: bytes) -> None:
-    """Compare a message index with the chunk before it, and note both."""
-    index = chunk.summary.index
-    if opcode != Opcode.MESSAGE_INDEX:
-        raise RecordingError(f"chunk at {index.chunk_start_offset}: has no message index")
-    if message_index(chunk.summary.channel, chunk.times, chunk.offsets)[RECORD_HEAD.size :] != body:
-        raise RecordingError(f"the message index at {at} does not lead to the chunk's messages")
-    index.message_index_offsets[chunk.summary.channel] = at
-    index.message_index_length = RECORD_HEAD.size + len(body)
-    if not contents.chunks or contents.chunks[-1] is not chunk.summary:
-        contents.chunks.append(chunk.summary)
+def _with_index(chunk: ReadChunk, raw: RawRecord) -> ChunkEntry:
+    """Return the entry of a chunk after comparing the message index that follows it."""
+    if not raw.is_message_index:
+        raise RecordingError(f"chunk at {chunk.offset}: has no message index")
+    expected = message_index(chunk.entry.channel, chunk.times, chunk.offsets)
+    if expected[RECORD_HEAD.size :] != raw.body:
+        raise RecordingError(f"the message index at {raw.offset} does not lead to the chunk's messages")
+    return chunk.entry._replace(index_length=len(expected))
 
 
-def _note(entries: list[N], entry: N) -> None:
-    if len(entries) == MAX_NAMED or len(entry.name) > MAX_NAME_BYTES:
-        raise RecordingError(f"found a record too many or with too long a name at {entry.offset}")
-    entries.append(entry)
-
-
-def _tails(path: Path, contents: Contents) -> tuple[bytes, bytes]:
+def _tails(path: Path, contents: Index) -> tuple[bytes, bytes]:
     """Return what follows the data of a recording, and what should follow it."""
-    with _reading(path) as stream, RecordingFile.inspect(path, contents) as file:
-        expected = file.tail()
+    with _reading(path) as stream:
+        expected = contents.tail(contents.topics, checksum(stream, 0, contents.end))
         stream.seek(contents.end)
         return stream.read(len(expected) + 1), expected
 
 
-def _ends_torn(stream: BinaryIO, contents: Contents) -> bool:
+def _ends_torn(stream: BinaryIO, contents: Index) -> bool:
     """Return whether a file ends with a record that was not written to its end, or with nothing but zeros.
 
     Before it may stand a good chunk without its index, which is written again.
@@ -285,16 +242,16 @@ def _ends_torn(stream: BinaryIO, contents: Contents) -> bool:
         head = stream.read(RECORD_HEAD.size)
         if len(head) < RECORD_HEAD.size:
             return True
-        opcode, length = RECORD_HEAD.unpack(head)
-        if offset + RECORD_HEAD.size + length > contents.size and 0 < opcode <= Opcode.DATA_END:
-            return bool(length <= MAX_CHUNK_BYTES)
+        raw = RawRecord.of(head, offset)
+        if raw.end > contents.size and raw.is_known:
+            return raw.length <= MAX_CHUNK_BYTES
         try:
-            if opcode != Opcode.CHUNK:
+            if not raw.is_chunk:
                 raise RecordingError("no chunk")
-            read_chunk(stream.read(length), offset)
-        except (RecordingError, *UNREADABLE):
+            read_record(raw._replace(body=stream.read(raw.length)))
+        except RecordingError:
             return _only_zeros(stream, offset)
-        offset += RECORD_HEAD.size + length
+        offset = raw.end
     return False
 
 

@@ -264,7 +264,7 @@ class Pipeline:
 
 def _rank(chunk: Chunk) -> int:
     """Return the rank of a chunk in its group: if only a part of it is written, steps have their resets."""
-    message = TOPIC_OF[chunk.summary.channel].message
+    message = TOPIC_OF[chunk.entry.channel].message
     return 0 if message in (RESET, RESET_STATE) else 1 if message in (*STEP_MESSAGES, ACTIONS) else 2
 
 

@@ -10,15 +10,20 @@ from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
-from typing import BinaryIO, Final
-
-from mcap.opcode import Opcode
+from typing import BinaryIO, Final, TypeVar
 
 from runner.errors import RecordingError
 from runner.recording.blocks import RECORD_HEAD
-from runner.recording.chunks import MAX_CHUNK_BYTES, first_channel, unpack_chunk
-from runner.recording.index import ChunkEntry
-from runner.recording.records import MAX_METADATA_BYTES, UNREADABLE, attachment_of, metadata_of
+from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry, first_channel, unpack_chunk
+from runner.recording.records import (
+    MAX_METADATA_BYTES,
+    AttachmentRecord,
+    MetadataRecord,
+    RawRecord,
+    read_record,
+)
+
+N = TypeVar("N", MetadataRecord, AttachmentRecord)
 
 _MAX_CACHED_BYTES: Final = 16 << 20
 _THREADS: Final = 2
@@ -47,45 +52,13 @@ class RecordStore:
             self._threads.shutdown(cancel_futures=True)
         self._stream.close()
 
-    def record(self, opcode: int, offset: int, length: int, max_bytes: int = MAX_CHUNK_BYTES) -> memoryview:
-        """Return the body of a record; its length includes the head.
-
-        Raises:
-            RecordingError: it is of another kind, cut off, larger than `max_bytes`, or cannot be read.
-        """
-        if length > max_bytes:
-            raise RecordingError(
-                f"{self._path}: the record at {offset} declares {length:,} bytes, "
-                f"expected at most {max_bytes:,}."
-            )
-        try:
-            with self._lock:
-                self._stream.seek(offset)
-                data = self._stream.read(length)
-        except OSError as error:
-            raise RecordingError(f"{self._path}: cannot be read at {offset} ({error.strerror}).") from error
-        if len(data) != length:
-            raise RecordingError(f"{self._path}: the record at {offset} is cut off.")
-        if RECORD_HEAD.unpack_from(data) != (opcode, length - RECORD_HEAD.size):
-            raise RecordingError(f"{self._path}: found another record at {offset} than the index says.")
-        return memoryview(data)[RECORD_HEAD.size :]
-
     def metadata(self, name: str, offset: int, length: int) -> dict[str, str]:
         """Return the entries of a metadata record.
 
         Raises:
             RecordingError: it cannot be read, or has another name.
         """
-        try:
-            body = bytes(self.record(Opcode.METADATA, offset, length, MAX_METADATA_BYTES))
-            found, entries = metadata_of(body)
-        except UNREADABLE as error:
-            raise RecordingError(
-                f"{self._path}: the metadata {name!r} at {offset} cannot be read."
-            ) from error
-        if found != name:
-            raise RecordingError(f"{self._path}: found metadata {found!r} at {offset}, expected {name!r}.")
-        return entries
+        return self._named(MetadataRecord, "metadata", name, offset, length, MAX_METADATA_BYTES).entries
 
     def attachment(self, name: str, offset: int, length: int) -> tuple[str, bytes]:
         """Return an attachment's media type and data, after comparing its checksum.
@@ -93,16 +66,19 @@ class RecordStore:
         Raises:
             RecordingError: it cannot be read, is damaged, or has another name.
         """
-        body = bytes(self.record(Opcode.ATTACHMENT, offset, length))
-        try:
-            found, media_type, data = attachment_of(body, offset)
-        except UNREADABLE as error:
-            raise RecordingError(f"{self._path}: the attachment at {offset} cannot be read.") from error
-        except RecordingError as error:
-            raise RecordingError(f"{self._path}: {error}.") from error
-        if found != name:
-            raise RecordingError(f"{self._path}: found attachment {found!r} at {offset}, expected {name!r}.")
-        return media_type, data
+        record = self._named(AttachmentRecord, "attachment", name, offset, length)
+        return record.media_type, record.data
+
+    def chunk_body(self, entry: ChunkEntry) -> memoryview:
+        """Return the body of a chunk's record, still packed.
+
+        Raises:
+            RecordingError: there is no chunk, or it cannot be read.
+        """
+        raw = self._raw(entry.offset, entry.length)
+        if not raw.is_chunk:
+            raise self._another(raw)
+        return memoryview(raw.body)
 
     def chunk(self, entry: ChunkEntry) -> bytes:
         """Return a chunk's message records, after comparing its checksum; the last few are cached."""
@@ -125,7 +101,7 @@ class RecordStore:
 
     def first_channel(self, entry: ChunkEntry) -> int:
         """Return the channel of a chunk's first message, where no index states it."""
-        return first_channel(self.record(Opcode.CHUNK, entry.offset, entry.length), self._where(entry))
+        return first_channel(self.chunk_body(entry), self._where(entry))
 
     @cached_property
     def _threads(self) -> ThreadPoolExecutor:
@@ -144,7 +120,7 @@ class RecordStore:
 
     def _unpacked(self, entry: ChunkEntry) -> bytes:
         where = self._where(entry)
-        body = self.record(Opcode.CHUNK, entry.offset, entry.length)
+        body = self.chunk_body(entry)
         try:
             head, records = unpack_chunk(body, where)
         except RecordingError as error:
@@ -157,3 +133,42 @@ class RecordStore:
 
     def _where(self, entry: ChunkEntry) -> str:
         return f"{self._path}: chunk at {entry.offset}"
+
+    def _named(
+        self, kind: type[N], what: str, name: str, offset: int, length: int, max_bytes: int = MAX_CHUNK_BYTES
+    ) -> N:
+        raw = self._raw(offset, length, max_bytes)
+        try:
+            record = read_record(raw)
+        except RecordingError as error:
+            raise RecordingError(f"{self._path}: {error}.") from error
+        if not isinstance(record, kind):
+            raise self._another(raw)
+        if record.name != name:
+            raise RecordingError(
+                f"{self._path}: found {what} {record.name!r} at {offset}, expected {name!r}."
+            )
+        return record
+
+    def _raw(self, offset: int, length: int, max_bytes: int = MAX_CHUNK_BYTES) -> RawRecord:
+        """Return a record whose length, with its head, is known."""
+        if length > max_bytes:
+            raise RecordingError(
+                f"{self._path}: the record at {offset} declares {length:,} bytes, "
+                f"expected at most {max_bytes:,}."
+            )
+        try:
+            with self._lock:
+                self._stream.seek(offset)
+                head, body = self._stream.read(RECORD_HEAD.size), self._stream.read(length - RECORD_HEAD.size)
+        except OSError as error:
+            raise RecordingError(f"{self._path}: cannot be read at {offset} ({error.strerror}).") from error
+        if len(head) + len(body) != length:
+            raise RecordingError(f"{self._path}: the record at {offset} is cut off.")
+        raw = RawRecord.of(head, offset, body)
+        if raw.length != len(body):
+            raise self._another(raw)
+        return raw
+
+    def _another(self, raw: RawRecord) -> RecordingError:
+        return RecordingError(f"{self._path}: found another record at {raw.offset} than the index says.")

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 import numpy as np
-from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import RecordingError, StorageError
@@ -30,9 +29,8 @@ from runner.recording.messages import decode
 from runner.recording.metadata import REQUIRED_RECORDS, check_run, dtypes_of, json_object, kind_of
 from runner.recording.reader import open_recording
 from runner.recording.records import (
-    IN_DATA,
-    UNREADABLE,
     MetadataRecord,
+    RawRecord,
     ReadChunk,
     Record,
     Report,
@@ -219,7 +217,7 @@ class _Salvage:
     def _take_chunk(self, file: RecordingFile, chunk: ReadChunk) -> None:
         """Copy a good chunk; note a hole before it."""
         where = f"{self._path}: chunk at {chunk.offset}"
-        topic, count = chunk.topic, chunk.summary.messages
+        topic, count = chunk.topic, len(chunk.times)
         if topic not in self._topics:
             raise RecordingError(f"{where}: found messages of another kind of run.")
         expected = self._next[topic]
@@ -339,39 +337,38 @@ class DamagedFile:
         offset = len(MCAP0_MAGIC)
         while offset + RECORD_HEAD.size <= self.size:
             report(offset, self.size)
-            opcode, length = RECORD_HEAD.unpack(self._read(offset, RECORD_HEAD.size))
-            if (opcode, length) == (Opcode.DATA_END, 4):
+            raw = RawRecord.of(self._read(offset, RECORD_HEAD.size), offset)
+            if raw.ends_data:
                 return
-            is_good, record = self._good_record(opcode, length, offset)
-            if is_good:
-                if record is not None:
+            if (record := self._good_record(raw)) is not None:
+                if not isinstance(record, RawRecord):
                     yield record
-                offset += RECORD_HEAD.size + length
+                offset = raw.end
                 continue
             next_chunk = self._next_chunk(offset + 1)
-            if opcode == Opcode.CHUNK and next_chunk == self.size:
+            if raw.is_chunk and next_chunk == self.size:
                 self.torn_chunk = self._read(offset + RECORD_HEAD.size, _LIKE_BYTES)
             self.lost_bytes += next_chunk - offset
             offset = next_chunk
         self.lost_bytes += max(self.size - offset, 0)
 
-    def _good_record(self, opcode: int, length: int, offset: int) -> tuple[bool, Record | None]:
-        """Return whether the record at an offset is undamaged, and what a copy takes of it."""
-        start = offset + RECORD_HEAD.size
-        if opcode not in IN_DATA or length > min(self.size - start, MAX_CHUNK_BYTES):
-            return False, None
+    def _good_record(self, raw: RawRecord) -> Record | RawRecord | None:
+        """Return a record read and checked; None if it is damaged."""
+        start = raw.end - raw.length
+        if not raw.is_data or raw.length > min(self.size - start, MAX_CHUNK_BYTES):
+            return None
         try:
-            if opcode == Opcode.CHUNK:
-                chunk_head(self._read(start, min(length, _LIKE_BYTES)), length, "")
-            return True, read_record(opcode, offset, self._read(start, length))
-        except (RecordingError, *UNREADABLE):
-            self._allowance -= length
+            if raw.is_chunk:
+                chunk_head(self._read(start, min(raw.length, _LIKE_BYTES)), raw.length, "")
+            return read_record(raw._replace(body=self._read(start, raw.length)))
+        except RecordingError:
+            self._allowance -= raw.length
             if self._allowance < 0:
                 raise RecordingError(
-                    f"{self._path}: too much of it only looks like chunks, last at {offset}: "
+                    f"{self._path}: too much of it only looks like chunks, last at {raw.offset}: "
                     "it was made to exhaust its readers."
                 ) from None
-            return False, None
+            return None
 
     def _next_chunk(self, offset: int) -> int:
         """Return the offset of the next good chunk, or the end of the file."""
@@ -379,8 +376,8 @@ class DamagedFile:
             piece = self._read(offset, _PIECE + _LIKE_BYTES)
             for like in _LIKE_A_CHUNK.finditer(piece, 0, len(piece)):
                 at = offset + like.start()
-                _, length = RECORD_HEAD.unpack_from(piece, like.start())
-                if like.start() < _PIECE and self._good_record(Opcode.CHUNK, length, at)[0]:
+                raw = RawRecord.of(piece[like.start() : like.start() + RECORD_HEAD.size], at)
+                if like.start() < _PIECE and self._good_record(raw) is not None:
                     return at
             offset += _PIECE
         return self.size

@@ -11,8 +11,7 @@ from typing import Self
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.chunks import chunk_head, decompress
-from runner.recording.index import ChunkEntry
+from runner.recording.chunks import ChunkEntry, chunk_head, decompress
 from runner.recording.reader import Recording
 from runner.recording.schema import Topic
 from runner.recording.topic_chunks import ChunkSpan

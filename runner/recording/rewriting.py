@@ -11,8 +11,8 @@ from runner.recording.digest import ContentHash, combined_digest
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
 from runner.recording.records import (
-    UNREADABLE,
     MetadataRecord,
+    RawRecord,
     ReadChunk,
     Record,
     read_record,
@@ -132,8 +132,8 @@ def whole_records(path: Path) -> Iterator[Record]:
         check_integrity(path)
     try:
         with open_regular(path) as stream:
-            for opcode, offset, body in walk(stream, path.stat().st_size):
-                if (record := read_record(opcode, offset, body)) is not None:
+            for raw in walk(stream, path.stat().st_size):
+                if not isinstance(record := read_record(raw), RawRecord):
                     yield record
-    except UNREADABLE as error:
-        raise RecordingError(f"{path}: a record of it cannot be read; `dualtaxi repair` mends it.") from error
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}; `dualtaxi repair` mends it.") from error

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
-from runner.recording.chunks import MAX_CHUNK_BYTES
-from runner.recording.index import ChunkEntry, ChunkTable, Index
+from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry
+from runner.recording.index import ChunkTable, Index
 from runner.recording.messages import Message, decode
 from runner.recording.record_store import RecordStore
 from runner.recording.schema import ALL_TOPICS, EXTRA_TOPICS, STEP_NANOSECONDS, Topic

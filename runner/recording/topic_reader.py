@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Final, Self
 
 import numpy as np
-from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording.chunks import MAX_CHUNK_BYTES
+from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry
 from runner.recording.description import RunDescription
-from runner.recording.index import ChunkEntry, read_index
+from runner.recording.index import read_index
 from runner.recording.messages import Message, Scalars, decode_scalars
 from runner.recording.metadata import check_file, dtypes_of
 from runner.recording.record_store import RecordStore
@@ -163,7 +162,7 @@ class TopicReader(RunDescription):
         Raises:
             RecordingError: there is no such chunk.
         """
-        return self._store.record(Opcode.CHUNK, entry.offset, entry.length)
+        return self._store.chunk_body(entry)
 
     def messages(self, topic: Topic, first_chunk: int = 0) -> Iterator[tuple[int, bytes]]:
         """Yield (log time in nanoseconds, payload) of a topic's messages, in order."""

@@ -306,7 +306,7 @@ def _cut(path: Path, topic: schema.Topic, chunks: int) -> Path:
     copy.parent.mkdir()
     shutil.copy(path, copy)
     own = [chunk for chunk in survey(path).chunks if chunk.channel == topic.channel]
-    last = own[chunks - 1].index
+    last = own[chunks - 1]
     with copy.open("r+b") as file:
-        file.truncate(last.chunk_start_offset + last.chunk_length)
+        file.truncate(last.offset + last.length)
     return copy

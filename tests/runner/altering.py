@@ -33,14 +33,14 @@ def altered(source: Path, target: Path, topic: Topic | None, change: Change, **m
     """
     with open_recording(source) as recording, RecordingFile(target, recording.topics) as file:
         contents = survey(source, keep_result=True)
-        names = [entry.name for entry in contents.metadata]
+        names = list(contents.metadata)
         entries = {name: recording.metadata(name) for name in names}
         entries |= {name: turn(entries[name]) for name, turn in metadata.items()}
         for name in names:
             if name != "result":
                 file.add_metadata(name, entries[name])
-        for entry in contents.attachments:
-            file.add_attachment(entry.name, entry.media_type, recording.attachment(entry.name))
+        for name, media_type, data in recording.attachments():
+            file.add_attachment(name, media_type, data)
         for one in recording.topics:
             turn = change if one is topic else lambda messages: messages
             _write(file, one, *_records(recording, one, turn))
@@ -56,7 +56,7 @@ def without_chunk(path: Path, topic: Topic, number: int) -> int:
     """
     chunks = [part for part in survey(path).chunks if part.channel == topic.channel]
     data = bytearray(path.read_bytes())
-    data[chunks[number].index.chunk_start_offset + 150] ^= 1
+    data[chunks[number].offset + 150] ^= 1
     path.write_bytes(data)
     repair(path)
     return chunks[number].messages

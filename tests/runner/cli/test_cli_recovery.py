@@ -47,9 +47,9 @@ def _aged(run: Run) -> Run:
 
 def flip(path: Path) -> None:
     """Invert a byte in the first chunk of training steps."""
-    index = next(one.index for one in survey(path).chunks if one.channel == schema.TRAIN_STEP.channel)
+    chunk = next(one for one in survey(path).chunks if one.channel == schema.TRAIN_STEP.channel)
     data = bytearray(path.read_bytes())
-    data[index.chunk_start_offset + index.chunk_length // 2] ^= 1
+    data[chunk.offset + chunk.length // 2] ^= 1
     path.write_bytes(data)
 
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from mcap.opcode import Opcode
 
 import runner
 from runner.execution.branching import branch_training
@@ -64,10 +63,10 @@ def packed_steps(run):
     """Return place, body and times of a recording's chunks of training steps, by their message indexes."""
     found = []
     with run.recording.open("rb") as stream:
-        for opcode, offset, body in walk(stream, run.recording.stat().st_size):
-            if opcode == Opcode.CHUNK:
-                last = (offset, body, CHUNK_HEAD.unpack_from(body)[:2])
-            elif opcode == Opcode.MESSAGE_INDEX and body[0] == schema.TRAIN_STEP.channel:
+        for raw in walk(stream, run.recording.stat().st_size):
+            if raw.is_chunk:
+                last = (raw.offset, raw.body, CHUNK_HEAD.unpack_from(raw.body)[:2])
+            elif raw.is_message_index and raw.body[0] == schema.TRAIN_STEP.channel:
                 found.append(last)
     return found
 

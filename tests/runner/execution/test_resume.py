@@ -142,9 +142,9 @@ def test_a_stop_while_it_catches_up_loses_nothing(whole, tmp_path):
 def damage(run: Run, share: float) -> None:
     """Turn a byte around in one of the chunks of training steps."""
     parts = [part for part in survey(run.recording).chunks if part.channel == TRAIN_STEP.channel]
-    index = parts[int(share * len(parts))].index
+    chunk = parts[int(share * len(parts))]
     data = bytearray(run.recording.read_bytes())
-    data[index.chunk_start_offset + index.chunk_length - 99] ^= 0x55
+    data[chunk.offset + chunk.length - 99] ^= 0x55
     run.recording.write_bytes(data)
 
 
@@ -266,7 +266,7 @@ def test_after_a_full_disk(whole, tmp_path, monkeypatch, room):
         if file.size + len(data) > room:
             write(file, data[: max(room - file.size, 0)])
             raise OSError(errno.ENOSPC, "No space left on device")
-        write(file, data)
+        return write(file, data)
 
     with monkeypatch.context() as patch:
         patch.setattr(RecordingFile, "_append", filling)

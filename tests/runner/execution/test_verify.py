@@ -193,7 +193,7 @@ def test_cut_off(run, tmp_path):
 
 def test_a_recording_that_was_cut_off_before_its_first_messages_is_not_wrong(run, tmp_path):
     data = run.recording.read_bytes()
-    first = survey(run.recording).chunks[0].index.chunk_start_offset
+    first = survey(run.recording).chunks[0].offset
     for end in (first, first - 1, first + 1, first + 100):
         (tmp_path / "cut.mcap").write_bytes(data[:end])
         found = verify(tmp_path / "cut.mcap")
@@ -248,12 +248,12 @@ def test_damage_is_placed(run, tmp_path):
     path = tmp_path / "x.mcap"
     chunks = [part for part in survey(run.recording).chunks if part.channel == schema.TRAIN_STEP.channel]
     data = bytearray(run.recording.read_bytes())
-    data[chunks[2].index.chunk_start_offset + 200] ^= 1
+    data[chunks[2].offset + 200] ^= 1
     path.write_bytes(data)
     found = verify(path)
     assert not found.sound
     first = sum(part.messages for part in chunks[:2])
-    assert f"chunk at {chunks[2].index.chunk_start_offset}" in found.finding
+    assert f"chunk at {chunks[2].offset}" in found.finding
     assert f"/train/step: step {first} is the first that cannot be read" in found.finding
     assert repair(path).lost == {"/train/step": [[first, first + chunks[2].messages]]}
     found = verify(path)

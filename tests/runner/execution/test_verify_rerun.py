@@ -11,7 +11,7 @@ from runner.execution.verify import verify
 from runner.recording.chunks import encode_chunk
 from runner.recording.integrity import survey
 from runner.recording.reader import open_recording
-from runner.recording.records import read_chunk
+from runner.recording.records import RawRecord, read_record
 from runner.recording.writer import RecordingFile
 from runner.runs import provenance
 from runner.util.packing import Packing
@@ -59,8 +59,8 @@ def described_as(source, target, change):
                 continue
             file.add_attachment(name, media_type, data)
         for entry in survey(source).chunks:
-            body = source.read_bytes()[entry.index.chunk_start_offset + 9 :][: entry.index.chunk_length - 9]
-            chunk = read_chunk(body, entry.index.chunk_start_offset)
+            data = source.read_bytes()[entry.offset :][: entry.length]
+            chunk = read_record(RawRecord.of(data, entry.offset, data[9:]))
             file.add_chunk(encode_chunk(chunk.topic, chunk.records, chunk.times, chunk.offsets, Packing()))
         file.finish("result", recording.metadata("result"))
     return target

@@ -306,7 +306,7 @@ def test_recordings_with_message_indexes_of_extras_are_read_as_those_without(tmp
     with RecordingFile(earlier, schema.KINDS["transition"]) as file:
         for record in whole_records(run.recording):
             if isinstance(record, ReadChunk):
-                index = message_index(record.summary.channel, record.times, record.offsets)
+                index = message_index(record.entry.channel, record.times, record.offsets)
                 file.add_chunk(replace(copied_chunk(record, indexed=True), index=index))
             elif record[0] != "result":
                 file.copy(record)

@@ -58,8 +58,10 @@ def test_a_piece_is_read_from_its_own_chunks_alone(taxis, monkeypatch):
     with open_recording(taxis.recording) as recording:
         recording.count(schema.TRAIN_STEP)
         read = []
-        original = RecordStore.record
-        monkeypatch.setattr(RecordStore, "record", lambda self, *at: read.append(at) or original(self, *at))
+        original = RecordStore.chunk_body
+        monkeypatch.setattr(
+            RecordStore, "chunk_body", lambda self, *at: read.append(at) or original(self, *at)
+        )
         assert len(list(recording.blocks(schema.TRAIN_STEP, 1000, 1010))) == 1
         assert len(read) == 1
 
