@@ -84,6 +84,7 @@ class Parser(ABC, Generic[Part]):
 
     def __init__(self, text: str) -> None:
         self.text = re.sub(r"\s", " ", text).strip()
+        self._data = self.text.encode(errors="replace")  # the parser counts bytes
         if len(self.text) > self.max_length:
             raise RunnerError(
                 f"{self.what}: found {len(self.text):,} characters, expected {self.max_length:,} at most."
@@ -138,7 +139,7 @@ class Parser(ABC, Generic[Part]):
 
     def error(self, node: ast.expr, message: str) -> RunnerError:
         """Return the error that marks a node in the expression."""
-        start = len(self.text.encode()[: node.col_offset].decode())  # the parser counts bytes
+        start = len(self._data[: node.col_offset].decode())
         return self.marked(start, len(self.text_of(node)), message)
 
     def marked(self, start: int, length: int, message: str) -> RunnerError:
@@ -149,7 +150,7 @@ class Parser(ABC, Generic[Part]):
 
     def text_of(self, node: ast.expr) -> str:
         """Return a node's own text."""
-        return ast.get_source_segment(self.text, node) or ""
+        return self._data[node.col_offset : node.end_col_offset].decode()
 
     # --- terms ------------------------------------------------------------------------------------------
 
