@@ -64,11 +64,10 @@ def round_trip(*overrides: str) -> RoundTrip:
 
 
 def _steps(recording: Path) -> int:
-    from runner.recording import schema
     from runner.recording.reader import open_recording
 
     with open_recording(recording) as opened:
-        return opened.count(schema.TRAIN_STEP) + opened.count(schema.EVAL_STEP)
+        return opened.train.steps.count() + opened.eval.steps.count()
 
 
 def _size(files: list[Path]) -> int:

@@ -101,7 +101,7 @@ def logged_rate(recording: Path, path: Path) -> float:
     from runner.export.rerun.tracks import new_stream
 
     with open_recording(recording) as opened:
-        steps = next(opened.blocks(schema.TRAIN_STEP))[:LOGGED_STEPS]
+        steps = next(opened.train.steps.blocks())[:LOGGED_STEPS]
     points, vectors = np.ones((36, 2), np.float32), np.ones((2, 2), np.float32)
     strips, bars = np.ones((2, 6, 2), np.float32), np.ones((12, 2, 2), np.float32)
     stream = new_stream("logged")

@@ -69,7 +69,7 @@ def read_all(path: Path) -> int:
     steps, total = 0, 0.0
     with open_recording(path) as recording:
         for topic in STEP_TOPICS:
-            for block in recording.blocks(topic):
+            for block in recording.table(topic).blocks():
                 steps += len(block)
                 for name in FIELDS:
                     total += block[name].sum()
@@ -92,4 +92,4 @@ def read_officially(path: Path, steps: int) -> None:
 def read_episode(path: Path) -> None:
     """Open the recording and read one episode in its middle."""
     with open_recording(path) as recording:
-        recording.episode_steps("train", recording.count(schema.TRAIN_EPISODE) // 2)
+        recording.train.episode_steps(recording.train.episodes.count() // 2)

@@ -11,7 +11,6 @@ from benchmarks.bench_reader import tutorial
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.processes import run, run_command
 from runner.execution.verify import verify
-from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
 
@@ -29,7 +28,7 @@ def measure(quick: bool) -> list[Figure]:
         path = tutorial(folder)
         table_at(path, 1)  # compiles
         with open_recording(path) as recording:
-            steps = recording.count(schema.TRAIN_STEP)
+            steps = recording.train.steps.count()
         tables = [seconds(lambda: table_at(path, rng.randrange(steps))) for _ in range(3 * repetitions)]
         verified = [seconds(lambda: sound(path)) for _ in range(repetitions)]
         memory = [peak(READ, path), peak(VERIFY, path)]

@@ -9,7 +9,6 @@ import pytest
 from runner.config import load
 from runner.config.job import jobs_of
 from runner.execution.session import run_job
-from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
 from runner.runs.run import create_run
@@ -27,9 +26,9 @@ def test_a_shipped_experiment_runs(path, tmp_path):
     check_integrity(run.recording)
     with open_recording(run.recording) as recording:
         assert recording.finished
-        assert recording.count(schema.TRAIN_EPISODE) == 30
-        assert recording.count(schema.EVAL_EPISODE) == 9
-        assert recording.count(schema.TRAIN_STEP) >= 30
+        assert recording.train.episodes.count() == 30
+        assert recording.eval.episodes.count() == 9
+        assert recording.train.steps.count() >= 30
         assert {table.episode for table in recording.snapshots()} >= {0, 30}
 
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from runner.errors import RecordingError, RunnerError, nearest
 from runner.recording.clock import read_clock
 from runner.recording.reader import Recording
-from runner.recording.schema import STEP_NANOSECONDS, TRAIN_EPISODE
+from runner.recording.schema import STEP_NANOSECONDS
 
 Values = NDArray[np.float64]
 Place = TypeVar("Place", int, float)
@@ -168,7 +168,7 @@ def _times(recording: Recording) -> tuple[Values, Values]:
         return clock.positions.astype(np.float64), clock.seconds
     stride = max(1, math.ceil(done["episodes"] / _MAX_KNOWN))
     steps, values = [np.zeros(1)], [np.zeros(1)]
-    for block in recording.blocks(TRAIN_EPISODE):
+    for block in recording.train.episodes.blocks():
         sampled = block[block["episode"] % stride == 0]
         steps.append(sampled["last_step"] + 1.0)
         values.append(clock.seconds_at((sampled["log_time"] // STEP_NANOSECONDS).astype(np.int64)))

@@ -148,10 +148,10 @@ def evaluations_of(recording: Recording) -> list[Evaluation]:
             for metrics in recording.metrics("eval")
         ]
     trained, tested = (
-        np.concatenate([np.empty(0, np.uint64), *(block["log_time"] for block in recording.blocks(topic))])
-        for topic in (schema.TRAIN_EPISODE, schema.EVAL_EPISODE)
+        np.concatenate([np.empty(0, np.uint64), *(block["log_time"] for block in phase.episodes.blocks())])
+        for phase in recording.phases
     )
-    ends = [block["last_step"].astype(np.int64) + 1 for block in recording.blocks(schema.TRAIN_EPISODE)]
+    ends = [block["last_step"].astype(np.int64) + 1 for block in recording.train.episodes.blocks()]
     steps = np.concatenate([np.zeros(1, np.int64), *ends])
     episodes = np.searchsorted(trained, tested)
     distinct = np.unique(episodes, return_index=True, return_counts=True)
@@ -184,7 +184,7 @@ def evaluation_records(recording: Recording) -> list[EvaluationRecord]:
     agents, events = recording.agents, recording.event_names
     if recording.has_reports:
         return [evaluation_record(metrics, agents, events) for metrics in recording.metrics("eval")]
-    trials = recording.episodes("eval")
+    trials = recording.eval.episodes.array()
     return [_loop_record(recording, one, trials[one.start : one.stop]) for one in evaluations_of(recording)]
 
 
@@ -261,12 +261,12 @@ def loop_summary(recording: Recording) -> Summary:
     """
     evaluations, last = evaluations_of(recording), None
     if evaluations:
-        trials = recording.episodes("eval", evaluations[-1].start, evaluations[-1].stop)
+        trials = recording.eval.episodes.array(evaluations[-1].start, evaluations[-1].stop)
         last = _loop_record(recording, evaluations[-1], trials).summary()
     logged = (
         recording.result.logged
         if "logged" in recording.result
-        else {one["name"]: finite(one["value"]) for one in recording.decoded(schema.SCALAR_TOPIC)}
+        else {one["name"]: finite(one["value"]) for one in recording.table(schema.SCALAR_TOPIC).decoded()}
     )
     return Summary(last_evaluation=last, recent_training=recording.recent_training(), logged=logged)
 

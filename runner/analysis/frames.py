@@ -169,7 +169,7 @@ def episode_columns(
     recording: Recording, phase: Phase = "train", start: int = 0, stop: int | None = None
 ) -> dict[str, Array]:
     """Return the columns of `episodes`, an array each."""
-    records = recording.episodes(phase, start, stop)
+    records = recording.phase(phase).episodes.array(start, stop)
     columns = _plain_columns(records, ("episode", "length", "penalties", "success"))
     columns |= _plain_columns(records, ("terminated", "truncated", "last_step"))
     columns |= _by_name(records["returns"], [f"return.{agent}" for agent in recording.agents])
@@ -180,7 +180,7 @@ def logged_columns(recording: Recording) -> dict[str, Sequence[object]]:
     """Return the columns of `logged`, a list each."""
     names = ("phase", "step", "episode", "name", "value")
     columns: dict[str, list[object]] = {name: [] for name in names}
-    for scalar in recording.decoded(SCALAR_TOPIC):
+    for scalar in recording.table(SCALAR_TOPIC).decoded():
         for name in names:
             columns[name].append(scalar[name])
     return dict(columns)
@@ -203,7 +203,7 @@ def step_columns(
     if steps.dtype is None:
         raise RecordingError(
             f"{recording.path}: its observations vary in size, so its steps are no columns; "
-            "`Recording.transitions` reads them one by one."
+            "`recording.train.transitions()` reads them one by one."
         )
     if episode is None:
         blocks = [block.copy() for block in steps.blocks(start, stop)]
@@ -214,7 +214,7 @@ def step_columns(
     columns = _spread(_plain_columns(records, [name for name in _BEFORE if name in names]))
     columns |= _by_name(records["rewards"], [f"reward.{agent}" for agent in recording.agents])
     columns |= _plain_columns(records, [name for name in _AFTER if name in names])
-    extras = recording.extras(phase).at(records["step"])
+    extras = recording.phase(phase).extras.at(records["step"])
     return columns | {f"extra.{name}": filled(values) for name, values in extras.items()}
 
 

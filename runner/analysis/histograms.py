@@ -19,7 +19,7 @@ from runner.analysis.axes import EPISODES, Axis, Positions, edges_of, positions
 from runner.environments.naming import numbered_actions, spoken
 from runner.recording.metrics import is_usable
 from runner.recording.reader import Recording
-from runner.recording.schema import RESET_ONLY, TRAIN_EPISODE
+from runner.recording.schema import RESET_ONLY
 from runner.recording.spaces import decode
 from runner.util.arrays import Array
 
@@ -169,7 +169,7 @@ def _episodes(
     columns.setdefault(("length", ""), _Column("length", "", "steps", _number))
     for line in lines:
         columns.setdefault(("return", line), _Column("return", line, "summed reward", _number))
-    for block in recording.blocks(TRAIN_EPISODE):
+    for block in recording.train.episodes.blocks():
         own = {("return", line): block["returns"][:, i].astype(np.float64) for i, line in enumerate(lines)}
         at = places.at(block["episode"] + 1, block["last_step"] + 1)
         yield at, {("length", ""): block["length"].astype(np.float64), **own}
@@ -179,12 +179,12 @@ def _steps(
     recording: Recording, places: Positions, columns: dict[tuple[str, str], _Column], notes: list[str]
 ) -> Iterator[Block]:
     lines = recording.agents[:_MAX_PARTS] if len(recording.agents) > 1 else [""]
-    if recording.phase("train").steps:
+    if recording.train.steps:
         for line in lines:
             columns.setdefault(("reward", line), _Column("reward", line, "reward of a step", _number))
     else:
         notes.append("Rewards have no histogram, as no whole steps of training were recorded.")
-    for block in recording.rows(recording.phase("train").steps):
+    for block in recording.train.steps.rows():
         taken = block["t"] != RESET_ONLY
         values: dict[tuple[str, str], Values] = {}
         for part, own in _parts(recording, _uniform(recording, block["action"][taken]), notes).items():

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from runner.environments.naming import action_names, actions_in_words, numbered, state_of, states_in_words
 from runner.errors import NotInRecording, RunnerError
-from runner.recording import schema
 from runner.recording.messages import Snapshot
 from runner.recording.reader import Recording
 from runner.replay.history import history_of
@@ -118,7 +117,7 @@ def _describe_snapshots(
 ) -> tuple[TablesDescription, NDArray[np.float64]]:
     """Return the latest tables that a loop recorded, or those at a step."""
     arrays = list(recorded_tables(recording))
-    last = max([recording.count(schema.TRAIN_STEP), *(array.step for array in arrays)])
+    last = max([recording.train.steps.count(), *(array.step for array in arrays)])
     latest = {array.name: array for array in arrays if step is None or array.step <= step <= last}
     if not latest:
         raise NotInRecording(
@@ -138,9 +137,9 @@ def _describe_snapshots(
         number = numbered(str(state), list(map(str, states)), "a state", 1)
         stop = max(array.step for array in latest.values())
         taken = None
-        if recording.count(schema.TRAIN_STEP) >= stop:  # else steps are missing
+        if recording.train.steps.count() >= stop:  # else steps are missing
             counts = np.zeros(shape[1], np.int64)
-            for block in recording.blocks(schema.TRAIN_STEP, 0, stop):
+            for block in recording.train.steps.blocks(0, stop):
                 counts += np.bincount(block["action"][block["state"] == number], minlength=shape[1])
             taken = counts.tolist()
         names = recording.action_names("train") or tuple(map(str, range(shape[1])))

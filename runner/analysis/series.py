@@ -205,7 +205,7 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
     else:
         readings = [_single_agent_unnamed(evaluation_readings(each)) for each in evaluations]
         training, averaged = _loop_training(recording, places, names, room, not_finite)
-        is_unended = not recording.count(schema.TRAIN_EPISODE)
+        is_unended = not recording.train.episodes.count()
         if recording.status == "finished":
             recent, recent_episodes = _recent_training(recording)
         if left_out := sum(each.not_finite for each in evaluations):
@@ -349,7 +349,7 @@ def _mean_episodes(
     agents, bins = recording.agents, len(edges) - 1
     count, length = np.zeros(bins), np.zeros(bins)
     returns, usable_returns = np.zeros((bins, len(agents))), np.zeros((bins, len(agents)))
-    for block in recording.blocks(schema.TRAIN_EPISODE):
+    for block in recording.train.episodes.blocks():
         ends = places.at(block["episode"] + 1, block["last_step"] + 1)
         at = (np.searchsorted(edges, ends) - 1).clip(0, bins - 1)
         count += np.bincount(at, minlength=bins)
@@ -379,10 +379,10 @@ def _mean_episodes(
 
 def _unfinished_episodes(recording: Recording) -> Readings:
     """Return mean length and return of training episodes of which none ended; nothing without rewards."""
-    if not recording.count(schema.TRAIN_STEP) or recording.has_actions_alone("train"):
+    if not recording.train.steps.count() or recording.train.steps.are_actions:
         return {}
     agents, steps, total = recording.agents, 0, 0.0
-    for block in recording.rows(recording.phase("train").steps):
+    for block in recording.train.steps.rows():
         steps += len(block)
         total = total + block["rewards"].sum(axis=0, dtype=np.float64)
     returns = np.broadcast_to(total, len(agents)) / recording.environments
@@ -433,7 +433,7 @@ def _mean_scalars(
             own = rows[evaluated]
             steps[evaluated] = (own["log_time"] // schema.STEP_NANOSECONDS).astype(np.int64) - own["step"]
             moments, at = np.unique(steps[evaluated], return_inverse=True)
-            ended = [recording.phase("train").episodes.first_from("last_step", k) for k in moments.tolist()]
+            ended = [recording.train.episodes.first_from("last_step", k) for k in moments.tolist()]
             episodes[evaluated] = np.array(ended)[at]
         reached = places.at(episodes + 1, steps)
         stretches = np.searchsorted(ends, np.trunc(reached) if places.axis.whole else reached)

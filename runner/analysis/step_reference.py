@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Self
 
 from runner.errors import NotInRecording, RunnerError
-from runner.recording import schema
 from runner.replay.steps import step_of_episode
 
 if TYPE_CHECKING:
@@ -100,7 +99,7 @@ def parse_step(text: str, expected: str = _EXPECTED_ANY) -> int | StepRef:
 
 def training_steps(recording: Recording) -> int:
     """Return the number of training steps of a job, also if they were not recorded."""
-    ended = step_of_episode(recording, recording.count(schema.TRAIN_EPISODE))
+    ended = step_of_episode(recording, recording.train.episodes.count())
     return max(recording.done()["train_steps"], ended)
 
 
@@ -120,7 +119,7 @@ def training_step(recording: Recording, at: int | StepRef) -> int:
         return at
     if at.after is not None:
         raise RunnerError(f"found {at}, expected a step of training: {EXPECTED_OF_TRAINING}.")
-    ended = recording.count(schema.TRAIN_EPISODE)
+    ended = recording.train.episodes.count()
     start = step_of_episode(recording, min(at.episode, ended))
     stop = taken if at.episode >= ended else step_of_episode(recording, at.episode + 1)
     if at.episode > ended or start == stop:
@@ -137,5 +136,5 @@ def training_step(recording: Recording, at: int | StepRef) -> int:
 
 def reference_to(recording: Recording, step: int) -> StepRef:
     """Return the reference to a training step of a job, by its episode and its place in it."""
-    episode = recording.phase("train").episodes.first_from("last_step", step)
+    episode = recording.train.episodes.first_from("last_step", step)
     return StepRef(episode, step - step_of_episode(recording, episode))

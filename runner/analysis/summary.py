@@ -159,7 +159,7 @@ def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> Ru
 
 
 def _extras(recording: Recording) -> dict[str, RecordedExtras]:
-    extras = {phase: recording.extras(phase) for phase in schema.PHASES}
+    extras = {phase: recording.phase(phase).extras for phase in schema.PHASES}
     return {
         phase: RecordedExtras(own.count, {name: (kind.base.name, kind.shape) for name, kind in own.items()})
         for phase, own in extras.items()

@@ -78,7 +78,7 @@ class Batches:
 
     def messages(self, topic: Topic) -> Iterator[tuple[int, bytes]]:
         """Yield position and payload of a topic's messages."""
-        for time, payload in self._recording.messages(topic):
+        for time, payload in self._recording.table(topic).messages():
             position, rest = divmod(time, STEP_NANOSECONDS)
             if rest:
                 raise self._unarchivable(topic, f"at {time} ns")
@@ -118,7 +118,7 @@ def _merged(recording: Recording, topics: tuple[Topic, Topic]) -> Iterator[tuple
     heads = []
     for topic in topics:
         is_extra = topic.message is schema.EXTRA
-        blocks = recording.extras(topic.phase).blocks() if is_extra else recording.blocks(topic)
+        blocks = recording.phase(topic.phase).extras.blocks() if is_extra else recording.table(topic).blocks()
         if (block := next(blocks, None)) is not None:
             heads.append((topic, block, blocks))
     while len(heads) == 2:

@@ -122,7 +122,7 @@ class _ArchiveWriter:
         """Write all but the manifest."""
         self._write_descriptions()
         for table in self._batches.shape.tables:
-            if table.name in layout.LEFT_OUT_IF_EMPTY and not any(map(self._recording.count, table.topics)):
+            if table.name in layout.LEFT_OUT_IF_EMPTY and not any(map(self._recording.table, table.topics)):
                 continue
             with TableWriter(self._folder / table.name, table.columns) as writer:
                 if self._recording.can_train_again and table.name == layout.STEPS:

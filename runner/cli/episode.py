@@ -32,7 +32,7 @@ class Episode:
 
     def __init__(self, recording: Recording, choice: EpisodePlace, title: str) -> None:
         self._recording, self._phase, self._number = recording, choice.phase, choice.number
-        self._length = len(recording.episode_span(choice.phase, choice.number))
+        self._length = len(recording.phase(choice.phase).episode_span(choice.number))
         self._title = title
 
     def steps(self) -> Iterator[dict[str, object]]:

@@ -22,7 +22,6 @@ from runner.debugging.factors import Mixing
 from runner.environments.naming import spoken
 from runner.errors import RunnerError
 from runner.execution.session import run_job
-from runner.recording import schema
 from runner.recording.labels import Labels
 from runner.recording.reader import open_recording
 from runner.runs.catalogue.removal import plan, remove
@@ -116,12 +115,12 @@ def _difference(before: Run, after: Run, what: str) -> tuple[Place | None, tuple
             sentences.append(f"Training diverges {where_in_words(divergence)}: {cause.text}.")
             update, place = cause.update, (divergence.step, divergence.episode, divergence.t)
         elif a.agents == b.agents:  # the first update that differs though all steps are the same
-            steps = min(recording.count(schema.TRAIN_STEP) for recording in (a, b))
+            steps = min(recording.train.steps.count() for recording in (a, b))
             update = replay_to(a, b, steps)[1]
         else:
             update = None
         if update is not None:
-            record = next(a.blocks(schema.TRAIN_STEP, update.step, update.step + 1))[0]
+            record = next(a.train.steps.blocks(update.step, update.step + 1))[0]
             place = update.step, update.episode, int(record["t"])
             sentences.insert(
                 0,

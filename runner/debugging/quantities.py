@@ -14,7 +14,6 @@ from runner.debugging.expressions import JOINT, TABLE_NAMES, Array, Columns, Qua
 from runner.errors import RecordingError, RunnerError
 from runner.learning.learner import rules_of
 from runner.learning.watching import Changes, Watch, explorations
-from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.tables import TableReplay
 
@@ -180,7 +179,7 @@ class JobColumns:
 
     def _count_visits(self, recording: Recording, stop: int) -> None:
         expected = 0
-        for block in recording.blocks(schema.TRAIN_STEP, 0, stop) if stop else ():
+        for block in recording.train.steps.blocks(0, stop) if stop else ():
             first = int(block["step"][0])
             check_lost(recording, expected, first)
             expected = first + len(block)

@@ -144,7 +144,7 @@ class _Branches:
     def _read_episode(self) -> None:
         """Read the step, what came before it, and where the episode led."""
         recording, phase, episode, t = self._recording, self._place.phase, self._place.number, self._at.t
-        span = recording.episode_span(phase, episode)
+        span = recording.phase(phase).episode_span(episode)
         if t >= len(span):
             raise no_step(recording, self._place.title, len(span), t)
         self._returns, self._succeeded, done = np.zeros(len(recording.agents)), False, 0

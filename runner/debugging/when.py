@@ -24,7 +24,6 @@ from runner.debugging.expressions import Array, Columns, Expression, JobParser, 
 from runner.debugging.quantities import JobColumns, check_lost
 from runner.errors import RunnerError
 from runner.export.contents import require_steps
-from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.util.expressions import CONDITION
@@ -163,11 +162,11 @@ def when_in(
     parsed = parser.parse()
     require_steps(recording, "search")
     start = 0 if first is None else _step_number(recording, first)
-    stop = recording.count(schema.TRAIN_STEP) if last is None else _step_number(recording, last) + 1
+    stop = recording.train.steps.count() if last is None else _step_number(recording, last) + 1
     if start >= stop:
         raise RunnerError(f"found first step {start:,} and last step {stop - 1:,}, expected them in order.")
     columns = JobColumns(recording, list(parser.quantities), max(start - 1, 0))
-    for block in recording.blocks(schema.TRAIN_STEP, start - 1, start) if start else ():
+    for block in recording.train.steps.blocks(start - 1, start) if start else ():
         deque(columns.take(block, 0), maxlen=0)  # what was known before the first step
     terms = parsed.terms
     with np.errstate(all="ignore"):
@@ -214,7 +213,7 @@ def _search(
     steps = 0
     holds, expected = False, start
     limit = 2 * min(intervals, MAX_INTERVALS, MAX_VALUES // (2 * max(1, len(expression.terms))))
-    for block in recording.blocks(schema.TRAIN_STEP, start, stop):
+    for block in recording.train.steps.blocks(start, stop):
         first = int(block["step"][0])
         check_lost(recording, expected, first)
         expected = first + len(block)

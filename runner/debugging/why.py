@@ -188,7 +188,7 @@ def _step_at(recording: Recording, at: StepRef | None) -> NDArray[np.void]:
             "found no state or no action, expected both, or a step (`at`) whose state and action are meant."
         )
     place = place_of(recording, at.which)
-    span = recording.episode_span(place.phase, place.number)
+    span = recording.phase(place.phase).episode_span(place.number)
     if at.t >= len(span):
         raise no_step(recording, place.title, len(span), at.t)
     (block,) = recording.phase(place.phase).steps.blocks(span[at.t], span[at.t] + 1)
@@ -202,7 +202,7 @@ def _steps_before(recording: Recording, at: StepRef) -> int:
     place = place_of(recording, at.which)
     if at.after is not None:
         return place.table_step
-    span = recording.episode_span("train", at.episode)
+    span = recording.train.episode_span(at.episode)
     if at.t > len(span):
         raise no_step(recording, place.title, len(span), at.t)
     return span.start + at.t
@@ -232,7 +232,7 @@ def _steps(recording: Recording, largest: NDArray[np.void], learner: int) -> Ite
     states, actions = states_in_words(mdp), actions_in_words(mdp)
     records = {}
     for step in sorted(largest["step"].tolist()):  # each chunk is read once, and not kept
-        records[step] = next(recording.blocks(schema.TRAIN_STEP, step, step + 1))[0].copy()
+        records[step] = next(recording.train.steps.blocks(step, step + 1))[0].copy()
     for share in largest:
         record = records[int(share["step"])]
         state, action, next_state, episode, t, explored = record[_OF_STEP].tolist()

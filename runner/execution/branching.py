@@ -25,7 +25,6 @@ from runner.environments.naming import agent_actions, agent_of, joint_action, nu
 from runner.errors import ConfigError, RunnerError
 from runner.execution.initial_tables import recorded_tables
 from runner.execution.session import Report, Stop, run_job
-from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.recording.reuse import PackedChunks
 from runner.runs.branches import TrainingOrigin, origin_in
@@ -181,8 +180,8 @@ def _check_beginning(parent: Recording, own: Run, episodes: int) -> None:
         RunnerError: they are not.
     """
     with open_recording(own.recording) as recording:
-        count = min(episodes, unbroken(parent)[1], recording.count(schema.TRAIN_EPISODE))
-        ours, theirs = (one.blocks(schema.TRAIN_EPISODE, 0, count) for one in (recording, parent))
+        count = min(episodes, unbroken(parent)[1], recording.train.episodes.count())
+        ours, theirs = (one.train.episodes.blocks(0, count) for one in (recording, parent))
         first = first_difference(ours, theirs, ("episode", "last_step", "returns"))
     if first is not None:
         raise RunnerError(

@@ -103,7 +103,7 @@ def _rerun(path: Path, found: Verification, sample: int | None, trust: bool) -> 
 
 
 def _rerun_all(recording: Recording, found: Verification, trust: bool) -> Verification:
-    total = {phase: recording.step_count(phase) for phase in schema.PHASES}
+    total = {phase: recording.phase(phase).steps.total() for phase in schema.PHASES}
     left = total.copy()
     with closing(Replay(recording, trust, found.tolerance, report_progress)) as replay:
         for steps in replay.all():
@@ -147,7 +147,7 @@ def _rerun_sample(recording: Recording, found: Verification, sample: int, trust:
                 found = replace(found, steps=found.steps + len(steps), difference=steps.difference)
         except CannotRedo as error:
             reason = str(error)
-            span = recording.episode_span(phase, number)
+            span = recording.phase(phase).episode_span(number)
             found = replace(found, left_out=found.left_out + len(span))
             continue
         found = replace(found, episodes=found.episodes + 1)

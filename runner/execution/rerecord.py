@@ -200,7 +200,7 @@ def _rerecord_job(run: Run, fresh: Path, report: Report, stop: Stop) -> None:
             for name in recording.metadata_names
             if name == CODE_RECORD or name.startswith("resume/")
         }
-        circumstances = {topic: list(recording.messages(topic)) for topic in schema.MACHINE_TOPICS}
+        circumstances = {topic: list(recording.table(topic).messages()) for topic in schema.MACHINE_TOPICS}
         code = [entry for entry in recording.attachments() if entry[0] == CODE_ATTACHMENT]
     with RecordingFile(fresh) as file:
         describe(file, job, run, learner, made_by)

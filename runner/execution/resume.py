@@ -251,7 +251,7 @@ class _ResumedSession(Session):
         summary, recording = super().summary(topics), self._recording
         if self._reference.exhausted:
             return summary
-        counts = {topic.name: recording.count(topic) for topic in schema.TOPICS}
+        counts = {topic.name: recording.table(topic).count() for topic in schema.TOPICS}
         evaluations = recording.metrics("eval")
         return summary | {
             "content_digest": None,
@@ -266,12 +266,11 @@ class _ResumedSession(Session):
 
 def _steps(recording: Recording, phase: str) -> int:
     """Return the number of steps of a phase, also if the recording leaves them out."""
-    steps, episodes = schema.PHASES[phase]
-    ended = recording.count(episodes)
+    own = recording.phase(phase)
+    ended = own.episodes.count()
     if ended == 0:
-        return recording.count(steps)
-    last = recording.episodes(phase, ended - 1, ended)[-1]
-    return max(recording.count(steps), int(last["last_step"]) + 1)
+        return own.steps.count()
+    return max(own.steps.count(), int(own.episodes.array(ended - 1)[-1]["last_step"]) + 1)
 
 
 def _changes(run: Run) -> Differences:

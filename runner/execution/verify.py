@@ -153,7 +153,7 @@ def _first_unreadable(recording: Recording) -> str:
         name = schema.NUMBERED_BY[topic.message]
         number = 0
         try:
-            for block in recording.blocks(topic):
+            for block in recording.table(topic).blocks():
                 number = int(block[name][-1]) + 1
         except RecordingError:
             return f" {topic.name}: {name} {number} is the first that cannot be read."
@@ -205,7 +205,7 @@ def _retrain(recording: Recording, job: Job, installed: bool, report: Report, tr
     reference = Reference(recording, complete, without_steps=job.config.recording.steps == "none")
     recorder = recorder_for(job, learner, None, reference)
     variable = set(schema.TOPICS) - set(schema.BLOCK_TOPICS) - {schema.LOG_TOPIC}
-    recorded = {topic.name: recording.count(topic) for topic in variable}
+    recorded = {topic.name: recording.table(topic).count() for topic in variable}
 
     def all_compared() -> bool:
         return reference.exhausted and all(recorder.counts[name] >= n for name, n in recorded.items())
@@ -233,7 +233,7 @@ def _retrain(recording: Recording, job: Job, installed: bool, report: Report, tr
     result = recording.result
     # an interrupted run that stated its result is compared with it if all steps of the result are recorded
     whole = complete or bool(result.content_digest and result.steps_recorded)
-    steps = {"train": recording.count(schema.TRAIN_STEP), "eval": recording.count(schema.EVAL_STEP)}
+    steps = {"train": recording.train.steps.count(), "eval": recording.eval.steps.count()}
     if whole:  # else the job was run a little further than it is recorded
         steps = recorder.steps
     verification = replace(
@@ -241,7 +241,7 @@ def _retrain(recording: Recording, job: Job, installed: bool, report: Report, tr
         train_steps=steps["train"],
         eval_steps=steps["eval"],
         steps=steps["train"] + steps["eval"],
-        episodes=recording.count(schema.TRAIN_EPISODE),
+        episodes=recording.train.episodes.count(),
     )
     return compare_result(verification, recording, session.summary(topics)) if whole else verification
 

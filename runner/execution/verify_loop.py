@@ -39,8 +39,8 @@ def verify_loop(recording: Recording) -> Verification:
     verification = Verification(
         recording.path,
         verdict="consistent" if is_over else "interrupted",
-        train_steps=recording.step_count("train"),
-        eval_steps=recording.step_count("eval"),
+        train_steps=recording.train.steps.total(),
+        eval_steps=recording.eval.steps.total(),
         not_compared=LOOP_NOT_COMPARED if recording.has_environment else "",
         is_loop=True,
     )
@@ -121,7 +121,7 @@ class _Content:
             is_added = topic in self._recording.dtypes or topic.message is schema.EXTRA
             if is_added or topic in schema.MACHINE_TOPICS:
                 continue
-            for time, payload in self._recording.messages(topic):
+            for time, payload in self._recording.table(topic).messages():
                 if topic.digested:
                     self.digest.update(topic, message_record(topic, time, payload))
                 self.counts[topic.name] += 1

@@ -39,7 +39,7 @@ def shortcomings(recording: Recording) -> list[str]:
         if recording.can_train_again:
             planned = recording.config.get("episodes")
             of = f" of {planned:,}" if is_whole(planned, 0, 2**63) else ""
-            recorded = f"there are {recording.count(schema.TRAIN_EPISODE):,}{of} training episodes"
+            recorded = f"there are {recording.train.episodes.count():,}{of} training episodes"
         problem = "is still running" if status == "running" else f"did not finish ({status})"
         sentence = f"Run {recording.run_id} {problem}: {recorded}."
         if (error := recording.result.error or "").startswith(RECORDING_STOPPED):
@@ -78,7 +78,7 @@ def why_no_steps(recording: Recording) -> str:
 
 def ending_of(recording: Recording, phase: str, number: int) -> str:
     """Return how an episode ended, a key of `ENDINGS`."""
-    records = recording.episodes(phase, number, number + 1)
+    records = recording.phase(phase).episodes.array(number, number + 1)
     if not len(records):
         return "cut off"
     return next((end for end in ("success", "terminated", "truncated") if records[0][end]), "reset")

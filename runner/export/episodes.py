@@ -11,7 +11,6 @@ from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.environments.naming import trial_in_words
 from runner.errors import NotInRecording, RecordingError
 from runner.export.contents import require_steps
-from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.steps import check_steps, steps_of
 
@@ -73,9 +72,9 @@ def ranked_episodes(recording: Recording) -> tuple[str, NDArray[np.int64]]:
         RecordingError: no episode ended, or there are no steps.
     """
     require_steps(recording, "show", may_redo=True)
-    phase = "eval" if recording.count(schema.EVAL_EPISODE) else "train"
-    records = recording.episodes(phase)
-    records = records[records["last_step"] < recording.step_count(phase)]
+    phase = "eval" if recording.eval.episodes.count() else "train"
+    records = recording.phase(phase).episodes.array()
+    records = records[records["last_step"] < recording.phase(phase).steps.total()]
     if not len(records):
         raise RecordingError(f"{recording.path}: found no episode that ended; --episode 0 shows the first.")
     return phase, _by_rank(records)
@@ -106,7 +105,7 @@ def ranked_trials(recording: Recording, after: int) -> tuple[int, int, int]:
 
 def ranked(recording: Recording, phase: str, start: int, stop: int) -> tuple[int, int, int]:
     """Return the worst, the median and the best of some episodes: by success, return and length."""
-    ranked_numbers = _by_rank(recording.episodes(phase, start, stop))
+    ranked_numbers = _by_rank(recording.phase(phase).episodes.array(start, stop))
     worst, median, best = (int(ranked_numbers[i]) for i in (0, len(ranked_numbers) // 2, -1))
     return worst, median, best
 
@@ -147,7 +146,7 @@ def default_trial(recording: Recording) -> tuple[int, int] | None:
 
 def last_episode(recording: Recording) -> int:
     """Return the number of the last training episode that ended; 0 if none did."""
-    return max(0, recording.count(schema.TRAIN_EPISODE) - 1)
+    return max(0, recording.train.episodes.count() - 1)
 
 
 def last_whole_evaluation(recording: Recording) -> int | None:
@@ -156,11 +155,11 @@ def last_whole_evaluation(recording: Recording) -> int | None:
     A recording that was cut off may have an evaluation's metrics without its trials. The evaluations of a
     loop are the trials that were recorded.
     """
-    episodes, steps = recording.count(schema.EVAL_EPISODE), recording.step_count("eval")
+    episodes, steps = recording.eval.episodes.count(), recording.eval.steps.total()
     for one in reversed(evaluations_of(recording)):
         if (
             one.stop <= episodes
-            and recording.episodes("eval", one.stop - 1, one.stop)[0]["last_step"] < steps
+            and recording.eval.episodes.array(one.stop - 1, one.stop)[0]["last_step"] < steps
         ):
             return one.after
     return None

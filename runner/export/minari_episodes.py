@@ -72,7 +72,7 @@ class _Resets:
     def __init__(self, recording: Recording, phase: str) -> None:
         self._recording = recording
         self._environments = recording.environments
-        self._remaining = recording.resets(phase)
+        self._remaining = recording.phase(phase).reset_values()
         self._next = next(self._remaining, None)
         self._read: dict[tuple[int, int], tuple[int | None, Value]] = {}
         """By environment and episode."""
@@ -107,10 +107,7 @@ def _steps(recording: Recording, phase: str, lengths: Mapping[int, int]) -> Iter
     table, n = recording.phase(phase).steps, recording.environments
     first = max(min(last - (length - 1) * n for last, length in lengths.items()), 0)
     open_parts: dict[int, list[Records]] = {environment: [] for environment in range(n)}
-    is_fixed = table.dtype is not None
-    for block in table.blocks(first, max(lengths) + 1) if is_fixed else recording.rows(table):
-        if block["step"][0] > max(lengths):
-            break
+    for block in table.numbered(range(first, max(lengths) + 1)):
         ended: list[tuple[int, Records]] = []
         for environment, parts in open_parts.items():
             rows = block[(environment - int(block["step"][0])) % n :: n]

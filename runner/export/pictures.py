@@ -91,7 +91,7 @@ class Picture(Moment):
 
 def moments_of(recording: Recording, phase: str, episode: int) -> Iterator[Moment]:
     """Yield T + 1 moments of an episode of T steps: after the reset, and after each step."""
-    describe, steps = describer(recording, phase), len(recording.episode_span(phase, episode))
+    describe, steps = describer(recording, phase), len(recording.phase(phase).episode_span(episode))
     returns = np.zeros(len(recording.agents))
     unpaid = tuple(returns.tolist())
     for t, (observation, step) in enumerate(observations_of(recording, phase, episode)):
@@ -133,7 +133,7 @@ class Pictures:
         require_steps(recording, "show", may_redo=True)
         self._recording, self._phase, self._episode = recording, phase, episode
         self.learners = recording.agents
-        self.steps = len(recording.episode_span(phase, episode))
+        self.steps = len(recording.phase(phase).episode_span(episode))
         self.source, self.reason, _, self._painted = paint(recording, phase, episode, trust)
         self.note = ""
         self._pictures = self._generate()

@@ -78,7 +78,7 @@ def measures(recording: Recording) -> Iterator[Measures]:
             yield _measures(phase, row, values)
     for row in recording.optimality():
         yield _measures("eval", row, _named(row, exact_values, agents))
-    for scalar in recording.decoded(SCALAR_TOPIC):
+    for scalar in recording.table(SCALAR_TOPIC).decoded():
         if math.isfinite(scalar["value"]):
             position, step = scalar["log_time"] // STEP_NANOSECONDS, training_step(scalar)
             values = {f"logged/{scalar['name']}": scalar["value"]}
@@ -88,7 +88,7 @@ def measures(recording: Recording) -> Iterator[Measures]:
 def episodes(recording: Recording, phase: str) -> Iterator[Measures]:
     """Yield length and return of each episode of a phase, at its last step: `episode/return/AGENT`."""
     names = ["episode/length", *(f"episode/return/{agent}" for agent in recording.agents)]
-    for block in recording.blocks(PHASES[phase][1]):
+    for block in recording.phase(phase).episodes.blocks():
         columns = (
             block[field].tolist() for field in ("log_time", "episode", "last_step", "length", "returns")
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,10 +14,8 @@ from runner.errors import ConfigError
 from runner.loops.extras import TOPICS, begin_layout
 from runner.loops.rows import Rows
 from runner.loops.shard_sources import PHASES, Source
-from runner.loops.single_rows import VariableRows
 from runner.recording.episode_log import Flags
 from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAME_LENGTH, MAX_NAMES, ExtraLayout
-from runner.recording.messages import Message
 from runner.recording.recorder import Recorder
 from runner.util.arrays import Ints
 
@@ -34,8 +32,8 @@ class Copied:
     mdp: Mdp | None
 
 
-class _Copies(Rows):
-    """What copied rows have in common."""
+class CopiedRows(Rows):
+    """Rows that are copied as they are, but for their numbers."""
 
     def __init__(self, recorder: Recorder, copied: Copied, phase: str) -> None:
         self._fields = _SHARED_FIELDS + (_STEP_FIELDS if copied.kind == "step" else _TRANSITION_FIELDS)
@@ -50,11 +48,7 @@ class _Copies(Rows):
         """The number of the episode that began last; -1 before any."""
         return self._begun - 1
 
-
-class CopiedRows(_Copies):
-    """Rows of one size that are copied."""
-
-    def put_reset(self, reset: Message, environment: int) -> None:
+    def put_reset(self, reset: np.void, environment: int) -> None:
         """Copy a reset."""
         self._reset_block["environment"][len(self._reset_rows)] = environment
         self.reset(reset["observation"], int(reset["seed"]) if reset["seeded"] else None)
@@ -99,34 +93,15 @@ class CopiedRows(_Copies):
         self._recorder.take(self._topics.steps, np.arange(before + 1, before + n + 1, dtype=np.uint64))
 
 
-class CopiedMessages(_Copies, VariableRows):
-    """Rows whose values vary in size, that are copied."""
-
-    def put_reset(self, reset: Message, environment: int) -> None:
-        """Copy a reset."""
-        self._put_reset_message(_payload(reset) | {"environment": environment})
-        self.reset(None, int(reset["seed"]) if reset["seeded"] else None)
-
-    def put(self, rows: Sequence[Message]) -> None:
-        """Copy consecutive steps of the environment that was reset last."""
-        for row in rows:
-            self._put_message(_payload(row))
-
-    def _put_reset(self, observation: object, seed: int | None) -> None:
-        """Do nothing: the message is recorded."""
-
-
-def _payload(message: Mapping[str, object]) -> dict[str, object]:
-    return {name: value for name, value in message.items() if name != "log_time"}
-
-
 class CopiedExtras:
     """The extras of all processes, with the names of all of them."""
 
     def __init__(self, recorder: Recorder, sources: Sequence[Source]) -> None:
         self._recorder = recorder
         self._own = {
-            (source.number, phase): source.recording.extras(phase) for source in sources for phase in PHASES
+            (source.number, phase): source.recording.phase(phase).extras
+            for source in sources
+            for phase in PHASES
         }
         dtypes: dict[str, np.dtype[np.generic]] = {}
         self._names: dict[tuple[int, str], str] = {}

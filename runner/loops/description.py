@@ -15,6 +15,8 @@ from runner.environments.gym_types import Space
 from runner.environments.loading import mdp_of
 from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
+from runner.recording import schema
+from runner.recording.blocks import with_varying
 from runner.recording.gym_spaces import describe_space, parts_of
 from runner.recording.metadata import Attachments, dtypes_in, environment_attachments
 from runner.recording.schema import Topic
@@ -67,6 +69,11 @@ class Described:
         """The dtypes of the message records of fixed width in its recordings."""
         events = len(self.mdp.event_names) if self.mdp else 0
         return dtypes_in(self.kind, len(self.agents), events, self.recorded_spaces, self.env_id)
+
+    @cached_property
+    def row_dtypes(self) -> dict[Topic, np.dtype[np.void]]:
+        """The dtypes of the rows that are put down: where values vary in size, objects that hold bytes."""
+        return with_varying(self.dtypes, schema.KINDS[self.kind], len(self.agents))
 
     @cached_property
     def common(self) -> str:

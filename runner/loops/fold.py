@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import BinaryIO, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +24,12 @@ from numpy.typing import NDArray
 from runner.client.outbox import forget_upload
 from runner.config.loading import recorded_packing
 from runner.errors import RecordingError, RunnerError, StorageError, truncated_message
-from runner.loops.copied_rows import Copied, CopiedExtras, CopiedMessages, CopiedRows
+from runner.loops.copied_rows import Copied, CopiedExtras, CopiedRows
 from runner.loops.fold_check import Content, left_out
 from runner.loops.outcomes import Outcomes
 from runner.loops.shard_sources import PHASES, Source, open_sources
 from runner.recording import schema
+from runner.recording.blocks import with_varying
 from runner.recording.maker import SHARD_MAKER, EnvironmentMaker, Shard
 from runner.recording.messages import (
     Message,
@@ -176,7 +177,7 @@ class _Fold:
                 file.add_attachment(name, media_type, data)
             recorder = Recorder(
                 file,
-                dtypes,
+                with_varying(dtypes, first.topics, len(first.agents)),
                 packing=packing,
                 watch=self._outcomes.take_records,
             )
@@ -231,7 +232,7 @@ class _Fold:
         """Return the description of the spaces, with the widest actions that a process recorded."""
 
         def width(source: Source) -> int:
-            topic = source.recording.phase("train").steps.topic
+            topic = source.recording.train.steps.topic
             dtype = source.recording.dtypes.get(topic)
             return dtype["action"].itemsize if dtype is not None else 0
 
@@ -297,13 +298,12 @@ class _Fold:
         """Copy all resets, steps and extras; return how many rewards the environment's table excludes."""
         recorder, first = self._recorder, self._first
         copied = Copied(first.kind, self._mdp)
-        kind = CopiedMessages if copied.kind == "variable" else CopiedRows
-        rows = {phase: kind(recorder, copied, phase) for phase in PHASES}
+        rows = {phase: CopiedRows(recorder, copied, phase) for phase in PHASES}
         extras = CopiedExtras(recorder, self._sources)
         active, copied_steps, total = rows["train"], 0, sum(self._totals.values())
         for unit in self._units:
             phase, source = PHASES[unit["phase"]], self._sources[unit["source"]]
-            own: Any = rows[phase]
+            own = rows[phase]
             topics = schema.topics_of(copied.kind, phase)
             if own is not active:
                 active.commit()
@@ -366,7 +366,7 @@ class _Fold:
         """Yield position and payload in the run of a process's messages of a topic."""
         phase, read = topic.phase, self._read[source.number]
         if topic.message == schema.RESET_STATE:
-            for state in source.recording.reset_states(phase):
+            for state in source.recording.phase(phase).reset_states():
                 read[topic.name] += 1
                 units = source.units[phase][source.units[phase]["reset"] == state.reset]
                 for unit in units:
@@ -374,7 +374,7 @@ class _Fold:
                     moved = state._replace(reset=int(unit["new_reset"]), environment=environment)
                     yield int(unit["new_position"]), moved.to_payload()
             return
-        for fields in source.recording.decoded(topic):
+        for fields in source.recording.table(topic).decoded():
             read[topic.name] += 1
             position = int(fields.pop("log_time")) // STEP_NANOSECONDS
             if topic.message == schema.INFO:

@@ -35,15 +35,16 @@ class Content:
         self.digests: dict[tuple[str, str], Any] = defaultdict(blake3)
 
     def take(self, topic: Topic, rows: Any) -> None:
-        """Take the next steps or resets: records, a record, or a list of messages."""
-        if topic in self._dtypes:
-            for name in {field.name for field in topic.message.fields} - _NEW:
-                dtype = self._dtypes[topic][name].base
-                self.digests[topic.name, name].update(np.ascontiguousarray(rows[name], dtype).tobytes())
-            return
-        for message in rows if isinstance(rows, list) else [rows]:
-            for name in message.keys() - _NEW:
-                self.digests[topic.name, name].update(repr(message[name]).encode())
+        """Take the next steps or resets: records, or a record."""
+        for name in {field.name for field in topic.message.fields} - _NEW:
+            values = np.atleast_1d(rows)[name]
+            if values.dtype.hasobject:
+                parts = [len(value).to_bytes(4, "little") + value for value in values.tolist()]
+                data = b"".join(parts)
+            else:
+                dtype = self._dtypes[topic][name] if topic in self._dtypes else values.dtype
+                data = np.ascontiguousarray(values, dtype.base).tobytes()
+            self.digests[topic.name, name].update(data)
 
     def check(self, path: Path) -> None:
         """Compare a folded recording with what was copied into it, after checking every byte of it.
@@ -56,8 +57,7 @@ class Content:
         with open_recording(path) as recording:
             for topic in recording.topics:
                 if topic.name.endswith(("/step", "/reset")):
-                    is_fixed = topic in self._dtypes
-                    for rows in recording.blocks(topic) if is_fixed else recording.decoded(topic):
+                    for rows in recording.table(topic).rows():
                         found.take(topic, rows)
         for (topic_name, name), digest in self.digests.items():
             if found.digests[topic_name, name].digest() != digest.digest():
@@ -80,7 +80,8 @@ def left_out(source: Source, read: Mapping[str, int]) -> str:
         found, there = read.get(topic.name, 0), source.stated.get(topic.name, 0)
         there = max([there, *(stop for _, stop in source.recording.lost.get(topic.name, []))])
         if topic.message in schema.STEP_MESSAGES:
-            found, there = source.stops[topic.phase], max(there, source.recording.step_count(topic.phase))
+            found = source.stops[topic.phase]
+            there = max(there, source.recording.phase(topic.phase).steps.total())
             if found < there:
                 steps.append(f"{found:,} of {there:,} {schema.PHASE_NAMES[topic.phase]} steps")
         elif found < there:

@@ -72,7 +72,7 @@ class LoopRun:
         self.outcomes = Outcomes(described.mdp)
         self.recorder = Recorder(
             self._file,
-            described.dtypes,
+            described.row_dtypes,
             packing=options.packing.packing,
             record_steps=options.steps == "all",
             beat=self._beat,
@@ -170,7 +170,7 @@ class LoopRun:
             return False
         self.described = replace(self.described, wide_action=wide)
         self._facts = self._run_facts()
-        self.recorder.set_dtypes(self.described.dtypes)
+        self.recorder.set_dtypes(self.described.row_dtypes)
         return True
 
     def commit(self) -> None:

@@ -18,12 +18,10 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.integrity import check_integrity, is_merely_cut_off
-from runner.recording.messages import Message
 from runner.recording.reader import Recording, open_recording
 from runner.recording.repair import can_be_repaired
-from runner.recording.row_reader import FOREVER
 from runner.recording.schema import STEP_NANOSECONDS
-from runner.recording.topic_chunks import TopicChunks
+from runner.recording.topic_chunks import FOREVER, TopicChunks
 from runner.runs.listing import run_in
 from runner.runs.run import RECORDING_FILE, RUN_FILE, Run
 from runner.runs.shards import shard_folders
@@ -85,19 +83,12 @@ class Source:
         """The numbers of those at which an environment was only reset."""
         self.taken = {phase: self.stops[phase] - len(self.only_resets[phase]) for phase in PHASES}
         self.units = {phase: self._units(phase) for phase in PHASES}
-        self._messages: dict[TopicChunks, Iterator[Message]] = {}
-        self.times = {phase: self._times(phase) for phase in PHASES}
-        """`log_time` of each step where values vary in size; else empty."""
-
-    @property
-    def _is_fixed(self) -> bool:
-        return self.recording.phase("train").steps.dtype is not None
 
     def _stop(self, phase: str) -> int:
         """Return the steps of a phase, up to the first that is lost or may lack its reset."""
         own = self.recording.phase(phase)
         (step, _), (reset, last_reset) = map(self._first_gap, (own.steps, own.resets))
-        stop = min(self.recording.whole_steps(phase), step)
+        stop = min(self.recording.phase(phase).whole_steps(), step)
         return (stop if reset == FOREVER else min(stop, last_reset)) // self.n * self.n
 
     def _first_gap(self, table: TopicChunks) -> tuple[int, int]:
@@ -106,47 +97,36 @@ class Source:
         And the `step` of the last message before it.
         """
         number, last = 0, 0
-        lost = self.recording.lost.get(table.topic.name)
-        if self._is_fixed and not lost:
+        if not self.recording.lost.get(table.topic.name):
             return FOREVER, 0
-        for rows in self.recording.rows(table):
+        for rows in table.rows():
             numbers = rows[schema.NUMBERED_BY[table.topic.message]]
             after = np.flatnonzero(numbers != number + np.arange(len(rows)))
             before = rows[: after[0]] if after.size else rows
             number, last = number + len(before), int(before["step"][-1]) if len(before) else last
             if after.size:
                 return number, last
-        return (number, last) if lost else (FOREVER, 0)
+        return number, last
 
     def _only_resets(self, phase: str) -> NDArray[np.int64]:
         maker = self.recording.maker
         if self.n == 1 and (maker is None or maker.kind != "vector"):
             return np.empty(0, np.int64)
-        blocks = self.recording.phase(phase).steps.blocks(0, self.stops[phase])
+        blocks = self.recording.phase(phase).steps.numbered(range(self.stops[phase]))
         parts = [block["step"][block["t"] == schema.RESET_ONLY] for block in blocks]
         return np.concatenate([np.empty(0, np.int64), *parts])
-
-    def _times(self, phase: str) -> NDArray[np.int64]:
-        if self._is_fixed:
-            return np.empty(0, np.int64)
-        steps = self.recording.phase(phase).steps.decoded()
-        return np.array([step["log_time"] for step in steps], np.int64)[: self.stops[phase]]
 
     def _units(self, phase: str) -> NDArray[np.void]:
         """Return the units of a phase, ordered by environment, without key and new numbers."""
         table, stop = self.recording.phase(phase).resets, self.stops[phase]
-        if self._is_fixed:
-            dtype = np.dtype([(name, "i8") for name in _RESET])
-            parts = [np.empty(0, dtype)]
-            for block in table.blocks():
-                part = np.empty(len(block), dtype)
-                for name in _RESET:
-                    part[name] = block[name]
-                parts.append(part)
-            resets = np.concatenate(parts)
-        else:
-            rows = [tuple(each[name] for name in _RESET) for each in table.decoded()]
-            resets = np.array(rows, [(name, "i8") for name in _RESET])
+        dtype = np.dtype([(name, "i8") for name in _RESET])
+        parts = [np.empty(0, dtype)]
+        for block in table.rows():
+            part = np.empty(len(block), dtype)
+            for name in _RESET:
+                part[name] = block[name]
+            parts.append(part)
+        resets = np.concatenate(parts)
         resets = resets[(resets["step"] <= stop) & (resets["environment"] < self.n)]
         resets = resets[np.lexsort((resets["reset"], resets["environment"]))]
         units = np.zeros(len(resets), UNIT)
@@ -169,41 +149,24 @@ class Source:
         if not self.stops[other] and not self.is_placed:
             return min(position, self.stops[phase])
         time = position * STEP_NANOSECONDS + 1
-        if not self._is_fixed:
-            return int(np.searchsorted(self.times[phase], time))
         first = self.recording.phase(phase).steps.first_from("log_time", time)
         return min(first, self.stops[phase])
 
     # --- what a unit holds, read in the order of the run ----------------------------------------------
 
-    def reset(self, phase: str, unit: np.void) -> np.void | Message:
+    def reset(self, phase: str, unit: np.void) -> np.void:
         """Return the reset of a unit."""
         table, number = self.recording.phase(phase).resets, int(unit["reset"])
-        if self._is_fixed:
-            record: np.void = next(table.blocks(number, number + 1))[0]
-            return record
-        return next(self._stream(table))
+        record: np.void = next(table.numbered(range(number, number + 1)))[0]
+        return record
 
-    def steps(self, phase: str, unit: np.void) -> Iterator[tuple[Records | list[Message], Ints]]:
+    def steps(self, phase: str, unit: np.void) -> Iterator[tuple[Records, Ints]]:
         """Yield the steps of a unit in pieces, with their numbers in the phase of its process."""
-        table, first, stop = self.recording.phase(phase).steps, int(unit["first"]), int(unit["stop"])
-        if first >= stop:
-            return
-        if not self._is_fixed:
-            stream = self._stream(table)
-            for begin in range(first, stop, 1024):
-                numbers = np.arange(begin, min(begin + 1024, stop))
-                yield [next(stream) for _ in numbers], numbers
-            return
-        for block in table.blocks(first, stop):
-            rows = block[(first - int(block["step"][0])) % self.n :: self.n]
-            rows = rows[rows["t"] != schema.RESET_ONLY]
+        numbers = range(int(unit["first"]), int(unit["stop"]), self.n)
+        for block in self.recording.phase(phase).steps.numbered(numbers):
+            rows = block[block["t"] != schema.RESET_ONLY]
             if len(rows):
                 yield rows, rows["step"].astype(np.int64)
-
-    def _stream(self, table: TopicChunks) -> Iterator[Message]:
-        """Return the messages of a topic of varying size; units of one environment come in their order."""
-        return self._messages.setdefault(table, table.decoded())
 
     # --- where messages go ----------------------------------------------------------------------------
 

@@ -13,12 +13,10 @@ from runner.errors import RecordingError
 from runner.loops.description import Described
 from runner.loops.rows import Rows
 from runner.loops.values import lone_number, require_reset, warn_user, whole_number
-from runner.recording import schema
 from runner.recording.episode_log import Flags
-from runner.recording.gym_values import filler, filler_by_agent, leaves_by_agent, value_bytes
-from runner.recording.messages import encode
+from runner.recording.gym_values import filler, filler_by_agent, leaves_by_agent
+from runner.recording.recorder import BLOCK_BYTES
 from runner.util.arrays import Ints
-from runner.util.values import Json
 
 _DISCRETE: Final = struct.Struct("<qqd??")
 _DISCRETE_DTYPE: Final = np.dtype(
@@ -26,12 +24,11 @@ _DISCRETE_DTYPE: Final = np.dtype(
 )
 _ENDING: Final = struct.Struct("<d??")
 _ENDING_DTYPE: Final = np.dtype([("rewards", "<f8"), ("terminated", "?"), ("truncated", "?")])
-_VARIABLE_ROWS: Final = 4096
 _MAX_STATE: Final = 2**32 - 1
 
 
 class BlockRows(Rows):
-    """Rows whose steps have one size: put down in place."""
+    """Rows that are put down in the recorder's blocks."""
 
     _scratch_dtype: np.dtype[np.void]
     """What a step brings that waits until its block is completed."""
@@ -41,10 +38,17 @@ class BlockRows(Rows):
         self._block = self._recorder.block(self._topics.steps)
         self._reset_block = self._recorder.block(self._topics.resets)
         room = len(self._block)
+        self._are_bytes, self._held = self._block.dtype.hasobject, 0
         if len(self._scratch) < room:
             self._scratch = np.zeros(room, self._scratch_dtype)
             self._bytes = self._scratch.view(np.uint8).data
         return room, len(self._reset_block)
+
+    def _hold(self, *values: bytes) -> None:
+        """Count the bytes of values of varying size; with many of them, the block is full."""
+        self._held += sum(map(len, values))
+        if self._held > BLOCK_BYTES:
+            self._room, self._reset_room = self.filled + 1, len(self._reset_rows) + 1
 
     def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
         block, rows = self._block[:n], self._scratch[:n]
@@ -125,7 +129,7 @@ class DiscreteRows(BlockRows):
 
 
 class ArrayRows(BlockRows):
-    """Rows of `dualtaxi.Transition` in spaces of fixed width."""
+    """Rows of `dualtaxi.Transition`, in spaces of fixed width or not."""
 
     _scratch_dtype = _ENDING_DTYPE
     _is_settled = False
@@ -165,10 +169,14 @@ class ArrayRows(BlockRows):
         self._action(row, action)
         self._next(row, observation)
         _ENDING.pack_into(self._bytes, row * 10, reward, terminated, truncated)
+        if self._are_bytes:
+            self._hold(self._block["action"][row], self._block["next_observation"][row])
         self._count(terminated or truncated)
 
     def _put_reset(self, observation: object, seed: int | None) -> None:  # noqa: ARG002
         self._first(len(self._reset_rows), observation)
+        if self._are_bytes:
+            self._hold(self._reset_block["observation"][len(self._reset_rows)])
 
     def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
         block, rows = self._block[:n], self._scratch[:n]
@@ -240,69 +248,5 @@ class AgentRows(BlockRows):
         return sum(bool(flags.get(agent)) << i for i, agent in enumerate(self._agents))
 
 
-class VariableRows(Rows):
-    """Rows of `dualtaxi.Transition` where a space has texts: each message is made when it comes."""
-
-    _is_settled = False
-    _t = 0
-    """Steps of the episode in progress before its last one."""
-
-    def _open_steps(self) -> tuple[int, int]:
-        self._scratch = np.zeros(_VARIABLE_ROWS, _ENDING_DTYPE)
-        return _VARIABLE_ROWS, _VARIABLE_ROWS
-
-    def take(
-        self,
-        action: object,
-        observation: object,
-        reward: SupportsFloat,
-        terminated: object,
-        truncated: object,
-    ) -> None:
-        """Put down a step."""
-        reward = lone_number(reward, "reward")
-        require_reset(self.resets, self._phase)
-        if not self._is_settled:
-            self._is_settled = True
-            self._first_action(action)
-        fields = {
-            "action": value_bytes(self._action_leaves, action),
-            "next_observation": value_bytes(self._observation_leaves, observation),
-            "rewards": [reward],
-            "t": 0 if self._fresh else self._t + 1,
-            "terminated": bool(terminated),
-            "truncated": bool(truncated),
-            "acted": 1,
-            "agents_terminated": int(bool(terminated)),
-            "agents_truncated": int(bool(truncated)),
-        }
-        self._put_message(fields)
-
-    def _put_message(self, fields: Json) -> None:
-        """Record a step, given by its fields but its number and that of its episode."""
-        fields |= {"step": self.place[0], "episode": self._begun - (not self._fresh)}
-        position = self._recorder.position + self.filled + 1
-        self._recorder.append(self._topics.steps, encode(schema.TRANSITION, fields), position)
-        self._t, ends = fields["t"], (fields["terminated"], fields["truncated"])
-        self._scratch[self.filled] = (fields["rewards"][0], *ends)
-        self._count(any(ends))
-
-    def _put_reset(self, observation: object, seed: int | None) -> None:
-        fields = {"seed": seed or 0, "seeded": seed is not None}
-        self._put_reset_message(fields | {"observation": value_bytes(self._observation_leaves, observation)})
-
-    def _put_reset_message(self, fields: Json) -> None:
-        """Record a reset, given by its fields but the numbers of reset, episode and step."""
-        fields |= {"reset": self.resets, "episode": self._begun, "step": self.place[0]}
-        position = self._recorder.position + self.filled
-        self._recorder.append(self._topics.resets, encode(schema.RESET, fields), position)
-
-    def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
-        """Do nothing: the messages are complete."""
-
-    def _finish_resets(self, episode: Ints, step: Ints, other: int) -> None:
-        """Do nothing: the messages are complete."""
-
-
-ROWS: Final[dict[str, type[Rows]]] = {"step": DiscreteRows, "transition": ArrayRows, "variable": VariableRows}
+ROWS: Final[dict[str, type[Rows]]] = {"step": DiscreteRows, "transition": ArrayRows, "variable": ArrayRows}
 """The rows of one environment by the kind of recording."""

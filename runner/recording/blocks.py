@@ -9,6 +9,7 @@ still reads each message.
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from typing import Final
 
@@ -46,6 +47,15 @@ RECORD_HEAD: Final = struct.Struct("<BQ")
 MESSAGE: Final = int(Opcode.MESSAGE)
 MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
 """`HEADER` for one message: opcode, length, channel, sequence, log time, publish time."""
+
+
+def with_varying(
+    dtypes: Mapping[Topic, np.dtype[np.void]], topics: Iterable[Topic], learners: int
+) -> dict[Topic, np.dtype[np.void]]:
+    """Return the dtypes of all steps and resets; values that vary in size are objects, which hold bytes."""
+    value = np.dtype(object)
+    varying = [topic for topic in topics if topic.message in (TRANSITION, RESET) and topic not in dtypes]
+    return {**dtypes, **{topic: topic_dtype(topic, learners, 0, value, value) for topic in varying}}
 
 
 @lru_cache(64)
@@ -87,7 +97,12 @@ def varint(number: int) -> bytes:
 
 
 def blank_records(topic: Topic, dtype: np.dtype[np.void], n: int) -> NDArray[np.void]:
-    """Return n message records of the topic with every constant byte set and every value 0."""
+    """Return n message records of the topic with every constant byte set and every value 0.
+
+    Records with objects are not those of a file, and have no constant bytes.
+    """
+    if dtype.hasobject:
+        return np.zeros(n, dtype)
     records = np.empty(n, dtype)
     records.view(np.uint8).reshape(n, records.itemsize)[:] = _blank_record(topic, dtype)  # not field by field
     return records

@@ -127,7 +127,7 @@ def read_clock(recording: TopicReader) -> Clock | None:
         RecordingError: samples are damaged, or more than 1,048,576.
     """
     rows: list[tuple[int, float, float]] = []
-    for fields in recording.decoded(schema.CLOCK_TOPIC, max_bytes=1024):
+    for fields in recording.table(schema.CLOCK_TOPIC).decoded(max_bytes=1024):
         row = (fields["log_time"] // STEP_NANOSECONDS, fields["seconds"], fields["started"])
         if len(rows) == MAX_SAMPLES or not all(map(math.isfinite, row)) or not 0 <= row[1] < _MAX_SECONDS:
             raise RecordingError(

@@ -66,11 +66,11 @@ def check_extras(recording: Recording, phase: str, complete: bool, on_block: OnB
     Raises:
         Inconsistent: one does not.
     """
-    extras, last = recording.extras(phase), -1
+    extras, last = recording.phase(phase).extras, -1
     steps, topic = recording.phase(phase).steps, schema.topics_of(recording.kind, phase).extras
     # Steps of varying size are not looked up: their extras are only counted, and compared with one another.
-    total = recording.step_count(phase) if extras else 0
-    if recording.leaves_out_steps and not recording.has_actions_of(phase):
+    total = recording.phase(phase).steps.total() if extras else 0
+    if recording.leaves_out_steps and not recording.phase(phase).steps.are_known:
         total = recording.result.get(f"{phase}_steps", _MAX_STEPS)
     for block in extras.blocks(stop=None if complete else total):
         on_block(topic, block)

@@ -258,7 +258,7 @@ def read_console(recording: TopicReader, clock: Clock | None) -> list[ConsoleLin
     """
     lines: dict[tuple[float, int, int], ConsoleLine] = {}
     left = _MAX_READ
-    for count, fields in enumerate(recording.decoded(schema.CONSOLE_TOPIC, max_bytes=_MAX_MESSAGE)):
+    for count, fields in enumerate(recording.table(schema.CONSOLE_TOPIC).decoded(max_bytes=_MAX_MESSAGE)):
         number, started, seconds = (fields[name] for name in ("stream", "started", "seconds"))
         if number >= len(STREAMS) or not abs(seconds) < float("inf"):
             raise RecordingError(

@@ -1,6 +1,6 @@
 """Extras: the values that a loop records with its steps, such as an agent's value estimates or logits.
 
-    extras = recording.extras("train")            # a mapping: name -> dtype, with its shape
+    extras = recording.train.extras               # a mapping: name -> dtype, with its shape
     extras.of_episode(3)["logits"]                # [T, 2], masked at steps without the value
     for block in extras.blocks():                 # NumPy records, some thousands at a time
         print(block["step"], block["values"]["value"])
@@ -165,7 +165,7 @@ class Extras(Mapping[str, np.dtype[np.generic]]):
     def of_episode(self, episode: int) -> dict[str, MaskedArray]:
         """Return the extras along an episode by name, [T, *shape] each, masked where a step has none.
 
-        They stand in the order of `Recording.episode_steps`.
+        They stand in the order of `Phase.episode_steps`.
 
         Raises:
             RecordingError: there is no such episode, or it is too long for an array.

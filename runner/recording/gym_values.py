@@ -106,9 +106,11 @@ def filler(leaves: Sequence[Leaf], column: Array, batch: tuple[int, ...] = ()) -
     """Return a function that puts a value of a space into a row of a column.
 
     Args:
-        column: [rows, *batch] values of the space.
+        column: [rows, *batch] values of the space; objects where they vary in size, which hold their bytes.
         batch: the shape of the batch that each value is, if it is one.
     """
+    if column.dtype.hasobject:
+        return _bytes_filler(leaves, column, batch)
     if len(leaves) == 1 and not leaves[0].part.keys:
         return _leaf_filler(leaves[0], column, batch)
     fillers = [(leaf, leaf.part.keys, _leaf_filler(leaf, _column_of(leaf, column), batch)) for leaf in leaves]
@@ -122,6 +124,16 @@ def filler(leaves: Sequence[Leaf], column: Array, batch: tuple[int, ...] = ()) -
             except (TypeError, LookupError) as error:
                 raise leaf.refused(error) from error
             put_leaf(row, inside)
+
+    return put
+
+
+def _bytes_filler(leaves: Sequence[Leaf], column: Array, batch: tuple[int, ...]) -> Put:
+    places = list(np.ndindex(*batch))
+
+    def put(row: int, value: Value) -> None:
+        for place in places:
+            column[row, *place] = value_bytes(leaves, value, place)
 
     return put
 
@@ -198,12 +210,14 @@ def filler_by_agent(
     return put
 
 
-def value_bytes(leaves: Sequence[Leaf], value: object) -> bytes:
-    """Return a value of a space as its bytes in a recording."""
+def value_bytes(leaves: Sequence[Leaf], value: object, place: tuple[int, ...] = ()) -> bytes:
+    """Return a value of a space, or the one at a place of a batch, as its bytes in a recording."""
     pieces = []
     for leaf in leaves:
         try:
             inside = leaf.part.of(value)
+            for i in place:
+                inside = inside[i]
             if leaf.part.text is not None:
                 pieces.append(encode_text(leaf.part.text(inside)))
             else:

@@ -175,7 +175,7 @@ def read_host(recording: TopicReader, clock: Clock | None) -> HostMetrics | None
     rows: list[tuple[float, ...]] = []
     gpus: list[list[list[float]]] = []
     name = schema.HOST_TOPIC.name
-    for fields in recording.decoded(schema.HOST_TOPIC, max_bytes=_BYTES):
+    for fields in recording.table(schema.HOST_TOPIC).decoded(max_bytes=_BYTES):
         own = [fields[name] for name in GPU_FIELDS]
         if len(rows) == MAX_SAMPLES or len({len(each) for each in own}) > 1 or len(own[0]) > MAX_GPUS:
             raise RecordingError(

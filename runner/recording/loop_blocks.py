@@ -124,10 +124,10 @@ def check_without_steps(recording: Recording, phase: str, on_block: OnBlock) -> 
             pass
     expected = 0
     last = 0
-    for rows in recording.actions(phase):
+    for rows in recording.phase(phase).steps.rows():
         if rows["step"][0] != expected or (np.diff(rows["log_time"].astype(np.int64)) <= 0).any():
             raise Inconsistent(
-                f"{own.actions.topic.name}: found step {rows['step'][0]:,}, expected {expected:,}"
+                f"{own.steps.actions.topic.name}: found step {rows['step'][0]:,}, expected {expected:,}"
             )
         expected, last = expected + len(rows), int(rows["log_time"][-1])
     return last
@@ -182,16 +182,16 @@ class Queue:
 def records_of(
     recording: Recording, table: TopicChunks, on_block: OnBlock = lambda *_: None
 ) -> Iterator[NDArray[np.void]]:
-    """Yield the records of a topic in blocks, as `Recording.rows` does.
+    """Yield the records of a topic in blocks, as `TopicChunks.rows` does.
 
     Raises:
         Inconsistent: messages are not numbered consecutively, or are of actions without their steps.
     """
     topic, first = table.topic, 0
     number = schema.NUMBERED_BY[topic.message]
-    if topic.message in schema.STEP_MESSAGES and recording.has_actions_alone(topic.phase):
+    if topic.message in schema.STEP_MESSAGES and recording.phase(topic.phase).steps.are_actions:
         raise Inconsistent(f"{topic.name}: found actions alone, expected whole steps as in the configuration")
-    for block in recording.rows(table):
+    for block in table.rows():
         if table.dtype is not None:
             on_block(topic, block)
         if (wrong := np.flatnonzero(block[number] != first + np.arange(len(block)))).size:

@@ -88,6 +88,13 @@ def encode(message: MessageType, values: Mapping[str, object]) -> bytes:
     return bytes(message_class(message)(**values).SerializeToString(deterministic=True))
 
 
+def encode_rows(message: MessageType, rows: NDArray[np.void]) -> list[bytes]:
+    """Return a message for each record."""
+    names = [field.name for field in message.fields]
+    columns = (rows[name].tolist() for name in names)
+    return [encode(message, dict(zip(names, values, strict=True))) for values in zip(*columns, strict=True)]
+
+
 def scalar_encoder(name: str, phase: str) -> Callable[[float, int, int], bytes]:
     """Return a function that encodes `dualtaxi.Scalar` messages, from value, step and episode.
 

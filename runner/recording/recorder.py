@@ -20,6 +20,7 @@ from runner.recording import schema
 from runner.recording.blocks import blank_records, message_record
 from runner.recording.clock import Stopwatch
 from runner.recording.digest import combined_digest
+from runner.recording.messages import encode_rows
 from runner.recording.observer import Observer
 from runner.recording.pipeline import MessageBatches, Pipeline
 from runner.recording.reference import Reference
@@ -350,6 +351,10 @@ class Recorder:
             Diverged: a record differs from the one that the recording already holds.
         """
         lane, block = self._lanes[topic], self._open(topic)
+        if lane.dtype.hasobject:  # messages of varying size, and the block is filled again
+            payloads = encode_rows(topic.message, block.records[: len(positions)])
+            self.extend(topic, payloads, positions.tolist())
+            return
         has_reference = self._reference.remaining(topic) > 0
         fresh: Records = block.records[block.filled : block.filled + len(positions)]
         times = positions * np.uint64(STEP_NANOSECONDS)

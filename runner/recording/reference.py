@@ -43,11 +43,11 @@ class Reference:
         if recording is None:
             return
         for topic in BLOCK_TOPICS:
-            self._remaining[topic] = recording.count(topic)
-            self._blocks[topic] = recording.blocks(topic)
+            self._remaining[topic] = recording.table(topic).count()
+            self._blocks[topic] = recording.table(topic).blocks()
         for topic in set(schema.TOPICS) - set(BLOCK_TOPICS) - {schema.LOG_TOPIC}:
-            self._messages[topic] = recording.messages(topic)
-        self._logged = set(recording.messages(schema.LOG_TOPIC))
+            self._messages[topic] = recording.table(topic).messages()
+        self._logged = set(recording.table(schema.LOG_TOPIC).messages())
 
     def remaining(self, topic: Topic) -> int:
         """Return how many messages of a fixed-width topic are still to be compared."""

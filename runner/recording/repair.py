@@ -150,9 +150,9 @@ def _read_back(fresh: Path, done: Repair, report: Report) -> None:
     with open_recording(fresh) as recording:
         for topic in recording.topics:
             if topic in recording.dtypes:
-                found = sum(len(block) for block in recording.blocks(topic))
+                found = sum(len(block) for block in recording.table(topic).blocks())
             else:
-                found = recording.count(topic)
+                found = recording.table(topic).count()
             expected = done.kept.get(topic.name, 0)
             if found != expected:
                 raise RecordingError(f"{fresh}: found {found} messages of {topic.name}, expected {expected}.")

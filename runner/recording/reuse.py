@@ -33,10 +33,10 @@ class PackedChunks:
         They must be packed as the recording that they are used for. Damaged ones are not used.
         """
         try:
-            steps = recording.count(schema.TRAIN_STEP)
+            steps = recording.train.steps.count()
             for topic in schema.BLOCK_TOPICS:
                 recording.table(topic).holding(0)
-            after = [block["log_time"][0] for block in recording.blocks(schema.TRAIN_STEP, step, step + 1)]
+            after = [block["log_time"][0] for block in recording.train.steps.blocks(step, step + 1)]
         except (RecordingError, OSError):
             return None
         return cls(recording, int(after[0]) if after else 2**64) if steps else None

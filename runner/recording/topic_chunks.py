@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Final, NamedTuple, TypeVar
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from runner.recording.blocks import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, topic_dtype
 from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry
 from runner.recording.index import ChunkTable, Index
 from runner.recording.messages import Message, decode
@@ -20,6 +21,12 @@ from runner.recording.record_store import RecordStore
 from runner.recording.schema import ALL_TOPICS, EXTRA_TOPICS, STEP_NANOSECONDS, Topic
 
 M = TypeVar("M")
+FOREVER: Final = 2**63 - 1
+"""A time in nanoseconds that no message has."""
+_OBJECT: Final = np.dtype(object)
+_ROWS: Final = 1024
+_ROWS_BYTES: Final = 16 << 20
+"""The most messages of varying size in a block of `rows`, and the bytes of values with which one ends."""
 _MANY: Final = 32
 """The least number of chunks of one size whose topic is inferred instead of unpacking them."""
 
@@ -120,43 +127,42 @@ class ChunkSpan(NamedTuple):
     entry: ChunkEntry
 
 
+@dataclass(frozen=True, eq=False)
+class ChunkFile:
+    """What the topics of a recording share."""
+
+    path: str
+    chunks: ChunkTable
+    store: RecordStore
+    learners: int
+    environments: int
+    """How many environments take turns."""
+
+
+@dataclass(eq=False)
 class TopicChunks:
     """The chunks of a topic, in order.
 
     Messages are numbered as recorded; where a repair lost some, the numbers continue after the gap.
-
-    Args:
-        places: which chunks of the file hold it.
-        dtype: of a message record; None if messages vary in size.
-        lost: ranges (first, stop) of the numbers of messages that a repair could not save.
     """
 
-    def __init__(
-        self,
-        topic: Topic,
-        places: NDArray[np.intp],
-        table: ChunkTable,
-        store: RecordStore,
-        dtype: np.dtype[np.void] | None,
-        lost: Sequence[Sequence[int]],
-        path: str,
-    ) -> None:
-        self.topic = topic
-        self.dtype = dtype
-        self._places = places
-        self._table = table
-        self._store = store
-        self._lost = lost
-        self._path = path
-        self._last: tuple[bytes, NDArray[np.void]] | None = None
-        """The records of a chunk that was checked last, and the array of them."""
+    file: ChunkFile
+    topic: Topic
+    places: NDArray[np.intp]
+    """The chunks of the file that hold it, by number."""
+    dtype: np.dtype[np.void] | None
+    """Of a message record; None if messages vary in size."""
+    lost: Sequence[Sequence[int]] = ()
+    """Ranges (first, stop) of the numbers of messages that a repair could not save."""
+    _last: tuple[bytes, NDArray[np.void]] | None = field(default=None, init=False)
+    """The records of a chunk that was checked last, and the array of them."""
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self.places)
 
     def entry(self, k: int) -> ChunkEntry:
         """Return the entry of chunk number k in the file's table."""
-        return self._table[int(self._places[k])]
+        return self.file.chunks[int(self.places[k])]
 
     def count(self) -> int:
         """Return the number after that of the last message; where messages vary in size, by reading them."""
@@ -179,17 +185,91 @@ class TopicChunks:
         chunks = range(
             int(np.searchsorted(ends, start, side="right")), int(np.searchsorted(firsts, stop, side="left"))
         )
-        for k, data in zip(chunks, self._store.chunks(map(self.entry, chunks)), strict=True):
+        for k, data in zip(chunks, self.file.store.chunks(map(self.entry, chunks)), strict=True):
             first = int(firsts[k])
             yield self._block(k, data)[max(start - first, 0) : stop - first]
 
-    def blocks_between(self, times: range) -> Iterator[NDArray[np.void]]:
-        """Yield the messages with a `log_time` in a range, in ns; they must have one size."""
+    def array(self, start: int = 0, stop: int | None = None) -> NDArray[np.void]:
+        """Return the messages number `start` up to `stop` as one array; they must have one size."""
+        blocks = list(self.blocks(start, stop))
+        return np.concatenate(blocks) if blocks else np.empty(0, self.dtype)
+
+    def rows(self, times: range | None = None) -> Iterator[NDArray[np.void]]:
+        """Yield the messages as records in blocks, also those that vary in size.
+
+        Values of varying size are objects: the bytes that `spaces.decode` takes.
+
+        Args:
+            times: their `log_time` in ns, from the first to before the last; None for all.
+
+        Raises:
+            RecordingError: they are damaged.
+        """
+        if self.dtype is None:
+            return self._decoded_rows(times=times)
+        return self.blocks() if times is None else self._blocks_between(times)
+
+    def numbered(self, numbers: range) -> Iterator[NDArray[np.void]]:
+        """Yield the messages of these numbers in blocks, as `rows` does."""
+        for block in self._blocks_from(numbers.start, numbers.stop) if numbers else ():
+            first = int(block[self._number][0])
+            if first >= numbers.stop:
+                return
+            begin = numbers.start - first
+            rows = block[max(begin, begin % numbers.step) : numbers.stop - first : numbers.step]
+            if len(rows):
+                yield rows
+
+    def _blocks_from(self, start: int, stop: int) -> Iterator[NDArray[np.void]]:
+        """Yield blocks as `rows` does, the first of which begins with message number `start` or before it."""
+        if self.dtype is not None:
+            return self.blocks(start, stop)
+        k = bisect_right(range(len(self)), start, key=lambda k: self._rows_of(k)[self._number][0])
+        return self._decoded_rows(chunks=range(max(k - 1, 0), len(self)))
+
+    def _rows_of(self, k: int) -> NDArray[np.void]:
+        """Return the messages of chunk number k as records."""
+        if self.dtype is not None:
+            return self._block(k, self.file.store.chunk(self.entry(k)))
+        return np.concatenate(list(self._decoded_rows(chunks=range(k, k + 1))))
+
+    @property
+    def _number(self) -> str:
+        """The field that numbers the messages."""
+        return schema.NUMBERED_BY[self.topic.message]
+
+    @property
+    def row_dtype(self) -> np.dtype[np.void]:
+        """The dtype of `rows`."""
+        if self.dtype is None:
+            return topic_dtype(self.topic, self.file.learners, 0, _OBJECT, _OBJECT)
+        return self.dtype
+
+    def _decoded_rows(
+        self, times: range | None = None, chunks: range | None = None
+    ) -> Iterator[NDArray[np.void]]:
+        learners, size = self.file.learners, 0
+        messages: list[Message] = []
+        for message in self.decoded(times=times, chunks=chunks):
+            if len(rewards := message.get("rewards", [0.0] * learners)) != learners:
+                raise RecordingError(
+                    f"{self.file.path}: {self.topic.name}, {self._number} {message[self._number]}: found "
+                    f"{len(rewards)} rewards, expected {learners}."
+                )
+            messages.append(message)
+            size += sum(len(value) for value in message.values() if isinstance(value, bytes))
+            if len(messages) == _ROWS or size > _ROWS_BYTES:
+                yield _records_of(messages, self.row_dtype)
+                messages, size = [], 0
+        if messages:
+            yield _records_of(messages, self.row_dtype)
+
+    def _blocks_between(self, times: range) -> Iterator[NDArray[np.void]]:
         firsts, ends = self._numbers
         if not len(firsts):
             return
         start, stop = np.uint64(max(times.start, 0)), np.uint64(max(times.stop, 0))
-        spans = self._table.columns[self._places]
+        spans = self.file.chunks.columns[self.places]
         first, end = np.searchsorted(spans["end_time"], start), np.searchsorted(spans["start_time"], stop)
         if first >= end:
             return
@@ -200,26 +280,29 @@ class TopicChunks:
 
     def first_from(self, field: str, value: int) -> int:
         """Return the number of the first message of that value or more in a field that never decreases."""
-        firsts, ends = (numbers.tolist() for numbers in self._numbers)
-        k = bisect_left(ends, value, key=lambda end: next(self.blocks(end - 1, end))[field][0])
-        if k == len(ends):
+        k = bisect_left(range(len(self)), value, key=lambda k: self._rows_of(k)[field][-1])
+        if k == len(self):
             return self.count()
-        block = next(self.blocks(firsts[k], ends[k]))
-        return int(firsts[k]) + int(np.searchsorted(block[field], value))
+        rows = self._rows_of(k)
+        at = int(np.searchsorted(rows[field], value))
+        return int(rows[self._number][at] if self.dtype is None else self._numbers[0][k] + at)
 
-    def messages(self, first_chunk: int = 0, times: range | None = None) -> Iterator[tuple[int, bytes]]:
-        """Yield (log time in nanoseconds, payload) of the messages from a chunk on.
+    def messages(
+        self, times: range | None = None, chunks: range | None = None
+    ) -> Iterator[tuple[int, bytes]]:
+        """Yield (log time in nanoseconds, payload) of the messages.
 
         Args:
             times: of the log times, from the first to before the last; None for all.
+            chunks: the numbers of the chunks to read; None for all.
         """
-        chunks = np.arange(first_chunk, len(self))
-        if times is not None and len(chunks):
-            spans = self._table.columns[self._places[first_chunk:]]
+        numbers = np.array(range(len(self)) if chunks is None else chunks, np.intp)
+        if times is not None and len(numbers):
+            spans = self.file.chunks.columns[self.places[numbers]]
             start, stop = np.uint64(max(times.start, 0)), np.uint64(max(times.stop, 0))
-            chunks = chunks[(spans["end_time"] >= start) & (spans["start_time"] < stop)]
-        for k in chunks.tolist():
-            data, at = self._store.chunk(self.entry(k)), 0
+            numbers = numbers[(spans["end_time"] >= start) & (spans["start_time"] < stop)]
+        for k in numbers.tolist():
+            data, at = self.file.store.chunk(self.entry(k)), 0
             while at < len(data):
                 if at + HEADER_BYTES > len(data):
                     raise self._damaged(k, f"stray bytes at {at}")
@@ -233,40 +316,41 @@ class TopicChunks:
                 at = end
 
     def decoded(
-        self, max_bytes: int = MAX_CHUNK_BYTES, times: range | None = None, first_chunk: int = 0
+        self, max_bytes: int = MAX_CHUNK_BYTES, times: range | None = None, chunks: range | None = None
     ) -> Iterator[Message]:
         """Yield the messages of a topic of variable size: `log_time` and the fields, by name.
 
         Args:
             max_bytes: the largest message that is accepted.
             times: in ns, from the first to before the last; None for all.
+            chunks: the numbers of the chunks to read; None for all.
 
         Raises:
             RecordingError: one cannot be read, or has more than `max_bytes` bytes.
         """
         parse = partial(decode, self.topic.message)
-        for time, fields in self.parsed(parse, first_chunk, max_bytes, times):
+        for time, fields in self.parsed(parse, max_bytes, times, chunks):
             yield {"log_time": time} | fields
 
     def parsed(
         self,
         parse: Callable[[bytes], M],
-        first_chunk: int = 0,
         max_bytes: int = MAX_CHUNK_BYTES,
         times: range | None = None,
+        chunks: range | None = None,
     ) -> Iterator[tuple[int, M]]:
         """Yield (log time in nanoseconds, parsed message) of the messages, in order.
 
         Raises:
             RecordingError: one cannot be parsed, or has more than `max_bytes` bytes; it is named.
         """
-        for time, payload in self.messages(first_chunk, times):
+        for time, payload in self.messages(times, chunks):
             try:
                 if len(payload) > max_bytes:
                     raise RecordingError(f"found {len(payload):,} bytes, expected at most {max_bytes:,}.")
                 message = parse(payload)
             except RecordingError as error:
-                raise RecordingError(f"{self._path}: {self.topic.name} at {time} ns: {error}") from error
+                raise RecordingError(f"{self.file.path}: {self.topic.name} at {time} ns: {error}") from error
             yield time, message
 
     @cached_property
@@ -274,19 +358,19 @@ class TopicChunks:
         """The number of each chunk's first message, and the number after its last."""
         if self.dtype is None and self:
             raise RecordingError(
-                f"{self._path}: the messages of {self.topic.name} vary in size; read them one by one."
+                f"{self.file.path}: the messages of {self.topic.name} vary in size; read them one by one."
             )
         width = 1 if self.dtype is None else self.dtype.itemsize
         sizes = np.empty(0, np.int64)
         if len(self):
-            sizes = self._table.columns["uncompressed_size"][self._places].astype(np.int64)
+            sizes = self.file.chunks.columns["uncompressed_size"][self.places].astype(np.int64)
         if (odd := np.flatnonzero(sizes % width)).size:
             k = int(odd[0])
             raise self._damaged(k, f"{sizes[k]} bytes, not a multiple of {width}")
         counts = sizes // width
         ends = np.cumsum(counts)
         firsts = ends - counts
-        for start, stop in self._lost:
+        for start, stop in self.lost:
             after = firsts >= start
             firsts[after] += stop - start
             ends[after] += stop - start
@@ -306,7 +390,14 @@ class TopicChunks:
         return block
 
     def _damaged(self, k: int, found: str) -> RecordingError:
-        return _damaged(self._path, self.entry(k), found)
+        return _damaged(self.file.path, self.entry(k), found)
+
+
+def _records_of(messages: Sequence[Message], dtype: np.dtype[np.void]) -> NDArray[np.void]:
+    records = np.zeros(len(messages), dtype)
+    for name in messages[0]:
+        records[name] = [message[name] for message in messages]
+    return records
 
 
 def _damaged(path: str, entry: ChunkEntry, found: str) -> RecordingError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -14,26 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry
+from runner.recording.chunks import ChunkEntry
 from runner.recording.description import RunDescription
+from runner.recording.extras import ExtraLayout, read_layouts
 from runner.recording.index import read_index
-from runner.recording.messages import Message, Scalars, decode_scalars
+from runner.recording.messages import Scalars, decode_scalars
 from runner.recording.metadata import check_file, dtypes_of
 from runner.recording.record_store import RecordStore
-from runner.recording.schema import PHASE_NAMES, SCALAR_TOPIC, PhaseTopics, Topic, topics_of
-from runner.recording.topic_chunks import TopicChunks, chunks_by_topic
+from runner.recording.schema import EXTRA_COLUMNS_TOPIC, SCALAR_TOPIC, STEP_MESSAGES, Topic, topics_of
+from runner.recording.steps import Steps
+from runner.recording.topic_chunks import ChunkFile, TopicChunks, chunks_by_topic
 
 _MAX_SCALARS: Final = 8_192
-
-
-class Phase:
-    """A phase of an open recording: the messages of each of its topics."""
-
-    def __init__(self, name: str, topics: PhaseTopics, chunks: Callable[[Topic], TopicChunks]) -> None:
-        self.name, self.title = name, PHASE_NAMES[name]
-        self.steps, self.actions, self.episodes = map(chunks, (topics.steps, topics.actions, topics.episodes))
-        self.resets, self.reset_states = map(chunks, (topics.resets, topics.reset_states))
-        self.infos, self.frames, self.metrics = map(chunks, (topics.infos, topics.frames, topics.metrics))
 
 
 class TopicReader(RunDescription):
@@ -61,8 +53,7 @@ class TopicReader(RunDescription):
         except BaseException:
             self.close()
             raise
-        self._topic_chunks: dict[Topic, TopicChunks] = {}
-        self._phases: dict[str, Phase] = {}
+        self._tables: dict[Topic, TopicChunks] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -95,7 +86,7 @@ class TopicReader(RunDescription):
         Raises:
             RecordingError: there is none of that name, or it cannot be read.
         """
-        return self._store.metadata(name, *self._place("metadata", self._index.metadata, name))
+        return self._store.metadata(name, *self._position("metadata", self._index.metadata, name))
 
     @property
     def metadata_names(self) -> list[str]:
@@ -118,9 +109,9 @@ class TopicReader(RunDescription):
         Raises:
             RecordingError: there is none of that name, or it is damaged.
         """
-        return self._store.attachment(name, *self._place("attachment", self._index.attachments, name))[1]
+        return self._store.attachment(name, *self._position("attachment", self._index.attachments, name))[1]
 
-    def _place(self, kind: str, places: Mapping[str, tuple[int, int]], name: str) -> tuple[int, int]:
+    def _position(self, kind: str, places: Mapping[str, tuple[int, int]], name: str) -> tuple[int, int]:
         if name not in places:
             raise RecordingError(
                 f"{self.path}: has no {kind} {name!r}; it was cut off, or not written by dualtaxi."
@@ -132,12 +123,6 @@ class TopicReader(RunDescription):
         """The dtype of each fixed-width topic's message records in this recording."""
         return dtypes_of(self.run, str(self.path))
 
-    def phase(self, name: str) -> Phase:
-        """Return a phase, `train` or `eval`."""
-        if name not in self._phases:
-            self._phases[name] = Phase(name, topics_of(self.kind, name), self.table)
-        return self._phases[name]
-
     def topic(self, name: str) -> Topic:
         """Return the topic of that name, such as `/train/step`.
 
@@ -148,14 +133,6 @@ class TopicReader(RunDescription):
             raise RecordingError(f"{self.path}: has no topic {name!r}: it is of the kind {self.kind!r}.")
         return self._topics_by_name[name]
 
-    def blocks(self, topic: Topic, start: int = 0, stop: int | None = None) -> Iterator[NDArray[np.void]]:
-        """Yield the messages number `start` up to `stop` of a fixed-width topic, a chunk at a time.
-
-        Each block is a read-only structured array with the fields of the message, and those of the MCAP
-        record (`log_time` in nanoseconds, ...).
-        """
-        return self.table(topic).blocks(start, stop)
-
     def chunk_body(self, entry: ChunkEntry) -> memoryview:
         """Return the body of a chunk's record, still packed; safe to call from several threads.
 
@@ -164,48 +141,52 @@ class TopicReader(RunDescription):
         """
         return self._store.chunk_body(entry)
 
-    def messages(self, topic: Topic, first_chunk: int = 0) -> Iterator[tuple[int, bytes]]:
-        """Yield (log time in nanoseconds, payload) of a topic's messages, in order."""
-        return self.table(topic).messages(first_chunk)
-
-    def decoded(
-        self, topic: Topic, max_bytes: int = MAX_CHUNK_BYTES, times: range | None = None
-    ) -> Iterator[Message]:
-        """Yield the messages of a topic of variable size, as `TopicChunks.decoded` does."""
-        return self.table(topic).decoded(max_bytes, times)
-
     def scalars(self) -> Iterator[Scalars]:
         """Yield the values that a loop logged, thousands at a time, as columns.
 
         Raises:
             RecordingError: a message cannot be read.
         """
-        messages = self.table(SCALAR_TOPIC).parsed(bytes)
+        scalars = self.table(SCALAR_TOPIC)
+        messages = scalars.parsed(bytes)
         while batch := list(islice(messages, _MAX_SCALARS)):
             try:
                 yield decode_scalars(batch)
             except RecordingError:
-                for _ in self.decoded(SCALAR_TOPIC):  # names the message
+                for _ in scalars.decoded():  # names the message
                     pass
                 raise
 
-    def table(self, topic: Topic) -> TopicChunks:
-        """Return the messages of a topic, or of this recording's own topic of that name: the kinds differ."""
-        own = self._topics_by_name.get(topic.name, topic)
-        if own not in self._topic_chunks:
-            self._topic_chunks[own] = TopicChunks(
-                own,
-                self._chunk_numbers[own],
-                self._index.chunks,
-                self._store,
-                self.dtypes.get(own),
-                self.lost.get(own.name, []),
-                str(self.path),
-            )
-        return self._topic_chunks[own]
+    def table(self, topic: Topic | str) -> TopicChunks:
+        """Return the messages of a topic, or of this recording's own topic of that name: the kinds differ.
+
+        Raises:
+            RecordingError: a recording of its kind has no topic of that name.
+        """
+        own = self.topic(topic) if isinstance(topic, str) else self._topics_by_name.get(topic.name, topic)
+        if own not in self._tables:
+            lost = self.lost.get(own.name, [])
+            dtype = self.dtypes.get(own)
+            chunks = self._file, own, self._places[own], dtype, lost
+            if own.message in STEP_MESSAGES:
+                actions = self.table(topics_of(self.kind, own.phase).actions)
+                self._tables[own] = Steps(*chunks, actions=actions)
+            else:
+                self._tables[own] = TopicChunks(*chunks)
+        return self._tables[own]
 
     @cached_property
-    def _chunk_numbers(self) -> Mapping[Topic, NDArray[np.intp]]:
+    def extra_layouts(self) -> list[ExtraLayout]:
+        """The names of extras, from when on; each entry has those of the one before it."""
+        columns = self.table(EXTRA_COLUMNS_TOPIC).decoded()
+        return read_layouts(((fields["log_time"], fields["json"]) for fields in columns), str(self.path))
+
+    @cached_property
+    def _file(self) -> ChunkFile:
+        return ChunkFile(str(self.path), self._index.chunks, self._store, len(self.agents), self.environments)
+
+    @cached_property
+    def _places(self) -> Mapping[Topic, NDArray[np.intp]]:
         """The numbers of the chunks of the file that hold each topic."""
         return chunks_by_topic(self._index, self._store, self.dtypes, str(self.path))
 

@@ -212,7 +212,7 @@ def _are_separate(recording: Recording) -> bool:
     """
     if any(map(recording.has_own_maker, schema.PHASES)) or "content_digest" in recording.result:
         return any(map(recording.has_own_maker, schema.PHASES))
-    if not all(map(recording.has_actions_of, schema.PHASES)):
+    if not all(phase.steps.are_known for phase in recording.phases):
         return False
     phase, changes = "", 0
     for piece in pieces(recording, schema.PHASES):

@@ -83,7 +83,7 @@ def redo(
     for episode in episodes:
         own = phase or "train"
         if draw_from:
-            span = recording.episode_span(own, episode)
+            span = recording.phase(own).episode_span(episode)
             first = span[draw_from - 1] if draw_from <= len(span) else span.stop
             begin = partial(begin, draw_from=first)
         for steps in redo_episode(recording, own, episode, begin):

@@ -82,7 +82,7 @@ def episode_at(
     Raises:
         CannotRedo: the environment differs from the recording, or cannot be brought there.
     """
-    span, n = recording.episode_span(phase, number), recording.environments
+    span, n = recording.phase(phase).episode_span(number), recording.environments
     if not 0 <= t < len(span):
         raise NotInRecording(
             f"{recording.path}: found no step {t:,} of {schema.PHASE_NAMES[phase]} episode {number}; it has "
@@ -126,8 +126,8 @@ def _target(recording: Recording, phase: str, number: int) -> _Target:
     Raises:
         RecordingError: there is no such episode, or it has no reset.
     """
-    span, n = recording.episode_span(phase, number), recording.environments
-    ended = recording.episodes(phase, number, number + 1)
+    own, n = recording.phase(phase), recording.environments
+    span, ended = own.episode_span(number), own.episodes.array(number, number + 1)
     stop_time = int(ended["log_time"][0]) if len(ended) else _step_time(recording, phase, span[-1])
     for reset in _resets_back(recording, phase, stop_time):
         if reset.environment % n == span[0] % n and reset.step <= span[0]:
@@ -138,13 +138,9 @@ def _target(recording: Recording, phase: str, number: int) -> _Target:
 
 def _step_time(recording: Recording, phase: str, step: int) -> int:
     steps = recording.phase(phase).steps
-    if steps.dtype is not None and not recording.has_actions_alone(phase):
-        blocks = steps.blocks(step, step + 1)
-    else:
-        blocks = (block[block["step"] == step] for block in recording.rows(steps))
-    if (time := next((int(block["log_time"][0]) for block in blocks if len(block)), None)) is None:
-        raise RecordingError(f"{recording.path}: {steps.topic.name}: step {step:,} was lost.")
-    return time
+    for block in steps.numbered(range(step, step + 1)):
+        return int(block["log_time"][0])
+    raise RecordingError(f"{recording.path}: {steps.topic.name}: step {step:,} was lost.")
 
 
 def _resets_back(recording: Recording, phase: str, time: int) -> Iterator[RecordedReset]:

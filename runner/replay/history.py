@@ -39,7 +39,7 @@ def history_of(recording: Recording, state: int, step: int) -> StateHistory:
     while replay.step < step:
         first, stop = replay.step, min(replay.step + _STEPS_AT_ONCE, step)
         rows = replay.rows(stop)
-        steps = np.concatenate(list(recording.blocks(schema.TRAIN_STEP, first, stop)))
+        steps = recording.train.steps.array(first, stop)
         here = steps["state"] == state
         _count(history.visits, replay.own_actions[steps["action"][here]])
         pending = _note_changes(

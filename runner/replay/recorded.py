@@ -16,9 +16,9 @@ from runner.errors import RecordingError
 from runner.recording.loop_blocks import aligned
 from runner.recording.reader import Recording
 from runner.recording.reset_states import ResetState
-from runner.recording.row_reader import FOREVER
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.spaces import Value
+from runner.recording.topic_chunks import FOREVER
 
 _BLOCK_BYTES: Final = 16 << 20
 T = TypeVar("T")
@@ -112,12 +112,12 @@ def resets_of(
 ) -> Iterator[RecordedReset]:
     """Yield the resets of a phase in order, from `start_time` up to and with `stop_time`."""
     times = range(start_time, FOREVER if stop_time is None else stop_time + 1)
-    states = recording.reset_states(phase, times)
+    states = recording.phase(phase).reset_states(times)
     state = next(states, None)
     names = ("reset", "environment", "episode", "step", "log_time", "seed", "seeded")
     rows = (
         row
-        for block in recording.rows(recording.phase(phase).resets, times)
+        for block in recording.phase(phase).resets.rows(times)
         for row in zip(*(block[name].tolist() for name in names), block["observation"], strict=True)
     )
     for row, options, large_seed in _with_extras(recording, phase, rows, times):
@@ -198,9 +198,9 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
     blocks = aligned(_blocks(recording, phase, start_time, stop_time), n)
     rows = (block for block, _ in blocks if len(block))
     if "content_digest" not in recording.result:
-        stop = recording.whole_steps(phase)
+        stop = recording.phase(phase).whole_steps()
         rows = (whole for block in rows if len(whole := block[block["step"] < stop]))
-    nothing = np.empty(0, recording.row_dtype(recording.phase(phase).steps))
+    nothing = np.empty(0, recording.phase(phase).steps.row_dtype)
     for block in rows:
         first, time = int(block["step"][0]), int(block["log_time"][0]) - STEP_NANOSECONDS
         early = []
@@ -258,7 +258,7 @@ def _blocks(
     # A block of actions alone may have more steps than fit into memory when they are whole.
     width = 1 if table.dtype is None else table.dtype.itemsize * recording.environments
     rows = max(_BLOCK_BYTES // width, 1) * recording.environments
-    for block in recording.rows(table, range(start_time + 1, stop)):
+    for block in table.rows(range(start_time + 1, stop)):
         others = block["log_time"].astype(np.int64) // STEP_NANOSECONDS - block["step"]
         changes = (np.flatnonzero(np.diff(others)) + 1).tolist()
         for begin, end in pairwise(sorted({*changes, *range(0, len(block), rows), len(block)})):

@@ -103,7 +103,7 @@ class Stepper(ABC):
         self._recording = recording
         self.observation_space, self.action_space = self._spaces()
         self._learners = len(recording.agents)
-        phase, after = recording.phase("train"), "next_state" if recording.has_states else "next_observation"
+        phase, after = recording.train, "next_state" if recording.has_states else "next_observation"
         fields = (phase.steps.dtype, after), (phase.resets.dtype, "observation")
         self.dtypes = Dtypes(*(np.dtype(object) if own is None else own[name] for own, name in fields))
 

@@ -26,27 +26,28 @@ def step_of_episode(recording: Recording, episode: int) -> int:
     Raises:
         RecordingError: fewer episodes were recorded, or the last of them was lost.
     """
-    ended = recording.count(schema.TRAIN_EPISODE)
+    ended = recording.train.episodes.count()
     if not 0 <= episode <= ended:
         raise NotInRecording(
             f"{recording.path}: found {ended} training episodes, expected at least {episode}."
         )
     if episode == 0:
         return 0
-    record = recording.episodes("train", episode - 1, episode)
+    record = recording.train.episodes.array(episode - 1, episode)
     if not len(record):
         raise RecordingError(f"{recording.path}: training episode {episode - 1} was lost.")
     return int(record[0]["last_step"]) + 1
 
 
 def transitions_of(recording: Recording, phase: str, episode: int) -> Iterator[Any]:
-    """Yield an episode's steps one by one, as `Recording.transitions` yields them; memory is bounded."""
-    if recording.phase(phase).steps.dtype is not None:
+    """Yield an episode's steps one by one, as `Phase.transitions` yields them; memory is bounded."""
+    own = recording.phase(phase)
+    if own.steps.dtype is not None:
         for block in episode_blocks(recording, phase, episode):
             yield from block
         return
-    numbers = recording.episode_span(phase, episode)
-    yield from islice(recording.transitions(phase), numbers.start, numbers.stop)
+    numbers = own.episode_span(episode)
+    yield from islice(own.transitions(), numbers.start, numbers.stop)
 
 
 def episode_blocks(recording: Recording, phase: str, episode: int) -> Iterator[NDArray[np.void]]:
@@ -55,19 +56,18 @@ def episode_blocks(recording: Recording, phase: str, episode: int) -> Iterator[N
     Raises:
         RecordingError: the recording has no such episode, or steps of it were lost.
     """
-    numbers = recording.episode_span(phase, episode)
-    if recording.has_actions_alone(phase):
+    own = recording.phase(phase)
+    if own.steps.are_actions:
         yield whole_steps(recording, phase, episode)
         return
-    count = 0
-    for block in recording.phase(phase).steps.blocks(numbers.start, numbers.stop):
-        steps = block[(numbers.start - int(block["step"][0])) % numbers.step :: numbers.step]
+    numbers, count = own.episode_span(episode), 0
+    for steps in own.steps.numbered(numbers):
         count += len(steps)
         yield steps
     if count != len(numbers):
         raise RecordingError(
             f"{recording.path}: {len(numbers) - count:,} of the {len(numbers):,} steps of "
-            f"{schema.PHASE_NAMES[phase]} episode {episode} were lost."
+            f"{own.title} episode {episode} were lost."
         )
 
 
@@ -77,20 +77,20 @@ def steps_of(recording: Recording, phase: str, episode: int) -> NDArray[np.void]
     Raises:
         CannotRedo: only its actions were recorded, and its environment cannot be had.
     """
-    if recording.has_actions_alone(phase):
-        return whole_steps(recording, phase, episode)
-    return recording.episode_steps(phase, episode)
+    own = recording.phase(phase)
+    return whole_steps(recording, phase, episode) if own.steps.are_actions else own.episode_steps(episode)
 
 
 def reset_of(recording: Recording, phase: str, episode: int) -> Any | None:
-    """Return the reset that an episode of a loop began with, as `Recording.resets` yields it.
+    """Return the reset that an episode of a loop began with, as `Phase.reset_values` yields it.
 
     It is the last one of the episode's environment at or before its first step. None if it was lost.
     """
-    resets, numbers = recording.phase(phase).resets, recording.episode_span(phase, episode)
+    own = recording.phase(phase)
+    resets, numbers = own.resets, own.episode_span(episode)
     if resets.dtype is None:
         last = None
-        for reset in recording.resets(phase):
+        for reset in own.reset_values():
             if reset["step"] > numbers.start:
                 break
             last = reset
@@ -98,11 +98,9 @@ def reset_of(recording: Recording, phase: str, episode: int) -> Any | None:
     first, stop = (
         resets.first_from("step", number) for number in (numbers.start - 2 * numbers.step, numbers.start + 1)
     )
-    latest = None
-    for block in resets.blocks(first, stop):
-        own = block[block["environment"] % numbers.step == numbers.start % numbers.step]
-        latest = own[-1] if len(own) else latest
-    return latest
+    before = resets.array(first, stop)
+    before = before[before["environment"] % numbers.step == numbers.start % numbers.step]
+    return before[-1] if len(before) else None
 
 
 def recorded_frames(recording: Recording, phase: str, episode: int, start: int = 0) -> Iterator[Message]:
@@ -114,7 +112,7 @@ def recorded_frames(recording: Recording, phase: str, episode: int, start: int =
     Raises:
         RecordingError: the recording has no such episode, steps of it were lost, or its first frame.
     """
-    span, n = recording.episode_span(phase, episode), recording.environments
+    span, n = recording.phase(phase).episode_span(episode), recording.environments
     first = max(0, start - frames_every(recording))
     times = log_times_of(recording, phase, episode)
     # The frames of a vector come after the step of its last environment.
@@ -165,13 +163,13 @@ def environments_with_frames(recording: Recording, phase: str) -> Sequence[int]:
 
 def environment_of(recording: Recording, phase: str, episode: int) -> int:
     """Return the environment of an episode, among those of a vector."""
-    return recording.episode_span(phase, episode).start % recording.environments
+    return recording.phase(phase).episode_span(episode).start % recording.environments
 
 
 def last_step(recording: Recording) -> int:
     """Return the last training step at which the tables can be had."""
     snapshots = max((snapshot.step for snapshot in recording.snapshots()), default=0)
-    return max(snapshots, recording.count(schema.TRAIN_STEP))
+    return max(snapshots, recording.train.steps.count())
 
 
 def check_steps(block: NDArray[np.void], mdp: Mdp, where: str, phase: str = "training") -> None:

@@ -32,7 +32,7 @@ class TableReplay(StepReplay):
     def __init__(self, recording: Recording, step: int = 0) -> None:
         super().__init__(recording.config, recording.mdp, recording.seed or 0, str(recording.path))
         self._recording = recording
-        self._recorded = recording.count(schema.TRAIN_STEP)
+        self._recorded = recording.train.steps.count()
         self._checkpoints = Checkpoints(recording)
         self._origin: int | None = None
         """The step from which the recording alone moved the tables; None if they were set by hand."""
@@ -116,7 +116,7 @@ class TableReplay(StepReplay):
             raise RecordingError(f"a replay at step {first} cannot go back to {stop}; start another.")
         if stop > max(self._recorded, first):
             raise self._missing(stop)
-        for block in self._recording.blocks(schema.TRAIN_STEP, first, stop) if stop > first else ():
+        for block in self._recording.train.steps.blocks(first, stop) if stop > first else ():
             for part in np.split(block, [-self.step % CHECKPOINT_STEPS] if len(block) else []):
                 at = slice(self.step - first, self.step - first + len(part))
                 own = None if trace is None else Trace(trace.updates[at], trace.learner)
@@ -159,7 +159,7 @@ def known_steps(recording: Recording) -> list[tuple[int, int]]:
     They are known from each snapshot up to the first step that was lost in a repair, or not recorded.
     """
     lost = sorted((start, stop) for start, stop in recording.lost.get(schema.TRAIN_STEP.name, []))
-    recorded = recording.count(schema.TRAIN_STEP)
+    recorded = recording.train.steps.count()
     spans: list[tuple[int, int]] = []
     tables = len(recording.agents) * len(kinds_of(from_mapping(recording.config)))
     counts = Counter(snapshot.step for snapshot in recording.snapshots(0, tables))

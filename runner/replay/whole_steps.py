@@ -18,7 +18,7 @@ from runner.replay.redone import RedoneSteps
 
 
 def whole_steps(recording: Recording, phase: str, episode: int) -> NDArray[np.void]:
-    """Return the steps of an episode as `Recording.episode_steps` does, from its recorded actions.
+    """Return the steps of an episode as `Phase.episode_steps` does, from its recorded actions.
 
     The environment is made again in a child process with limits, from what is installed. The last episodes
     are kept for the next call.
@@ -27,7 +27,7 @@ def whole_steps(recording: Recording, phase: str, episode: int) -> NDArray[np.vo
         CannotRedo: the environment cannot be made, or is another one.
         RecordingError: actions of the episode were lost, or it is too long for an array.
     """
-    span, topic = recording.episode_span(phase, episode), recording.phase(phase).steps.topic
+    span, topic = recording.phase(phase).episode_span(episode), recording.phase(phase).steps.topic
     if len(span) * recording.dtypes[topic].itemsize > MAX_EPISODE_BYTES:
         raise RecordingError(
             f"{recording.path}: {phase} episode {episode} has {len(span):,} steps, too many to rerun for "
@@ -41,10 +41,8 @@ def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> NDArray[np
     from runner.replay.environment import redo_in_child  # loads Gymnasium
 
     with open_recording(path) as recording:
-        span, own = recording.episode_span(phase, episode), []
-        for block in recording.actions(phase):
-            inside = block[(block["step"] >= span.start) & (block["step"] < span.stop)]
-            own.append(inside[(inside["step"] - span.start) % span.step == 0])
+        span = recording.phase(phase).episode_span(episode)
+        own = list(recording.phase(phase).steps.numbered(span))
         if not own or not np.array_equal(np.concatenate([part["step"] for part in own]), span):
             raise RecordingError(f"{path}: steps of {PHASE_NAMES[phase]} episode {episode:,} were lost.")
         records = blank_steps(recording, phase, np.concatenate(own))

@@ -161,7 +161,7 @@ def read_checkpoints(recording: Recording, recordings: Path) -> list[Checkpoint]
         return []
     store = Store(recordings)
     checkpoints: list[Checkpoint] = []
-    for fields in recording.decoded(schema.CHECKPOINT_TOPIC, _MAX_MESSAGE):
+    for fields in recording.table(schema.CHECKPOINT_TOPIC).decoded(_MAX_MESSAGE):
         if not (
             DIGEST.fullmatch(fields["digest"])
             and is_checkpoint_name(fields["name"])

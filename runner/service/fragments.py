@@ -204,7 +204,7 @@ def typical_episode(path: Path) -> bytes:
 def latest_episode(path: Path) -> bytes:
     """Return the address of the training episode that ended last, as `typical_episode`; empty without one."""
     with open_recording(path) as recording:
-        ended = recording.phase("train").episodes.count()
+        ended = recording.train.episodes.count()
         return f"train/{ended - 1}".encode() if ended and recording.has_steps else b""
 
 
@@ -270,7 +270,7 @@ def pictures(path: Path) -> bytes:
     size = 0
     total = 0
     with open_recording(path) as recording:
-        for image in recording.decoded(schema.IMAGE_TOPIC):
+        for image in recording.table(schema.IMAGE_TOPIC).decoded():
             total, size = total + 1, size + len(image["data"])
             last.append((image["frame_id"], image["log_time"] // schema.STEP_NANOSECONDS, image["data"]))
             while len(last) > MAX_PICTURES or size > MAX_PICTURE_BYTES:

@@ -61,7 +61,7 @@ def loop_expectations(path: Path) -> dict[str, Any]:
     with open_recording(path) as recording:
         hashes = {phase: blake3() for phase in ("train", "eval")}
         for phase, whole in hashes.items():
-            for step in recording.transitions(phase):
+            for step in recording.phase(phase).transitions():
                 whole.update(repr(step).encode())
         return {
             "content_digest": recording.result["content_digest"],

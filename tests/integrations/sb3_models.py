@@ -20,7 +20,7 @@ def verified(run) -> str:
 def logged(run) -> list[tuple[str, float]]:
     """Return the names and values of logged numbers, in their order."""
     with runner.open_recording(run.recording) as recording:
-        return [(one["name"], one["value"]) for one in recording.decoded(recording.topic("/scalar"))]
+        return [(one["name"], one["value"]) for one in recording.table("/scalar").decoded()]
 
 
 def weights(model) -> dict[str, torch.Tensor]:

@@ -19,7 +19,7 @@ def recorded_steps(run):
     """Return the training steps of a finished run as one array, [T, N]."""
     assert verify(run.recording).finding == ""
     with runner.open_recording(run.recording) as recording:
-        steps = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+        steps = recording.train.steps.array()
         return steps.reshape(-1, N), json.loads(recording.run["spaces"])
 
 

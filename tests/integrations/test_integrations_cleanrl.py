@@ -53,7 +53,7 @@ def series(run, name):
     """Return (steps, the script's own steps) of the values that were logged under a name."""
     steps, own, last = [], [], None
     with runner.open_recording(run.recording) as recording:
-        for scalar in recording.decoded(SCALAR_TOPIC):
+        for scalar in recording.table(SCALAR_TOPIC).decoded():
             if scalar["name"] == "global_step":
                 last = scalar["value"]
             elif scalar["name"] == name:

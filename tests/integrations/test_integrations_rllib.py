@@ -73,11 +73,11 @@ def test_env_runners_and_evaluation_make_one_run(recordings):
         ]
         returns = [
             (one["step"], one["value"])
-            for one in recording.decoded(recording.topic("/scalar"))
+            for one in recording.table("/scalar").decoded()
             if one["name"] == "env_runners/episode_return_mean"
         ]
-        ended = recording.episodes("train")
-        assert {len(block) for block in recording.blocks(recording.topic("/eval/reset"))}
+        ended = recording.train.episodes.array()
+        assert {len(block) for block in recording.eval.resets.blocks()}
     steps = [result["num_env_steps_sampled_lifetime"] for result in results]
     expected = [result["env_runners"]["episode_return_mean"] for result in results]
     assert returns == list(zip(steps, expected, strict=True))
@@ -204,8 +204,8 @@ def test_agents_with_policies_of_their_own_and_a_shared_one(recordings, game, ma
         assert recorded.agents == ("agent_0", "agent_1", "agent_2", "agent_3")
         names = ["env-runner-1.0", "env-runner-1.1", "env-runner-2.0", "env-runner-2.1", "evaluation-1.0"]
         assert [shard.name for shard in recorded.shards][1:6] == names
-        steps = np.concatenate(list(recorded.blocks(recorded.topic("/train/step"))))
-        ended = recorded.episodes("train")
+        steps = recorded.train.steps.array()
+        ended = recorded.train.episodes.array()
     assert (steps["acted"] == 0b1111).all() == (game is rllib_games.at_once)
     over = ended[ended["terminated"] | ended["truncated"]]
     assert len(over) == results[-1]["env_runners"]["num_episodes_lifetime"]

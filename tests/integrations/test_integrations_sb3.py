@@ -68,7 +68,7 @@ def test_the_learning_curves_are_those_of_the_monitor(recordings):
     callback = Recording()
     PPO("MlpPolicy", envs, **SMALL).learn(1_000, callback=callback)
     with runner.open_recording(callback.run.recording) as recording:
-        episodes = np.concatenate(list(recording.blocks(recording.topic("/train/episode"))))
+        episodes = recording.train.episodes.array()
     monitored = [value for env in envs.envs for value in env.get_episode_rewards()]
     assert len(monitored) > 10
     assert sorted(episodes["returns"][:, 0]) == sorted(monitored)
@@ -94,7 +94,7 @@ def test_actions_that_environments_change_in_place_are_recorded_as_given(recordi
         envs.step(np.full((2, 1), 0.8, np.float32))
     envs.close()
     with runner.open_recording(envs.run.recording) as recording:
-        rows = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+        rows = recording.train.steps.array()
     assert np.array_equal(rows["action"], np.full((10, 1), 0.8, np.float32))
 
 
@@ -116,7 +116,7 @@ def test_rewards_and_observations_are_those_before_normalisation(recordings):
     watch, callback = Watch(), Recording()
     model.learn(500, callback=[watch, callback])
     with runner.open_recording(callback.run.recording) as recording:
-        rows = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+        rows = recording.train.steps.array()
     assert rows["rewards"][:, 0].tolist() == np.ravel(watch.rewards).tolist()
     assert (rows["terminated"] | rows["truncated"]).tolist() == np.ravel(watch.dones).tolist()
     ended = rows["next_observation"][rows["terminated"]]
@@ -185,7 +185,7 @@ def test_the_numbers_of_an_update_stand_at_its_step_once(
     model.learn(total, callback=[Stop(), callback], log_interval=log_interval)
     found: dict[int, dict[str, float]] = {}
     with runner.open_recording(callback.run.recording) as recording:
-        for one in recording.decoded(recording.topic("/scalar")):
+        for one in recording.table("/scalar").decoded():
             if one["name"].startswith("train/"):
                 own = found.setdefault(one["step"], {})
                 assert one["name"] not in own

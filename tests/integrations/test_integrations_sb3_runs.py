@@ -77,7 +77,7 @@ def test_evaluations_are_the_evaluation_phase_of_the_run(recordings, number):
     assert dict(logged(callback.run))["eval/mean_reward"] == pytest.approx(evaluation.last_mean_reward)
     assert callback.run.summary["train_steps"] == 256
     with runner.open_recording(callback.run.recording) as recording:
-        episodes = recording.episodes("eval")["returns"][:, 0]
+        episodes = recording.eval.episodes.array()["returns"][:, 0]
     assert len(episodes) >= 2 * 4
     if number == 1:
         assert episodes[-4:].mean() == pytest.approx(evaluation.last_mean_reward)
@@ -167,7 +167,7 @@ def test_the_callback_of_wandb_records_into_its_run(recordings, has_environment)
     assert found.summary["train_steps"] == (128 if has_environment else 0)
     assert (recordings.parent / "models" / run.id / "model.zip").is_file()
     with runner.open_recording(found.recording) as recording:
-        names = [scalar["name"] for scalar in recording.decoded(SCALAR_TOPIC)]
+        names = [scalar["name"] for scalar in recording.table(SCALAR_TOPIC).decoded()]
     assert names.count("train/loss") == 128 // SMALL["n_steps"]
     assert names[-1] == "after"
     if has_environment:

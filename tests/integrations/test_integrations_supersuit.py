@@ -23,8 +23,8 @@ def test_agents_of_games_are_recorded_with_their_last_observations_and_come_out_
             last += [info["terminal_observation"] for info in infos if "terminal_observation" in info]
     check_integrity(rec.run.recording)
     with open_recording(rec.run.recording) as recording:
-        episodes = recording.episodes("train")
-        steps = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+        episodes = recording.train.episodes.array()
+        steps = recording.train.steps.array()
     assert len(episodes) == len(last) == 12
     assert (episodes["length"] == 20).all()
     np.testing.assert_array_equal(steps["next_observation"][episodes["last_step"]], last)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 
 import gymnasium
-import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
@@ -48,8 +47,8 @@ def collector(env, frames=90, batches=4):
 
 def steps_of(run):
     with runner.open_recording(run.recording) as recording:
-        steps = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
-        resets = np.concatenate(list(recording.blocks(recording.topic("/train/reset"))))
+        steps = recording.train.steps.array()
+        resets = recording.train.resets.array()
         return steps, resets, json.loads(recording.run["spaces"])
 
 
@@ -134,7 +133,7 @@ def test_the_logger_logs_into_the_recording(recordings):
     collecting.shutdown()
     (run,) = runner.list_runs(recordings)
     with runner.open_recording(run.recording) as recording:
-        names = [one["name"] for one in recording.decoded(recording.topic("/scalar"))]
+        names = [one["name"] for one in recording.table("/scalar").decoded()]
     assert names.count("reward") == names.count("loss") == names.count("count") == 4
 
 

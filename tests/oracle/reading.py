@@ -112,10 +112,12 @@ def _phase_tables(recording: Recording, phase: str) -> Iterator[tuple[str, Table
             if one["reset_with"]
         ),
     )
-    yield "reset_states", _of_messages(state._asdict() for state in recording.reset_states(phase))
+    yield "reset_states", _of_messages(state._asdict() for state in recording.phase(phase).reset_states())
     yield "frames", _images(_decoded(recording, f"/{phase}/frame"))
-    for name in recording.extras(phase):
-        blocks = [block[block["given"][name]] for block in _with(recording.extras(phase).blocks(), name)]
+    for name in recording.phase(phase).extras:
+        blocks = [
+            block[block["given"][name]] for block in _with(recording.phase(phase).extras.blocks(), name)
+        ]
         if blocks:
             whole = {key: np.concatenate([block[key] for block in blocks]) for key in ("log_time", "step")}
             values = np.concatenate([block["values"][name] for block in blocks])
@@ -157,12 +159,12 @@ def _environment(recording: Recording) -> Table:
 
 
 def _steps(recording: Recording, phase: str, resets: Table) -> Table:
-    if recording.has_actions_alone(phase):
-        blocks = list(recording.actions(phase))
+    if recording.phase(phase).steps.are_actions:
+        blocks = list(recording.phase(phase).steps.rows())
         columns = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0].dtype.names}
         columns = {name: values for name, values in columns.items() if name in ("step", *KEPT_COLUMNS)}
     else:
-        columns = _values(recording, recording.transitions(phase))
+        columns = _values(recording, recording.phase(phase).transitions())
     if not columns:
         return {}
     if recording.has_states:
@@ -182,11 +184,11 @@ def _steps(recording: Recording, phase: str, resets: Table) -> Table:
 
 
 def _resets(recording: Recording, phase: str) -> Table:
-    return _of_columns(_positioned(_values(recording, recording.resets(phase))))
+    return _of_columns(_positioned(_values(recording, recording.phase(phase).reset_values())))
 
 
 def _episodes(recording: Recording, phase: str, resets: Table) -> Table:
-    episodes = recording.episodes(phase)
+    episodes = recording.phase(phase).episodes.array()
     if not len(episodes):
         return {}
     columns = {name: episodes[name] for name in episodes.dtype.names or () if _is_content(name)}
@@ -256,7 +258,7 @@ def _images(messages: Iterable[dict[str, Any]]) -> Table:
 def _decoded(recording: Recording, name: str) -> list[dict[str, Any]]:
     """Return the messages of a topic of variable size."""
     messages = []
-    for fields in recording.decoded(recording.topic(name)):
+    for fields in recording.table(name).decoded():
         message = dict(fields)
         message["position"] = message.pop("log_time") // schema.STEP_NANOSECONDS
         if "json" in message:  # of an info, which holds the options of a reset too

@@ -86,10 +86,10 @@ def reader_of(topic: schema.Topic) -> Any:
     """Return what reads all messages of a topic."""
 
     def read(recording: Recording) -> None:
-        messages = sum(1 for _ in recording.messages(topic))
-        assert recording.count(topic) >= 0
+        messages = sum(1 for _ in recording.table(topic).messages())
+        assert recording.table(topic).count() >= 0
         if topic in schema.BLOCK_TOPICS:
-            assert sum(len(block) for block in recording.blocks(topic)) <= max(messages, 1) << 32
+            assert sum(len(block) for block in recording.table(topic).blocks()) <= max(messages, 1) << 32
 
     return read
 
@@ -103,12 +103,12 @@ def read_measures(recording: Recording) -> None:
 def read_episodes(recording: Recording) -> None:
     """Read the first and the last episode of both phases."""
     for phase in schema.PHASES:
-        for episode in (0, recording.count(schema.PHASES[phase][1])):
+        for episode in (0, recording.phase(phase).episodes.count()):
             with contextlib.suppress(RunnerError):
-                recording.episode_steps(phase, episode)
+                recording.phase(phase).episode_steps(episode)
         for blocks in (
-            recording.blocks_of_episodes(phase, 0, 1),
-            recording.phase(phase).steps.blocks_between(range(10**9, 10**12)),
+            recording.phase(phase).steps_of_episodes(0, 1),
+            recording.phase(phase).steps.rows(range(10**9, 10**12)),
         ):
             with contextlib.suppress(RunnerError):
                 for _ in blocks:

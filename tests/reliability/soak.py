@@ -291,7 +291,7 @@ def look(folder: Path, whole: Whole, tally: Tally, killed: Killed) -> None:
         return
     try:
         with open_recording(run.recording) as recording:
-            finished, steps = recording.finished, sum(recording.count(t) for t in _STEPS)
+            finished, steps = recording.finished, sum(recording.table(t).count() for t in _STEPS)
     except RecordingError:
         if has_chunk(run.recording):
             raise
@@ -347,7 +347,7 @@ def our_messages(path: Path) -> dict[str, bytes]:
         return {
             topic.name: b"".join(
                 struct.pack("<QI", time, len(payload)) + payload
-                for time, payload in recording.messages(topic)
+                for time, payload in recording.table(topic).messages()
             )
             for topic in schema.TOPICS
         }

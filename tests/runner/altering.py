@@ -65,12 +65,12 @@ def without_chunk(path: Path, topic: Topic, number: int) -> int:
 def _records(recording: Any, topic: Topic, change: Change) -> tuple[list[bytes], list[int]]:
     """Return the bytes and the log time of each message of a topic, changed."""
     if topic in recording.dtypes:
-        blocks = [block.copy() for block in recording.blocks(topic)]
+        blocks = [block.copy() for block in recording.table(topic).blocks()]
         if not blocks:
             return [], []
         whole = change(np.concatenate(blocks))
         return [record.tobytes() for record in whole], whole["log_time"].tolist()
-    messages = change(list(recording.messages(topic)))
+    messages = change(list(recording.table(topic).messages()))
     return [_record(topic, *message) for message in messages], [time for time, _ in messages]
 
 

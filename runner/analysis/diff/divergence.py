@@ -159,7 +159,7 @@ def _bits(values: Array) -> NDArray[Any]:
 
 def training_divergence(a: Recording, b: Recording) -> Divergence | None:
     """Return where the training of two jobs diverges; None if it takes the same steps, equally many."""
-    streams = [recording.blocks(schema.TRAIN_STEP, 0, unbroken(recording)[0]) for recording in (a, b)]
+    streams = [recording.train.steps.blocks(0, unbroken(recording)[0]) for recording in (a, b)]
     return _divergence("train", streams[0], streams[1])
 
 
@@ -189,7 +189,7 @@ def evaluation_divergences(a: Recording, b: Recording) -> Iterator[Divergence]:
 def unbroken(recording: Recording) -> tuple[int, int]:
     """Return how many steps and episodes of training precede the first that were lost, if any."""
     steps, episodes = (
-        min([recording.count(topic), *(start for start, _ in recording.lost.get(topic.name, []))])
+        min([recording.table(topic).count(), *(start for start, _ in recording.lost.get(topic.name, []))])
         for topic in schema.PHASES["train"]
     )
     return steps, episodes
@@ -197,14 +197,14 @@ def unbroken(recording: Recording) -> tuple[int, int]:
 
 def _trial_steps(recording: Recording, first: int, trials: int) -> Iterator[Block] | None:
     """Return the steps of some trials; None unless all of them are there."""
-    ends = recording.episodes("eval", first, first + trials)
+    ends = recording.eval.episodes.array(first, first + trials)
     if not trials or len(ends) < trials:
         return None
     start, stop = int(ends[0]["last_step"]) + 1 - int(ends[0]["length"]), int(ends[-1]["last_step"]) + 1
     lost = recording.lost.get(schema.EVAL_STEP.name, [])
-    if stop > recording.count(schema.EVAL_STEP) or any(a < stop and b > start for a, b in lost):
+    if stop > recording.eval.steps.count() or any(a < stop and b > start for a, b in lost):
         return None
-    return recording.blocks(schema.EVAL_STEP, start, stop)
+    return recording.eval.steps.blocks(start, stop)
 
 
 def _divergence(
@@ -267,19 +267,19 @@ def loop_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None
                 return replace(
                     divergence, episode=divergence.episode - one.start, evaluation=one.number, after=one.after
                 )
-    after = a.count(schema.TRAIN_EPISODE)  # the trial was not finished in either run, so it is after all
-    start = next((one.start for one in evaluations_of(a) if one.after == after), a.count(schema.EVAL_EPISODE))
+    after = a.train.episodes.count()  # the trial was not finished in either run, so it is after all
+    start = next((one.start for one in evaluations_of(a) if one.after == after), a.eval.episodes.count())
     return replace(divergence, episode=divergence.episode - start, after=after)
 
 
 def _first_in_phase(a: Recording, b: Recording, phase: str) -> Divergence | None:
     """Return the same; the number of a trial is that among all evaluations."""
     (ours, theirs), is_tabular = (one.phase(phase).steps for one in (a, b)), a.has_states
-    alone = [one.has_actions_alone(phase) for one in (a, b)]
-    common = set(a.row_dtype(ours).names or ()) & set(b.row_dtype(theirs).names or ())
+    alone = [one.phase(phase).steps.are_actions for one in (a, b)]
+    common = set(ours.row_dtype.names or ()) & set(theirs.row_dtype.names or ())
     digest = ("digest",) if all(alone) else ()
     fields = (*(each for each in (FIELDS if is_tabular else _TRANSITION_FIELDS) if each in common), *digest)
-    divergence = _divergence(phase, a.rows(ours), b.rows(theirs), fields)
+    divergence = _divergence(phase, ours.rows(), theirs.rows(), fields)
     if not is_tabular:  # else a step has the state before it
         divergence = (
             _reset_divergence(a, b, phase, math.inf if divergence is None else divergence.step) or divergence
@@ -324,7 +324,7 @@ def branch_divergence(a: Recording, b: Recording, origin: BranchOrigin) -> Diver
 def _reset_divergence(a: Recording, b: Recording, phase: str, last: float) -> Divergence | None:
     """Return where what a reset observed differs, if that is before the end of the step `last`."""
     streams = [
-        itertools.takewhile(lambda block: block["step"][0] <= last, one.rows(one.phase(phase).resets))
+        itertools.takewhile(lambda block: block["step"][0] <= last, one.phase(phase).resets.rows())
         for one in (a, b)
     ]
     _, left, right = first_difference(streams[0], streams[1], ("observation",)) or (0, None, None)

@@ -11,7 +11,6 @@ from runner.analysis.axes import first_crossing, mean_height
 from runner.errors import RunnerError, nearest
 from runner.recording.metrics import METRIC_OF, METRICS
 from runner.recording.reader import Recording
-from runner.recording.schema import TRAIN_EPISODE
 
 _COMPARED: Final = (*METRICS, METRIC_OF["training.mean_length"], METRIC_OF["training.percent_filled"])
 
@@ -87,7 +86,7 @@ def loop_means(recording: Recording) -> dict[str, float]:
     episodes = 0
     length = 0
     total = 0.0
-    for block in recording.blocks(TRAIN_EPISODE):
+    for block in recording.train.episodes.blocks():
         episodes += len(block)
         length += int(block["length"].sum())
         total += float(block["returns"].sum())

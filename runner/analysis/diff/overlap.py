@@ -82,7 +82,7 @@ def training_overlap(a: Recording, b: Recording) -> tuple[Overlap, tuple[Lengths
         equal_episodes += int(((ours == theirs) & (agree == ours)).sum())
         total += ours.sum(), theirs.sum()
     mean_a, mean_b = (total / max(episodes, 1)).tolist()
-    steps_a, steps_b = (recording.count(schema.TRAIN_STEP) for recording in (a, b))
+    steps_a, steps_b = (recording.train.steps.count() for recording in (a, b))
     overlap = Overlap(steps_a, steps_b, episodes, equal_episodes, equal_steps, compared, mean_a, mean_b)
     return overlap, (left.count_all_visits(), right.count_all_visits())
 
@@ -110,7 +110,7 @@ def _common_lengths(a: Recording, b: Recording) -> Iterator[tuple[Lengths, Lengt
     episodes = min(count for _, count in lengths)
     for first in range(0, episodes, _BATCH_EPISODES):
         last = min(first + _BATCH_EPISODES, episodes)
-        records = [recording.episodes("train", first, last) for recording in (a, b)]
+        records = [recording.train.episodes.array(first, last) for recording in (a, b)]
         whole = min(
             int(np.searchsorted(one["last_step"], steps))
             for one, (steps, _) in zip(records, lengths, strict=True)
@@ -131,7 +131,7 @@ class _Steps:
 
     def __init__(self, recording: Recording) -> None:
         self._path = recording.path
-        self._blocks = recording.blocks(schema.TRAIN_STEP)
+        self._blocks = recording.train.steps.blocks()
         self._rest: Block = np.empty(0, recording.dtypes[schema.TRAIN_STEP])
         self._visits = np.zeros(recording.mdp.states, np.int64)
 

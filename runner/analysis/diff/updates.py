@@ -13,7 +13,6 @@ from runner.config import from_mapping
 from runner.environments.naming import states_in_words
 from runner.learning.learner import NamedTables
 from runner.learning.schedules import compile_schedule, schedule_value
-from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.tables import TableReplay
 
@@ -105,7 +104,7 @@ def _are_equal(replays: Sequence[TableReplay]) -> bool:
 
 def _describe_update(a: Recording, b: Recording, step: int, replays: Sequence[TableReplay]) -> Update:
     """Return the update of a step that makes the tables differ; both replays are before it."""
-    records = [next(recording.blocks(schema.TRAIN_STEP, step, step + 1))[0] for recording in (a, b)]
+    records = [next(recording.train.steps.blocks(step, step + 1))[0] for recording in (a, b)]
     for replay in replays:
         replay.advance(step + 1)
     state = int(records[0]["state"])

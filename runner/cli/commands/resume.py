@@ -229,7 +229,7 @@ def _evaluate_checkpoint(
         run = play_checkpoint(source, checkpoint, policy, folder, trials, seed, trust, report)
     origin = run.file.config["config"]["origin"]
     with open_recording(run.recording) as recording:
-        played = recording.episodes("eval")
+        played = recording.eval.episodes.array()
     spreads = {"return": spread_of(played["returns"].sum(axis=1)), "length": spread_of(played["length"])}
     spread = {
         name: f", standard deviation {number(own['standard_deviation'])}, "

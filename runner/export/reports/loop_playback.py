@@ -77,7 +77,7 @@ class _ShownPart:
 
 def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: int) -> Playback:
     """Return what a page plays of an episode: at most `limit` steps from step `first` on."""
-    span = recording.episode_span(place.phase, place.number)
+    span = recording.phase(place.phase).episode_span(place.number)
     if not 0 <= first < len(span):
         raise no_step(recording, place.title, len(span), first)
     part = span[first : first + limit]
@@ -105,7 +105,9 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
     ended = ending_of(recording, place.phase, place.number)
     total = None
     if ended != "cut off":
-        total = float(recording.episodes(place.phase, place.number, place.number + 1)["returns"].sum())
+        total = float(
+            recording.phase(place.phase).episodes.array(place.number, place.number + 1)["returns"].sum()
+        )
     elif first + limit >= len(span):
         total = float(before.sum() + reward.sum())
     texts, series = _frames(parts, observations)
@@ -133,20 +135,12 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
 
 def _steps(recording: Recording, place: EpisodePlace, numbers: range) -> Iterator[Records]:
     """Yield the steps of an episode with these numbers, some at a time."""
-    phase = place.phase
-    if recording.has_actions_alone(phase):
-        steps = whole_steps(recording, phase, place.number)
-        yield steps[(steps["step"] >= numbers.start) & (steps["step"] < numbers.stop)]
+    recorded = recording.phase(place.phase).steps
+    if not recorded.are_actions:
+        yield from recorded.numbered(numbers)
         return
-    table = recording.phase(phase).steps
-    is_fixed = table.dtype is not None
-    for block in table.blocks(numbers.start, numbers.stop) if is_fixed else recording.rows(table):
-        if (first := int(block["step"][0])) >= numbers.stop:
-            return
-        chosen = block[(numbers.start - first) % numbers.step :: numbers.step]
-        chosen = chosen[(chosen["step"] >= numbers.start) & (chosen["step"] < numbers.stop)]
-        if len(chosen):
-            yield chosen
+    steps = whole_steps(recording, place.phase, place.number)
+    yield steps[(steps["step"] >= numbers.start) & (steps["step"] < numbers.stop)]
 
 
 def _observations_before(
@@ -174,7 +168,7 @@ def _extras(recording: Recording, phase: str, part: range, notes: list[str]) -> 
     """Return the values that the loop recorded with these steps, each at the frame before its step."""
     series = []
     agents = recording.agents if len(recording.agents) > 1 else ()
-    extras = recording.extras(phase)
+    extras = recording.phase(phase).extras
     by_name = extras.at(np.arange(part.start, part.stop, part.step)) if extras else {}
     for name, values in by_name.items():
         agent = next((one for one in agents if name.startswith(f"{one}/")), "")

@@ -149,7 +149,7 @@ def logged_near(recording: Recording, phase: str, time: Sequence[int]) -> list[L
     if recording.has_reports:
         entries = (
             (name.replace("_", " "), report["log_time"], short(report[name]))
-            for report in recording.decoded(schema.TRAIN_METRICS_TOPIC, times=times)
+            for report in recording.train.metrics.decoded(times=times)
             for name in ("epsilon", "step_size", "mean_length")
         )
     else:
@@ -159,11 +159,11 @@ def logged_near(recording: Recording, phase: str, time: Sequence[int]) -> list[L
                 scalar["log_time"],
                 short(scalar["value"]),
             )
-            for scalar in recording.decoded(schema.SCALAR_TOPIC, times=times)
+            for scalar in recording.table(schema.SCALAR_TOPIC).decoded(times=times)
         )
         texts = (
             (text["name"], text["log_time"], text["message"][:_MAX_LETTERS])
-            for text in recording.decoded(schema.LOG_TOPIC, times=times)
+            for text in recording.table(schema.LOG_TOPIC).decoded(times=times)
         )
         entries = islice(chain(scalars, texts), MAX_LOGGED)
     by_name: dict[str, Logged] = {}

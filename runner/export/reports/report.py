@@ -28,7 +28,6 @@ from runner.export.plots.style import PLAIN, CurveStyle
 from runner.export.reports.maps import MapRow, maps_of, stages_of
 from runner.export.reports.playback import MAX_VALUES, playback_of, titled
 from runner.export.reports.rendering import LegendEntry, embedded, render, templates
-from runner.recording import schema
 from runner.recording.composition import composition_of
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
@@ -179,8 +178,8 @@ def _notes(recording: Recording) -> list[str]:
 def _facts(recording: Recording) -> dict[str, str]:
     """Return what identifies a run, and how much of it was recorded."""
     config = recording.config
-    episodes = recording.count(schema.TRAIN_EPISODE)
-    steps, trial_steps = map(recording.step_count, ("train", "eval"))
+    episodes = recording.train.episodes.count()
+    steps, trial_steps = (phase.steps.total() for phase in recording.phases)
     if recording.can_train_again:
         facts = {
             "Environment": composition_of(recording),
@@ -215,7 +214,7 @@ def _episodes(recording: Recording, chosen: Sequence[tuple[int, ...]]) -> dict[t
     """
     if not recording.has_actions:
         return {}
-    after, ended = last_whole_evaluation(recording), recording.count(schema.TRAIN_EPISODE)
+    after, ended = last_whole_evaluation(recording), recording.train.episodes.count()
     reasons = [(which, "chosen") for which in chosen]
     if after is not None:
         worst, typical, best = ranked_trials(recording, after)

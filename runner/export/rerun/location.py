@@ -46,7 +46,7 @@ def locate(run: Run, request: Request, step: StepRef | None) -> Location:
             evaluations, where = evaluations_with_steps(recording, train, evals), str(recording.path)
             number = evaluation_after(evaluations, step.after, where).trial(step.episode, where)
             added = {"evaluations": (*request.evaluations, step.after), "trials": (number,)}
-        steps = recording.episode_span(phase, number)
+        steps = recording.phase(phase).episode_span(number)
         if step.t >= len(steps):
             raise NotInRecording(
                 f"{recording.path}: found no t = {step.t} there; the episode has {len(steps)} steps, from 0."

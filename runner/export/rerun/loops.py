@@ -107,14 +107,16 @@ class LoopReader:
             yield from self._episodes(phase)
             for environment, frames in grouped(self._recorded_frames(phase), FRAMES_SENT):
                 yield self._frames(phase, environment, frames)
-        for image in recording.decoded(schema.IMAGE_TOPIC):
+        for image in recording.table(schema.IMAGE_TOPIC).decoded():
             name, data = entity_name(image["frame_id"]), image["data"]
             if media_type(data) not in ("image/png", "image/jpeg"):
                 data = _first_frame(data)
             if data:
                 view = View("pictures", name, rrb.Spatial2DView)
                 yield rows_of(f"{root}/picture/{name}", [(_step(image["log_time"]), _picture(data))], view)
-        values = ((entity_name(scalar["name"]), scalar) for scalar in recording.decoded(schema.SCALAR_TOPIC))
+        values = (
+            (entity_name(scalar["name"]), scalar) for scalar in recording.table(schema.SCALAR_TOPIC).decoded()
+        )
         for name, rows in grouped(values, MAX_ROWS):
             log_times, episodes, numbers = (
                 np.array([row[field] for row in rows]) for field in ("log_time", "episode", "value")
@@ -124,11 +126,11 @@ class LoopReader:
             yield Track(f"{root}/logged/{name}", times, scalars(numbers[:, np.newaxis]), static, view)
         texts = (
             ("log", (_step(text["log_time"]), rr.TextLog(f"{text['name']}: {text['message']}", level="INFO")))
-            for text in recording.decoded(schema.LOG_TOPIC)
+            for text in recording.table(schema.LOG_TOPIC).decoded()
         )
         for name, lines in grouped(texts, MAX_ROWS):
             yield rows_of(f"{root}/{name}", lines, LOG)
-        arrays = recording.messages(schema.ARRAY_TOPIC)
+        arrays = recording.table(schema.ARRAY_TOPIC).messages()
         for (time, _), array in zip(arrays, recording.arrays(), strict=True):
             name, tensor = entity_name(array.name), rr.Tensor(np.atleast_1d(array.values))
             view = View("array", name, rrb.TensorView)
@@ -145,7 +147,7 @@ class LoopReader:
                 yield labels.track(root)
                 yield from background(root, scene, grid_view(title, scene))
                 yield from grid.still
-            trained = recording.episodes("train")["log_time"] if scene else ()
+            trained = recording.train.episodes.array()["log_time"] if scene else ()
             for steps in self._batches(phase, spans):
                 yield from self._lines_of(phase, steps)
                 if grid:
@@ -160,7 +162,7 @@ class LoopReader:
 
     def _episodes(self, phase: str) -> Iterator[Track]:
         """Yield returns and lengths: of a game one length, and the return of each agent."""
-        for block in self._recording.blocks(schema.PHASES[phase][1]):
+        for block in self._recording.phase(phase).episodes.blocks():
             for member in self._members:
                 is_own = block["last_step"] % len(self._environments) == member.number
                 own = block if self._is_game else block[is_own]
@@ -174,7 +176,7 @@ class LoopReader:
     def _lines_of(self, phase: str, steps: Records) -> Iterator[Track]:
         """Yield rewards, observations, actions and extras of steps."""
         recording = self._recording
-        extras = recording.extras(phase).at(steps["step"])
+        extras = recording.phase(phase).extras.at(steps["step"])
         for member in self._members:
             is_own = steps["step"] % len(self._environments) == member.number
             if self._is_game:
@@ -308,13 +310,9 @@ class LoopReader:
     def _batches(self, phase: str, spans: Sequence[range]) -> Iterator[Records]:
         """Yield the steps of all environments, at most a batch of each at a time."""
         recording, table = self._recording, self._recording.phase(phase).steps
-        if table.dtype is None:  # they vary in size, so they are read from the first on
+        if table.dtype is None:
             for span in spans:
-                for block in recording.rows(table):
-                    if block["step"][0] >= span.stop:
-                        break
-                    if len(own := block[(block["step"] >= span.start) & (block["step"] < span.stop)]):
-                        yield own
+                yield from table.numbered(span)
             return
         limit = max(1, min(MAX_ROWS * len(self._environments), _BATCH_BYTES // table.dtype.itemsize))
         for span in spans:

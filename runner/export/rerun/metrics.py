@@ -116,7 +116,7 @@ def _episode_lines(
     # The last row is for episodes that ended after the last report.
     sums, counts = np.zeros((len(reports) + 1, len(names))), np.zeros(len(reports) + 1)
     for phase, (_, topic) in schema.PHASES.items():
-        for block in recording.blocks(topic):
+        for block in recording.table(topic).blocks():
             parts = [block[name] for name in ("length", "penalties", "returns", "events")]
             values = np.column_stack(parts).astype(np.float64)
             number = {"episode" if phase == "train" else "trial": block["episode"]}

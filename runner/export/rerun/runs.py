@@ -38,7 +38,7 @@ class JobReader:
         self._source, self._selection = source, selection
         recording = self._recording = source.recording
         self._mdp, self._scene = recording.mdp, scene_of(recording.mdp)
-        steps = sum(recording.count(topic) for topic in (schema.TRAIN_STEP, schema.EVAL_STEP))
+        steps = sum(recording.table(topic).count() for topic in (schema.TRAIN_STEP, schema.EVAL_STEP))
         reports = [*recording.metrics("train")[-1:], *recording.metrics("eval")[-1:]]
         self.last = max([steps, *(row["log_time"] // schema.STEP_NANOSECONDS for row in reports)])
         """Steps executed in the whole run."""
@@ -99,7 +99,7 @@ class JobReader:
         recording, selection = self._recording, self._selection
         spans = [(None, span) for span in selection.train] if phase == "train" else selection.evaluations
         for evaluation, span in spans:
-            for block in recording.blocks(schema.PHASES[phase][0], span.start, span.stop):
+            for block in recording.phase(phase).steps.blocks(span.start, span.stop):
                 for start in range(0, len(block), MAX_ROWS):
                     part = block[start : start + MAX_ROWS]
                     check_steps(part, recording.mdp, str(recording.path), schema.PHASE_NAMES[phase])

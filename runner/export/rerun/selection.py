@@ -167,12 +167,12 @@ def select(recording: Recording, request: Request) -> Selection:
 
 def episodes_of(recording: Recording, phase: str) -> Episodes:
     """Return the episodes of a phase that have steps."""
-    steps, episodes = schema.PHASES[phase]
-    total, n, records = recording.count(steps), recording.environments, recording.episodes(phase)
+    own, n = recording.phase(phase), recording.environments
+    total, records = own.steps.count(), own.episodes.array()
     last, length = (records[name].astype(np.int64) for name in ("last_step", "length"))
     if n > 1:
         return Episodes((last - (length - 1) * n) // n * n, (last // n + 1) * n, len(records))
-    first = np.full(recording.count(episodes) + 1, -1, np.int64)
+    first = np.full(own.episodes.count() + 1, -1, np.int64)
     first[0], number = 0, records["episode"].astype(np.int64)
     is_counted = number < len(first) - 1
     first[number[is_counted]] = (last + 1 - length)[is_counted]
@@ -194,7 +194,7 @@ def evaluations_with_steps(recording: Recording, train: Episodes, evals: Episode
     for start in range(0, evals.count, trials):
         stop = min(start + trials, evals.count)
         bounds = int(evals.start[start]), int(evals.stop[stop - 1])
-        block = next(recording.blocks(schema.EVAL_STEP, *bounds), None)
+        block = next(recording.eval.steps.blocks(*bounds), None)
         if block is not None:  # otherwise all of its steps were lost in a repair
             trained = int(block["log_time"][0]) // schema.STEP_NANOSECONDS - (int(block["step"][0]) + 1)
             after = int(np.searchsorted(train.stop[: train.ended], trained, side="right"))
@@ -204,7 +204,7 @@ def evaluations_with_steps(recording: Recording, train: Episodes, evals: Episode
 
 def time_of(recording: Recording, phase: str, step: int) -> int:
     """Return where a step of a phase is on the timeline."""
-    record: Any = next(recording.blocks(schema.PHASES[phase][0], step, step + 1))[0]
+    record: Any = next(recording.phase(phase).steps.blocks(step, step + 1))[0]
     return int(record["log_time"]) // schema.STEP_NANOSECONDS
 
 
@@ -245,7 +245,7 @@ def _steps_without_values(recording: Recording, ranges: Sequence[range]) -> int:
 
     spans, unknown = known_steps(recording), 0
     for steps in ranges:
-        for block in recording.blocks(schema.TRAIN_STEP, steps.start, steps.stop):
+        for block in recording.train.steps.blocks(steps.start, steps.stop):
             inside = [(block["step"] >= first) & (block["step"] <= last) for first, last in spans]
             unknown += len(block) - int(np.any(inside, axis=0).sum())
     return unknown
@@ -284,7 +284,7 @@ def _complete_loop(
     recording: Recording, request: Request, selection: Selection, asked: Mapping[str, Ints]
 ) -> None:
     """Add all steps of a loop if there are few, its last steps of evaluation, and episodes to draw."""
-    total, tested = recording.count(schema.TRAIN_STEP), recording.count(schema.EVAL_STEP)
+    total, tested = recording.train.steps.count(), recording.eval.steps.count()
     limit = total if request.everything else DEFAULT_STEPS
     if request.everything or (request.is_default and (total <= limit or recording.has_varying_values)):
         selection.train = [range(min(total, limit))] if total else []
@@ -308,15 +308,15 @@ def _select_drawn(
     """Choose the episodes that are drawn: those asked for, by default a few of each environment."""
     n, total = recording.environments, 0
     shown = min(n, MAX_MEMBERS)
-    for phase, (steps, _) in schema.PHASES.items():
-        if not recording.count(steps):
+    for phase in schema.PHASES:
+        if not recording.phase(phase).steps.count():
             continue
         lengths = episodes_of(recording, phase).lengths // n
         numbers = [np.arange(len(lengths)) if request.everything else asked[phase]]
         for environment in range(shown) if request.is_default else ():
             own = np.arange(len(lengths))
             if n > 1:
-                own = np.flatnonzero(recording.episodes(phase)["last_step"] % n == environment)
+                own = np.flatnonzero(recording.phase(phase).episodes.array()["last_step"] % n == environment)
             numbers.append(own[_default_episodes(lengths[own], FRAME_STEPS // shown)])
         selection.drawn[phase] = np.unique(np.concatenate(numbers)).tolist()
         total += len(lengths)

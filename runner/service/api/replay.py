@@ -113,6 +113,6 @@ class _PicturedEpisode(NamedTuple):
 def _pictured_episode(run: Run, at: StepRef) -> _PicturedEpisode:
     with open_recording(run.recording) as recording:
         place = place_of(recording, at.which)
-        length = len(recording.episode_span(place.phase, place.number))
+        length = len(recording.phase(place.phase).episode_span(place.number))
     make = partial(encoded_pictures, run.recording, place.phase, place.number)
     return _PicturedEpisode((recording_state(run), place.phase, place.number), make, length)

@@ -45,12 +45,12 @@ def _environments(run: Run, at: StepRef) -> dict[str, object]:
     base = f"/runs/{run.run_id}/replay"
     with open_recording(run.recording) as recording:
         place = place_of(recording, at.which)
-        span = recording.episode_span(place.phase, place.number)
+        span = recording.phase(place.phase).episode_span(place.number)
         # Trials are numbered within their evaluation, whose first one this is.
         first = place.number - at.episode
         panels = []
         for environment, number in _episodes_at(recording, place, span)[:MAX_PANELS]:
-            own = recording.episode_span(place.phase, number)
+            own = recording.phase(place.phase).episode_span(number)
             path = replace(at, episode=number - first, t=0).episode_path
             name = "trial" if at.after is not None else "episode"
             panel = panel_of(

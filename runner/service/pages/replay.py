@@ -198,7 +198,7 @@ def _values(
     run: Run, at: StepRef, branches: list[Link], stage: Stage | None, problem: str = ""
 ) -> dict[str, object]:
     with open_recording(run.recording) as recording:
-        episodes = recording.phase("train").episodes.count()
+        episodes = recording.train.episodes.count()
         environments, is_job = recording.environments, recording.can_train_again
         evaluations = [Evaluation(one.after, one.stop - one.start) for one in evaluations_of(recording)]
     if at.after is None:

@@ -152,7 +152,7 @@ def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) ->
     if recording.has_reports:
         last = deque(recording.iter_metrics("eval"), MAX_EVALUATIONS)
         records = [evaluation_record(metrics, agents, events) for metrics in last]
-        total = recording.phase("eval").metrics.count()
+        total = recording.eval.metrics.count()
     else:
         every = evaluation_records(recording)
         records, total = every[-MAX_EVALUATIONS:], len(every)

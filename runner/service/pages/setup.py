@@ -78,7 +78,7 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
                     log_level(line["level"]).lower(),
                     line["message"],
                 )
-                for line in deque(recording.decoded(schema.LOG_TOPIC), MAX_LINES)
+                for line in deque(recording.table(schema.LOG_TOPIC).decoded(), MAX_LINES)
             ]
     except RecordingError as error:
         facts["Recording"] = settings.without_folders(str(error))

@@ -51,7 +51,7 @@ def folder(tmp_path_factory):
 def series(folder, name, axis):
     run = next(run for run in runner.list_runs(folder) if run.name == name)
     with open_recording(run.recording) as recording:
-        episodes = recording.episodes("train")
+        episodes = recording.train.episodes.array()
         return read_series(recording, axis), episodes
 
 
@@ -113,7 +113,7 @@ def test_values_logged_in_evaluation_are_where_training_was(tmp_path):
         (run,) = runner.list_runs(tmp_path)
         with open_recording(run.recording) as recording:
             own = read_series(recording, axis)
-            ended = recording.count(schema.TRAIN_EPISODE)
+            ended = recording.train.episodes.count()
         (place,) = [place for place, r in own.training if "training.logged.score (eval)" in r]
         assert place == (100 if axis is STEPS else ended)
 
@@ -141,7 +141,7 @@ def test_wall_time_is_that_of_the_clock(tmp_path):
     env.close()
     (run,) = runner.list_runs(tmp_path)
     with open_recording(run.recording) as recording:
-        clock, episodes = read_clock(recording), recording.episodes("train")
+        clock, episodes = read_clock(recording), recording.train.episodes.array()
         over_time = read_series(recording, TIME)
     ends = clock.seconds_at(episodes["last_step"] + 1)
     assert clock.duration >= 1.2
@@ -157,7 +157,7 @@ def test_an_evaluation_is_at_the_time_at_which_it_began(taxis):
         clock = read_clock(recording)
         over_time = read_series(recording, TIME)
         began = [
-            recording.episodes("train", e - 1, e)["log_time"][0] if e else 0
+            recording.train.episodes.array(e - 1, e)["log_time"][0] if e else 0
             for e in (one["episode"] for one in recording.metrics("eval"))
         ]
     times = clock.seconds_at(np.array(began, np.int64) // schema.STEP_NANOSECONDS)

@@ -120,7 +120,7 @@ def test_visits_to_states_are_those_of_the_steps(compare, record):
     counts = []
     for path in (record(), record("discount=0.9")):
         with open_recording(path) as recording:
-            states = np.concatenate([block["state"] for block in recording.blocks(schema.TRAIN_STEP)])
+            states = np.concatenate([block["state"] for block in recording.train.steps.blocks()])
             words = states_in_words(recording.mdp)
             counts.append(np.bincount(states, minlength=len(words)))
     assert (visits.states_a, visits.states_b) == tuple(np.count_nonzero(count) for count in counts)
@@ -188,7 +188,7 @@ def test_a_run_without_training_steps_gets_no_hint_to_rerecord_it(compare):
 @given(data=st.data())
 def test_an_altered_step_is_the_first_difference(record, data):
     with open_recording(record()) as recording:
-        blocks = list(recording.blocks(schema.TRAIN_STEP))
+        blocks = list(recording.train.steps.blocks())
     steps = np.concatenate(blocks)
     at = data.draw(st.integers(0, len(steps) - 1))
     field = data.draw(st.sampled_from(FIELDS))
@@ -216,7 +216,7 @@ def small(folder):
 @given(data=st.data())
 def test_the_diff_of_an_altered_copy_names_step_and_field(small, tmp_path, data):
     with open_recording(small) as recording:
-        at = data.draw(st.integers(0, recording.count(schema.TRAIN_STEP) - 1))
+        at = data.draw(st.integers(0, recording.train.steps.count() - 1))
         bounds = {"state": recording.mdp.states, "next_state": recording.mdp.states, "action": 36}
     field = data.draw(st.sampled_from(["state", "action", "next_state", "rewards", "terminated", "explored"]))
 
@@ -237,7 +237,7 @@ def test_the_diff_of_an_altered_copy_names_step_and_field(small, tmp_path, data)
 
 def test_equal_streams_have_no_difference_however_they_are_cut(record):
     with open_recording(record()) as recording:
-        blocks = list(recording.blocks(schema.TRAIN_STEP))
+        blocks = list(recording.train.steps.blocks())
     steps = np.concatenate(blocks)
     cut = (steps[first : first + 777] for first in range(0, len(steps), 777))
     assert first_difference(iter(blocks), cut) is None
@@ -291,7 +291,7 @@ class TestIndependentExploration:
         def cause_of_change(change):
             path = record("exploration=independent")
             with open_recording(path) as whole:
-                explored = np.concatenate([block["explored"] for block in whole.blocks(schema.TRAIN_STEP)])
+                explored = np.concatenate([block["explored"] for block in whole.train.steps.blocks()])
             step = int(np.flatnonzero(explored == self.FIRST_OF_TWO)[20])
 
             def changed(records):

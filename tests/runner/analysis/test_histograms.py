@@ -11,7 +11,6 @@ from runner.analysis.axes import EPISODES, STEPS, UPDATES
 from runner.analysis.histograms import histograms
 from runner.errors import RecordingError
 from runner.export.plots.heatmaps import constants_in, heatmap_plots
-from runner.recording import schema
 from runner.recording.reader import open_recording
 
 
@@ -81,8 +80,8 @@ def test_a_job_has_the_counts_of_its_steps_and_episodes(taxis):
     with open_recording(taxis.recording) as recording:
         found, notes = histograms(recording, STEPS)
         by_name = {(each.quantity, each.line): each for each in found}
-        steps = np.concatenate([block.copy() for block in recording.blocks(schema.TRAIN_STEP)])
-        episodes = recording.episodes("train")
+        steps = np.concatenate([block.copy() for block in recording.train.steps.blocks()])
+        episodes = recording.train.episodes.array()
         own = recording.mdp.own_actions[steps["action"]]
     assert notes == []
     middle = by_name["action", "taxi_2"].edges[10]

@@ -177,8 +177,8 @@ def test_states_before_resets_are_restored(tmp_path):
                 rec.reset()
     restore(archived(rec.run.recording, tmp_path / "archive"), tmp_path / "back.mcap")
     with open_recording(rec.run.recording) as recording, open_recording(tmp_path / "back.mcap") as restored:
-        assert len(list(recording.reset_states("train"))) == 2
-        assert list(restored.reset_states("train")) == list(recording.reset_states("train"))
+        assert len(list(recording.train.reset_states())) == 2
+        assert list(restored.train.reset_states()) == list(recording.train.reset_states())
         assert restored.maker == recording.maker
 
 
@@ -205,7 +205,7 @@ def test_every_number_of_an_observation_has_a_column(tmp_path):
             for phase in ("train", "eval")
         }
         for phase, frame in mine.items():
-            records = np.concatenate(list(recording.blocks(recording.topic(f"/{phase}/step"))))
+            records = recording.phase(phase).steps.array()
             seen = frame[[f"next_observation_{i}" for i in range(4)]].to_numpy()
             np.testing.assert_array_equal(seen, records["next_observation"])
             np.testing.assert_array_equal(frame["action"], records["action"])

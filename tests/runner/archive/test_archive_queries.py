@@ -79,7 +79,9 @@ def test_all_three_read_the_same_steps(runs, monkeypatch):
     for run in made:
         with open_recording(run.recording) as recording:
             blocks = [
-                block for topic in (schema.TRAIN_STEP, schema.EVAL_STEP) for block in recording.blocks(topic)
+                block
+                for topic in (schema.TRAIN_STEP, schema.EVAL_STEP)
+                for block in recording.table(topic).blocks()
             ]
         expected = sum(map(len, blocks)), sum(float(block["rewards"].sum()) for block in blocks)
         assert tuple(by_run[run.run_id]) == pytest.approx(expected)

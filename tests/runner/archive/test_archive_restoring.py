@@ -95,7 +95,7 @@ def taxis_with_a_hole(tmp_path):
     """A repaired recording that lost a chunk of training steps."""
     run = make_run(tmp_path / "holed", TAXIS, recording={"chunk_steps": 256})
     with open_recording(run.recording) as recording:
-        entry = recording.table(schema.TRAIN_STEP).entry(3)
+        entry = recording.train.steps.entry(3)
     data = bytearray(run.recording.read_bytes())
     data[entry.offset + 100] ^= 255
     run.recording.write_bytes(data)

@@ -14,7 +14,6 @@ from runner.archive import layout, writing
 from runner.archive.manifest import Entry, Manifest
 from runner.archive.store import Store
 from runner.cli import cli
-from runner.recording import schema
 from runner.recording.liveness import owner as this_process
 from runner.recording.reader import open_recording
 from runner.runs.listing import list_runs
@@ -196,7 +195,7 @@ def test_archiving_several_runs_skips_those_that_are_archived_already(run, recor
 def test_a_damaged_recording_is_refused_and_repair_is_named(run, recordings, command):
     recording = recordings / run.run_id / "recording.mcap"
     with open_recording(recording) as opened:
-        place = opened.table(schema.TRAIN_STEP).entry(0).offset + 100
+        place = opened.train.steps.entry(0).offset + 100
     data = bytearray(recording.read_bytes())
     data[place] ^= 255
     recording.write_bytes(data)
@@ -220,8 +219,8 @@ def test_a_killed_run_is_archived_and_restored(run, recordings, command):
         json.dumps(stored | {"status": "running", "owner": owner, "summary": {}})
     )
     with open_recording(folder / "recording.mcap") as recording:
-        came = {"episodes": recording.count(schema.TRAIN_EPISODE)}
-        came["train_steps"] = recording.count(schema.TRAIN_STEP)
+        came = {"episodes": recording.train.episodes.count()}
+        came["train_steps"] = recording.train.steps.count()
     (before,) = json.loads(done(command("ls", "--json")))["runs"]
     assert {key: before[key] for key in came} == came
     done(command("archive", run.run_id, "--remove"))

@@ -35,7 +35,7 @@ def test_the_steps_are_there_in_the_order_taken_under_the_names_of_the_recording
     assert set(table["run_id"].to_pylist()) == {run.run_id}
     with open_recording(run.recording) as recording:
         for phase, (topic, _) in schema.PHASES.items():
-            steps = np.concatenate(list(recording.blocks(topic)))
+            steps = recording.table(topic).array()
             mine = table.filter(pa.compute.equal(table["phase"], phase))
             for name in ("step", "episode", "t", "state", "action", "next_state", "terminated", "truncated"):
                 np.testing.assert_array_equal(mine[name].to_numpy(), steps[name])
@@ -47,7 +47,7 @@ def test_the_steps_are_there_in_the_order_taken_under_the_names_of_the_recording
 def test_learners_of_their_own_have_columns_of_their_own(tmp_path):
     run = make_run(tmp_path, TAXIS)
     with open_recording(run.recording) as recording:
-        steps = np.concatenate(list(recording.blocks(schema.TRAIN_STEP)))
+        steps = recording.train.steps.array()
         batches = Batches(recording)
         table = pa.Table.from_batches(batches.of(batches.shape.tables[0]))
     table = table.filter(pa.compute.equal(table["phase"], "train"))

@@ -17,11 +17,11 @@ def contents(path):
     """Return all that a recording holds, but where its chunks were closed."""
     with open_recording(path) as recording:
         blocks = {
-            topic.name: b"".join(block.tobytes() for block in recording.blocks(topic))
+            topic.name: b"".join(block.tobytes() for block in recording.table(topic).blocks())
             for topic in recording.dtypes
         }
         messages = {
-            topic.name: list(recording.messages(topic))
+            topic.name: list(recording.table(topic).messages())
             for topic in recording.topics
             if topic not in recording.dtypes
         }

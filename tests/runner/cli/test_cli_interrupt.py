@@ -64,7 +64,7 @@ def test_a_signal_ends_a_run_properly(tiny, tmp_path, number):
     with runner.open_recording(run.recording) as recording:
         assert recording.finished
         assert recording.result["content_digest"] == values["content_digest"]
-        assert len(recording.episodes("train")) == values["episodes"] > 0
+        assert len(recording.train.episodes.array()) == values["episodes"] > 0
 
 
 class Interrupting:

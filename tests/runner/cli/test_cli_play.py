@@ -24,7 +24,7 @@ def test_json_is_a_line_for_each_step(recorded, recorded_run):
     result = recorded("play", "tiny", "--episode", 7, "--json")
     lines = [json.loads(line) for line in result.stdout.splitlines()]
     with runner.open_recording(recorded_run.recording) as recording:
-        steps = recording.episode_steps("train", 7)
+        steps = recording.train.episode_steps(7)
     assert [line["state"] for line in lines] == steps["state"].tolist()
     assert [list(line["rewards"].values()) for line in lines] == steps["rewards"].tolist()
     assert [line["t"] for line in lines] == list(range(len(steps)))
@@ -70,7 +70,7 @@ def test_a_trial_of_an_evaluation(recorded, recorded_run, trial, number):
     result = recorded("play", "tiny", "--eval", trial, "--json")
     states = [json.loads(line)["state"] for line in result.stdout.splitlines()]
     with runner.open_recording(recorded_run.recording) as recording:
-        assert states == recording.episode_steps("eval", 2 * 5 + number)["state"].tolist()
+        assert states == recording.eval.episode_steps(2 * 5 + number)["state"].tolist()
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_missing_episodes_are_refused(recorded, words, message):
 
 def test_the_best_and_the_worst_trial(recorded, recorded_run):
     with runner.open_recording(recorded_run.recording) as recording:
-        returns = recording.episodes("eval")["returns"].sum(axis=1)
+        returns = recording.eval.episodes.array()["returns"].sum(axis=1)
     for option, value in (("--best", returns.max()), ("--worst", returns.min())):
         steps = map(json.loads, recorded("play", "tiny", option, "--json").stdout.splitlines())
         assert sum(sum(step["rewards"].values()) for step in steps) == value

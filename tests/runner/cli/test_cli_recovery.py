@@ -101,7 +101,7 @@ def test_ls_shows_the_progress_of_a_killed_run(command, copied):
     cut(copied, 0.7)
     (values,) = command.json("ls")["runs"]
     with open_recording(copied.recording) as recording:
-        assert values["episodes"] == recording.count(schema.TRAIN_EPISODE) < values["episodes_to_do"]
+        assert values["episodes"] == recording.train.episodes.count() < values["episodes_to_do"]
     assert f"{values['episodes']:,} of {values['episodes_to_do']:,}" in command("ls").stdout
     copied.recording.write_bytes(b"nothing that can be read")
     assert command.json("ls")["runs"][0]["episodes"] is None
@@ -288,7 +288,7 @@ def test_qtable(recorded, recorded_run, tmp_path):
     with open_recording(recorded_run.recording) as recording:
         expected = tables_at(recording, 300)
         assert np.load(out).tobytes() == np.array(expected).tobytes()
-        ended = int(recording.episodes("train", 9, 10)[0]["last_step"]) + 1
+        ended = int(recording.train.episodes.array(9, 10)[0]["last_step"]) + 1
     assert recorded.json("qtable", "@latest", "--episode", 10)["step"] == ended
     assert recorded.json("qtable", "@latest")["step"] == recorded_run.summary["train_steps"]
 
@@ -308,7 +308,7 @@ def test_qtable_replaces_a_file_only_with_force(recorded, tmp_path):
 
 def test_qtable_of_a_state(recorded, recorded_run):
     with open_recording(recorded_run.recording) as recording:
-        step = next(recording.blocks(schema.TRAIN_STEP))[0]
+        step = next(recording.train.steps.blocks())[0]
         state, action = int(step["state"]), int(step["action"])
     shown = recorded.json("qtable", "@latest", "--state", state, "--step", 1)
     assert shown["visits"] == 1

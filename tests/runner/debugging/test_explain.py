@@ -69,9 +69,7 @@ def test_a_planted_cause_is_found_with_the_step_that_it_changed_first(tmp_path):
     records = []
     for run in (run_a, run_b):
         with runner.open_recording(run.recording) as recording:
-            records.append(
-                [step for block in recording.blocks(recording.topic("/train/step")) for step in block]
-            )
+            records.append([step for block in recording.train.steps.blocks() for step in block])
     fields = ("state", "action", "explored", "next_state")
     equal = [all(x[name] == y[name] for name in fields) for x, y in zip(*records, strict=False)]
     assert equal.index(False) == first.step

@@ -65,8 +65,8 @@ def steps_at(length):
 def test_the_recorded_action_of_a_trial_leads_exactly_where_it_did(run):
     with open_recording(run.recording) as recording:
         for number, place in trials(recording):
-            steps = recording.episode_steps("eval", number)
-            (record,) = recording.episodes("eval", number, number + 1)
+            steps = recording.eval.episode_steps(number)
+            (record,) = recording.eval.episodes.array(number, number + 1)
             for t in steps_at(len(steps)):
                 at = StepRef(place.episode, t, place.after)
                 found = branched(recording, at, int(steps[t]["action"]))
@@ -80,7 +80,7 @@ def test_the_recorded_action_of_a_trial_leads_exactly_where_it_did(run):
 def test_each_action_leads_where_its_own_episode_says(run):
     with open_recording(run.recording) as recording:
         number, place = list(trials(recording))[-1]
-        steps = recording.episode_steps("eval", number)
+        steps = recording.eval.episode_steps(number)
         at = StepRef(place.episode, len(steps) // 2, place.after)
         found = what_if_in(recording, at)
         assert sorted(row.action for row in found.actions) == list(range(recording.mdp.joint_actions))
@@ -102,7 +102,7 @@ def test_training_is_played_on_with_the_same_draws(run):
     with open_recording(run.recording) as recording:
         learns = recording.config["algorithm"] != "random"
         for episode in (0, 7, recording.config["episodes"] - 1):
-            steps = recording.episode_steps("train", episode)
+            steps = recording.train.episode_steps(episode)
             for t in steps_at(len(steps)):
                 played = branched(recording, StepRef(episode, t), int(steps[t]["action"])).steps[t:]
                 common = min(len(played), len(steps) - t)

@@ -324,7 +324,7 @@ def test_a_branch_has_its_own_epsilon_and_values_from_its_step_on(tmp_path):
     assert runner.when(parent, "epsilon == 0.9").first is None
     assert runner.when(branch, "epsilon == 0.9").first.step == 700
     with open_recording(branch.recording) as recording:
-        last = tables_at(recording, recording.count(schema.TRAIN_STEP))[0]
+        last = tables_at(recording, recording.train.steps.count())[0]
         state, action = map(int, np.unravel_index(last.argmax(), last.shape))
     found = runner.when(branch, f"q.taxi_1[{state}, {action}] >= {last.max()}", first=600, every=True)
     assert found.last.values[0].after == last.max()

@@ -15,7 +15,6 @@ from runner.cli import cli
 from runner.debugging import weights
 from runner.debugging.q_value import EpisodesPart, sections_of
 from runner.errors import ConfigError, RecordingError, RunnerError, StorageError
-from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
 from tests.runner.learning.harness import ALGORITHMS, LINEAR, RULES
@@ -43,8 +42,8 @@ CASES |= {f"{name}, schedules": rules | SCHEDULES for name, rules in ALGORITHMS.
 def last_steps(run, count):
     """Return the last training steps, and the number of all."""
     with open_recording(run.recording) as recording:
-        total = recording.count(schema.TRAIN_STEP)
-        return np.concatenate(list(recording.blocks(schema.TRAIN_STEP, total - count, total))), total
+        total = recording.train.steps.count()
+        return recording.train.steps.array(total - count, total), total
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -120,7 +119,7 @@ def test_the_initial_tables_of_another_run_count(tmp_path):
 def test_the_value_before_a_step_is_that_of_its_state_and_action(tmp_path):
     run = make_run(tmp_path, PLAIN, mode="competitive")
     with open_recording(run.recording) as recording:
-        step = recording.episode_steps("train", 12)[7]
+        step = recording.train.episode_steps(12)[7]
         own = recording.mdp.own_actions[int(step["action"])]
         (_, table) = tables_at(recording, int(step["step"]))
     found = runner.why(run, at=STEP, agent="taxi 2")
@@ -235,7 +234,7 @@ def test_a_damaged_recording_is_reported(tmp_path):
     run = make_run(tmp_path, LAKE, episodes=200)
     data = bytearray(run.recording.read_bytes())
     with open_recording(run.recording) as recording:
-        offset = recording.table(schema.TRAIN_STEP).entry(0).offset
+        offset = recording.train.steps.entry(0).offset
     data[offset + 80] ^= 0xFF
     run.recording.write_bytes(data)
     with pytest.raises(RecordingError, match="repair"):

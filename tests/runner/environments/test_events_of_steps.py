@@ -8,7 +8,6 @@ import pytest
 import runner
 from runner.environments import mdp as mdps
 from runner.environments.mdp import events_of
-from runner.recording import schema
 
 WORLDS = {
     "sure": {"mode": "cooperative"},
@@ -24,8 +23,8 @@ def test_every_episode_has_the_events_that_were_counted(tmp_path, world, monkeyp
     run = runner.run({"episodes": 20, "evaluation": None, **WORLDS[world]}, recordings=tmp_path)
     with runner.open_recording(run.recording) as recording:
         mdp = recording.mdp
-        steps = np.concatenate(list(recording.blocks(schema.TRAIN_STEP)))
-        counted = recording.episodes("train")["events"]
+        steps = recording.train.steps.array()
+        counted = recording.train.episodes.array()["events"]
     monkeypatch.setattr(mdps, "_BATCH_OUTCOMES", 1000)  # so that some steps are looked at after others
     bits = events_of(mdp, steps)[:, np.newaxis] >> np.arange(len(mdp.event_names)) & 1
     found = np.zeros_like(counted)
@@ -37,7 +36,7 @@ def test_every_episode_has_the_events_that_were_counted(tmp_path, world, monkeyp
 def test_a_step_that_the_table_does_not_have_has_no_events(tmp_path):
     run = runner.run({"episodes": 3, "evaluation": None}, recordings=tmp_path)
     with runner.open_recording(run.recording) as recording:
-        mdp, steps = recording.mdp, recording.episode_steps("train", 0).copy()
+        mdp, steps = recording.mdp, recording.train.episode_steps(0).copy()
     assert events_of(mdp, steps).any()
     steps["next_state"] = (mdp.next_state[steps["state"], steps["action"]].max(axis=1) + 1) % mdp.states
     assert not events_of(mdp, steps).any()

@@ -36,7 +36,7 @@ def whole(tmp_path_factory):
 def test_the_steps_recorded_later_are_those_that_were(measured, whole):
     size = measured.recording.stat().st_size
     with open_recording(measured.recording) as recording:
-        before = [list(recording.messages(topic)) for topic in schema.MACHINE_TOPICS]
+        before = [list(recording.table(topic).messages()) for topic in schema.MACHINE_TOPICS]
     done = rerecord(measured)
     assert done.recording == measured.recording
     assert done.recording.stat().st_size > 2 * size
@@ -46,10 +46,10 @@ def test_the_steps_recorded_later_are_those_that_were(measured, whole):
     assert find_run(str(done.folder), done.folder).facts == done.facts
     with open_recording(done.recording) as later, open_recording(whole.recording) as at_once:
         for topic in schema.BLOCK_TOPICS:
-            left, right = (np.concatenate(list(one.blocks(topic))) for one in (later, at_once))
+            left, right = (one.table(topic).array() for one in (later, at_once))
             assert left.tobytes() == right.tobytes()
         assert later.metadata("rerecord")["dualtaxi"]
-        circumstances = [list(later.messages(topic)) for topic in schema.MACHINE_TOPICS]
+        circumstances = [list(later.table(topic).messages()) for topic in schema.MACHINE_TOPICS]
         assert circumstances == before, "the time that the training took"
         assert later.provenance == at_once.provenance
     assert verify(done.recording).sound
@@ -97,8 +97,8 @@ def test_the_last_table_plays_as_the_last_evaluation_did(whole, tmp_path):
         "step": whole.summary["train_steps"],
     }
     with open_recording(done.recording) as recording, open_recording(whole.recording) as origin:
-        assert recording.count(schema.TRAIN_STEP) == 0
-        assert recording.count(schema.EVAL_EPISODE) == 30
+        assert recording.train.steps.count() == 0
+        assert recording.eval.episodes.count() == 30
         expected = tables_at(origin, whole.summary["train_steps"])
         for table, snapshot in zip(expected, recording.snapshots(), strict=True):
             assert table.tobytes() == snapshot.values.tobytes()
@@ -112,7 +112,7 @@ def test_the_table_of_a_moment(whole, tmp_path):
         for table, snapshot in zip(tables_at(origin, 700), recording.snapshots(), strict=True):
             assert table.tobytes() == snapshot.values.tobytes()
         starts = np.flatnonzero(origin.mdp.start)
-        steps = np.concatenate(list(recording.blocks(schema.EVAL_STEP)))
+        steps = recording.eval.steps.array()
         assert sorted(steps["state"][steps["t"] == 0].tolist()) == starts.tolist()
 
 
@@ -122,7 +122,7 @@ def test_one_start_state_and_steps_even_if_the_run_had_none(measured):
     done = evaluate(measured, measured.folder.parent, trials=4, start=start)
     assert done.facts["config"]["initial_q"]["run"] == measured.run_id
     with open_recording(done.recording) as recording:
-        steps = np.concatenate(list(recording.blocks(schema.EVAL_STEP)))
+        steps = recording.eval.steps.array()
     assert steps["state"][steps["t"] == 0].tolist() == [start] * 4
 
 

@@ -132,7 +132,7 @@ def test_a_stop_while_it_catches_up_loses_nothing(whole, tmp_path):
     assert stopped.summary["content_digest"] is None
     with open_recording(run.recording) as recording:
         assert recording.finished
-        assert recording.count(TRAIN_STEP) == steps == recording.result["train_steps"]
+        assert recording.train.steps.count() == steps == recording.result["train_steps"]
     assert_same(resume(stopped), whole)
 
 

@@ -15,7 +15,7 @@ from runner.execution import verify
 from runner.execution.resume import resume
 from runner.execution.session import run_job
 from runner.recording.reader import open_recording
-from runner.recording.schema import BLOCK_TOPICS, EVAL_STEP, TRAIN_STEP
+from runner.recording.schema import BLOCK_TOPICS
 from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run
@@ -48,8 +48,10 @@ def test_killed_again_and_again(tmp_path, mode, config, sizes):
     with open_recording(run.recording) as recording:
         assert not recording.finished
         for topic in BLOCK_TOPICS:
-            assert recording.count(topic) == sum(len(block) for block in recording.blocks(topic))
-        assert recording.count(TRAIN_STEP) + recording.count(EVAL_STEP) > 0
+            assert recording.table(topic).count() == sum(
+                len(block) for block in recording.table(topic).blocks()
+            )
+        assert recording.train.steps.count() + recording.eval.steps.count() > 0
     done = resume(run)
     assert done.status == find_run(run.run_id, recordings).status == "finished"
     assert done.summary["content_digest"] == whole.summary["content_digest"]

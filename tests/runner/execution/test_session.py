@@ -135,10 +135,10 @@ def test_run_json_says_what_was_done(tmp_path):
     summary = stored["summary"]
     with open_recording(run.recording) as recording:
         for topic in schema.TOPICS:
-            assert summary["messages"][topic.name] == recording.count(topic)
+            assert summary["messages"][topic.name] == recording.table(topic).count()
         last = recording.metrics("eval")[-1]
-        assert summary["train_steps"] == recording.count(schema.TRAIN_STEP) == last["step"]
-        assert summary["eval_steps"] == recording.count(schema.EVAL_STEP)
+        assert summary["train_steps"] == recording.train.steps.count() == last["step"]
+        assert summary["eval_steps"] == recording.eval.steps.count()
         assert recording.job == Job(experiment(TAXIS), 9).identity
     assert summary["episodes"] == last["episode"] == 60
     assert summary["last_evaluation"] == {
@@ -193,7 +193,7 @@ def test_recorded_without_threads_a_run_is_the_same_to_the_byte(parts, tmp_path)
     assert alone.summary["content_digest"] == threaded.summary["content_digest"]
     with open_recording(alone.recording) as one, open_recording(threaded.recording) as other:
         for topic in set(schema.ALL_TOPICS) - set(schema.MACHINE_TOPICS):
-            assert list(one.messages(topic)) == list(other.messages(topic))
+            assert list(one.table(topic).messages()) == list(other.table(topic).messages())
     assert set(threading.enumerate()) <= before, "no thread is left"
 
 
@@ -228,13 +228,14 @@ def test_a_stopped_run_is_interrupted_and_closed_properly(asked, tmp_path):
         assert recording.finished
         assert recording.result["status"] == recording.run_facts()["status"] == "interrupted"
         for topic in set(schema.TOPICS) - {schema.LOG_TOPIC}:
-            messages = list(recording.messages(topic))
-            assert messages == list(complete.messages(topic))[: len(messages)], topic.name
-        assert sum(recording.count(topic) for topic in schema.BLOCK_TOPICS) < sum(
-            complete.count(topic) for topic in schema.BLOCK_TOPICS
+            messages = list(recording.table(topic).messages())
+            assert messages == list(complete.table(topic).messages())[: len(messages)], topic.name
+        assert sum(recording.table(topic).count() for topic in schema.BLOCK_TOPICS) < sum(
+            complete.table(topic).count() for topic in schema.BLOCK_TOPICS
         )
         lines = [
-            message_class(schema.LOG).FromString(line) for _, line in recording.messages(schema.LOG_TOPIC)
+            message_class(schema.LOG).FromString(line)
+            for _, line in recording.table(schema.LOG_TOPIC).messages()
         ]
         assert (lines[-1].message, lines[-1].level) == ("interrupted", schema.LOG_LEVELS.index("WARNING"))
 
@@ -283,7 +284,7 @@ def test_an_error_in_a_callback_loses_no_step(threads, tmp_path):
     with pytest.raises(ZeroDivisionError):
         run_job(Job(config, 0), run, report=report, threads=threads)
     with open_recording(run.recording) as recording:
-        assert (recording.count(schema.TRAIN_STEP), recording.count(schema.EVAL_STEP)) == taken[-1]
+        assert (recording.train.steps.count(), recording.eval.steps.count()) == taken[-1]
         assert min(taken[-1]) > 0
 
 

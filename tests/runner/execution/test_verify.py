@@ -86,7 +86,7 @@ def test_a_rewritten_recording_is_sound(run, tmp_path):
 )
 def test_one_field_of_one_record(run, tmp_path, topic, field, value):
     with open_recording(run.recording) as recording:
-        records = np.concatenate(list(recording.blocks(topic)))
+        records = recording.table(topic).array()
     number = next(k for k in range(len(records) // 3, len(records)) if np.all(records[field][k] != value))
     found = verify(altered(run.recording, tmp_path / "x.mcap", topic, setting(number, field, value)))
     assert not found.sound
@@ -208,7 +208,7 @@ def test_an_interrupted_recording_is_compared_to_its_end(run, tmp_path):
     with open_recording(cut) as recording:
         assert "result" not in survey(cut, keep_result=True).metadata
         last = len(recording.metrics("train")) - 1
-        counts = recording.count(schema.TRAIN_STEP), recording.count(schema.EVAL_STEP)
+        counts = recording.train.steps.count(), recording.eval.steps.count()
     found = verify(cut)
     assert found.sound, found.finding
     assert (found.train_steps, found.eval_steps) == counts

@@ -42,7 +42,7 @@ def test_they_have_every_kind_of_message(name):
 
 def test_each_state_has_its_history(name):
     with open_recording(DATA / f"{name}.mcap") as recording:
-        steps = np.concatenate(list(recording.blocks(schema.TRAIN_STEP)))
+        steps = recording.train.steps.array()
         state = int(np.bincount(steps["state"]).argmax())
         history = history_of(recording, state, len(steps))
         assert history.visits[0].sum() == (steps["state"] == state).sum()
@@ -62,11 +62,11 @@ def test_what_kept_loops_hold(name):
 def test_environments_in_parallel_are_distinguished():
     with open_recording(DATA / "vector.mcap") as recording:
         assert recording.environments == 3
-        steps = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+        steps = recording.train.steps.array()
         assert len(steps) == 80 * 3
         assert (steps["t"] == schema.RESET_ONLY).any()
     with open_recording(DATA / "game.mcap") as recording:
-        played = list(recording.transitions("train"))
+        played = list(recording.train.transitions())
         assert [int(one["acted"]) for one in played[:3]] == [0b111, 0b110, 0b100]
         assert [int(one["agents_terminated"]) for one in played[:3]] == [0b001, 0b010, 0b100]
 

@@ -30,7 +30,7 @@ def forged(source, target, topics=None, result=None):
     with open_recording(source) as recording:
         digest, counts = ContentHash(), {}
         for topic in set(recording.topics) - set(schema.MACHINE_TOPICS):
-            messages = list(recording.messages(topic))
+            messages = list(recording.table(topic).messages())
             counts[topic.name] = len(messages)
             for time, payload in messages:
                 digest.update(topic, message_record(topic, time, payload))

@@ -111,7 +111,7 @@ def test_every_world_becomes_a_film(pictured, tmp_path, world):
     result = film(pictured(world).recording, "--episode", 3, "-o", path, "--fps", 12.5)
     assert result.exit_code == 0, result.output
     with open_recording(pictured(world).recording) as recording:
-        assert len(frames_of(path)) == len(recording.episode_steps("train", 3)) + 1
+        assert len(frames_of(path)) == len(recording.train.episode_steps(3)) + 1
     with av.open(path) as container:
         assert container.streams.video[0].average_rate == 12.5
         assert container.streams.video[0].codec_context.name == "h264"
@@ -125,7 +125,7 @@ def test_values_and_their_reason_are_shown(tmp_path):
     assert result.exit_code == 0, result.output
     assert "The film shows values: " in result.stderr
     with open_recording(rec.run.recording) as recording:
-        assert len(frames_of(tmp_path / "film.webm")) == len(recording.episode_steps("train", 1)) + 1
+        assert len(frames_of(tmp_path / "film.webm")) == len(recording.train.episode_steps(1)) + 1
 
 
 def test_a_film_ends_with_a_note_where_the_environment_differs(tmp_path):
@@ -214,7 +214,7 @@ def test_frames_that_are_too_large_are_refused(tmp_path, ending):
 def test_best_and_worst_are_chosen_by_return(pictured, tmp_path):
     run = pictured("taxi")
     with open_recording(run.recording) as recording:
-        records = recording.episodes("eval")
+        records = recording.eval.episodes.array()
         phase, ranked = ranked_episodes(recording)
     assert phase == "eval"
     returns = records["returns"].sum(axis=1)
@@ -228,7 +228,7 @@ def test_without_evaluations_training_episodes_are_ranked(pole, tmp_path):
     run, drawn = pole
     result = film(run.recording, "--best", "-o", tmp_path / "film.mp4")
     with open_recording(run.recording) as recording:
-        best = recording.episodes("train")["returns"].sum(axis=1).argmax()
+        best = recording.train.episodes.array()["returns"].sum(axis=1).argmax()
     assert f"training episode {best}, recorded frames, {len(drawn[best])} frames" in result.stdout
 
 
@@ -312,7 +312,7 @@ def test_without_a_choice_it_is_the_median_trial(pictured, tmp_path):
     result = film(run.recording, "-o", tmp_path / "film.gif")
     with open_recording(run.recording) as recording:
         after, number = typical_trial(recording)
-        records = recording.episodes("eval", 12, 18)
+        records = recording.eval.episodes.array(12, 18)
     assert f"trial {number} of the evaluation after {after} episodes" in result.stdout
     ranks = [(r["success"], r["returns"].sum(), -int(r["length"])) for r in records]
     assert sorted(ranks)[3] == ranks[number]

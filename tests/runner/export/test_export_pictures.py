@@ -38,7 +38,7 @@ def recorded(folder, env, steps=60, **options):
 
 
 def test_there_is_a_picture_of_every_state_with_its_step(recording):
-    steps = recording.episode_steps("train", 3)
+    steps = recording.train.episode_steps(3)
     shown = list(Pictures(recording, "train", 3))
     assert [picture.t for picture in shown] == list(range(len(steps) + 1))
     assert len({picture.pixels.shape for picture in shown}) == 1
@@ -51,7 +51,7 @@ def test_there_is_a_picture_of_every_state_with_its_step(recording):
 
 
 def test_scenes_look_like_the_pictures_of_the_pages(recording):
-    mdp, steps = recording.mdp, recording.episode_steps("train", 3)[:30]
+    mdp, steps = recording.mdp, recording.train.episode_steps(3)[:30]
     shown = Pictures(recording, "train", 3)
     if mdp.scene is None:
         assert shown.source is Source.VALUES
@@ -151,7 +151,7 @@ def test_pictures_end_with_a_note_where_the_environment_differs(tmp_path):
     other = made_otherwise(rec.run.recording, tmp_path / "other.mcap", max_episode_steps=5)
     with open_recording(other) as recording:
         shown = list(Pictures(recording, "train", 0))
-        steps = recording.episode_steps("train", 0)
+        steps = recording.train.episode_steps(0)
         later = Pictures(recording, "train", 1)  # its reset needs those before it
     assert later.source is Source.VALUES
     assert "before, at train episode 0, t 4: truncated" in later.reason
@@ -172,7 +172,7 @@ def test_values_are_shown_where_the_environment_begins_otherwise(tmp_path):
         shown = Pictures(recording, "train", 0)
         assert shown.source is Source.VALUES
         assert "first observation" in shown.reason
-        assert len(list(shown)) == len(recording.episode_steps("train", 0)) + 1
+        assert len(list(shown)) == len(recording.train.episode_steps(0)) + 1
 
 
 def test_values_are_drawn_as_bars_that_follow_them(tmp_path):
@@ -185,7 +185,7 @@ def test_values_are_drawn_as_bars_that_follow_them(tmp_path):
         assert shown.source is Source.VALUES
         assert "cannot be imported" in shown.reason
         frames = [picture.pixels for picture in shown]
-        values = recording.episode_steps("train", 0)["next_observation"][:, 2]
+        values = recording.train.episode_steps(0)["next_observation"][:, 2]
     blue = [(frame[50:70] == [0, 0x72, 0xB2]).all(axis=2).sum() for frame in frames[1:]]
     for number, value in zip(blue, values, strict=True):
         assert (number > 0) == (value > 0)
@@ -202,7 +202,7 @@ def test_observations_that_are_images_are_shown(tmp_path):
     with recording:
         shown = Pictures(recording, "train", 0)
         assert shown.source is Source.OBSERVATION
-        last = recording.episode_steps("train", 0)["next_observation"][:, -1]
+        last = recording.train.episode_steps(0)["next_observation"][:, -1]
         np.testing.assert_array_equal([picture.pixels[..., 0] for picture in shown][1:], last)
 
 
@@ -220,14 +220,14 @@ def test_games_and_vectors_have_pictures(tmp_path):
         assert last.pixels.shape == (700, 700, 3)
         assert last.action == "agent 0 left, agent 1 left, agent 2 left"
         assert len(last.returns) == 3
-        np.testing.assert_allclose(last.returns, recording.episodes("train")[0]["returns"])
+        np.testing.assert_allclose(last.returns, recording.train.episodes.array()[0]["returns"])
     envs = runner.record_vector(gymnasium.make_vec("CartPole-v1", 3), tmp_path, name="vector")
     envs.reset(seed=0)
     for _ in range(60):
         envs.step(np.ones(3, np.int64))
     envs.close()
     with open_recording(envs.run.recording) as recording:
-        for episode, record in enumerate(recording.episodes("train")):
+        for episode, record in enumerate(recording.train.episodes.array()):
             shown = list(Pictures(recording, "train", episode))
             assert len(shown) == record["length"] + 1
             assert shown[-1].returns[0] == record["returns"][0]
@@ -238,7 +238,7 @@ def test_texts_of_an_observation_are_named(tmp_path):
     recording, _ = recorded(tmp_path, make("RoomsText"))
     with recording:
         shown = list(Pictures(recording, "train", 1))
-        missions = [step["next_observation"]["mission"] for step in recording.transitions("train")]
+        missions = [step["next_observation"]["mission"] for step in recording.train.transitions()]
     assert all(picture.events.startswith("mission ") for picture in shown[1:])
     assert any(repr(mission) in shown[1].events for mission in missions)
     assert shown[1].action.startswith("go ")

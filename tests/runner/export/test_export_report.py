@@ -52,7 +52,7 @@ def test_replays_are_the_recorded_episodes_best_and_worst_among_them(recording, 
         for title in titles
     )
     assert any("worst trial" in title.lower() and f"trial {worst} " in title for title in titles)
-    steps, words = recording.episode_steps("train", 7), states_in_words(recording.mdp)
+    steps, words = recording.train.episode_steps(7), states_in_words(recording.mdp)
     shown = episodes[0]
     (state,), (action,) = shown["texts"], shown["actions"]
     states = np.append(steps["state"], steps["next_state"][-1])
@@ -74,7 +74,7 @@ def test_q_values_are_those_before_each_step(recording, page_of):
     from runner.replay.tables import tables_at
 
     data = data_of(page_of(recording.run["name"]))[1]
-    steps = recording.episode_steps("train", 30)
+    steps = recording.train.episode_steps(30)
     for k in (0, len(steps) // 2, len(steps) - 1):
         tables = tables_at(recording, int(steps["step"][k]))
         for table, shown in zip(tables, data["values"], strict=True):
@@ -174,7 +174,7 @@ def test_the_slider_is_moved_by_keys_and_shows_the_recorded_frames(opened, pictu
     with open_recording(pictured(world).recording) as recording:
         mdp, words = recording.mdp, states_in_words(recording.mdp)
         _, typical, _ = ranked_trials(recording, 40)
-        steps = recording.episode_steps("eval", 12 + typical)
+        steps = recording.eval.episode_steps(12 + typical)
     states = np.append(steps["state"], steps["next_state"][-1])
     places = Drawing(mdp.scene).places(mdp, states)
     choose = Select(driver.find_element(By.CSS_SELECTOR, ".episode"))

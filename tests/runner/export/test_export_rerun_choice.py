@@ -39,7 +39,7 @@ class TestSelection:
         selection = select(rivals, Request())
         assert selection.train[0].start == 0
         last = selection.train[-1]
-        assert last.stop == rivals.count(schema.TRAIN_STEP)
+        assert last.stop == rivals.train.steps.count()
         assert [one.after for one, _ in selection.evaluations] == [40]
         assert "20 of 40 training episodes, evenly spread from 0 to 39" in selection.exported[0]
         assert any("--all" in left and "20 training episodes" in left for left in selection.left_out)
@@ -48,7 +48,7 @@ class TestSelection:
 
     def test_everything(self, rivals):
         selection = select(rivals, Request(everything=True))
-        assert selection.steps == rivals.count(schema.TRAIN_STEP) + rivals.count(schema.EVAL_STEP)
+        assert selection.steps == rivals.train.steps.count() + rivals.eval.steps.count()
         assert not selection.left_out
 
     def test_ranges_every_and_evaluations_are_combined(self, rivals):
@@ -74,7 +74,7 @@ class TestSelection:
         run = pictured("rivals")
         location = locate(run, Request(), StepRef(7, 2))
         with open_recording(run.recording) as recording:
-            step = recording.episode_steps("train", 7)[2]
+            step = recording.train.episode_steps(7)[2]
             spans = select(recording, location.request).train
         assert location.time == step["log_time"] // schema.STEP_NANOSECONDS
         assert any(span.start <= step["step"] < span.stop for span in spans)
@@ -182,7 +182,7 @@ class TestTwoRuns:
         step, message = locate_divergence(runs)
         with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
             divergence = diff(a, b).divergence
-            record = next(a.blocks(schema.TRAIN_STEP, divergence.step, divergence.step + 1))[0]
+            record = next(a.train.steps.blocks(divergence.step, divergence.step + 1))[0]
         assert step == StepRef(divergence.episode, divergence.t)
         assert f"training step {divergence.step:,}" in message
         location = locate(runs[0], Request(), step)

@@ -50,7 +50,7 @@ class Exported:
 
     def steps(self, phase):
         """Return the recorded steps of a phase."""
-        return np.concatenate(list(self.recording.blocks(TOPICS[phase])))
+        return self.recording.table(TOPICS[phase]).array()
 
 
 @pytest.fixture(scope="module", params=["taxis", "rivals", "taxi", "lake", "cliff", "corridor"])
@@ -213,12 +213,12 @@ def test_every_metric_is_there(exported):
     for name in [*names, "reward_percent"]:
         assert exported.table(f"/train/metrics/{name}")["Scalars:scalars"]
     lengths = [row[0] for row in exported.table("/train/episodes")["Scalars:scalars"]]
-    assert lengths == exported.recording.episodes("train")["length"].tolist()
+    assert lengths == exported.recording.train.episodes.array()["length"].tolist()
 
 
 def test_means_between_reports_are_of_the_episodes_that_ended_there(exported):
     recording = exported.recording
-    episodes = recording.episodes("train")
+    episodes = recording.train.episodes.array()
     reports = sorted(
         [*recording.metrics("train"), *recording.metrics("eval")], key=lambda row: row["log_time"]
     )

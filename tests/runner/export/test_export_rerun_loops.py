@@ -91,7 +91,7 @@ class Exported:
 
 
 def steps_of(recording, phase="train"):
-    steps = np.concatenate(list(recording.blocks(recording.topic(f"/{phase}/step"))))
+    steps = recording.phase(phase).steps.array()
     return steps[steps["t"] != schema.RESET_ONLY]
 
 
@@ -107,8 +107,8 @@ def test_every_environment_of_a_vector_is_sent(tmp_path, mode, kind):
     run = record_poles(tmp_path, mode, kind)
     with open_recording(run.recording) as recording:
         exported, steps = Exported(recording, tmp_path / "run.rrd", everything=True), steps_of(recording)
-        episodes = recording.episodes("train")
-        extras = recording.extras("train").at(steps["step"])["own"]
+        episodes = recording.train.episodes.array()
+        extras = recording.train.extras.at(steps["step"])["own"]
     for i in range(N):
         own = steps[steps["step"] % N == i]
         times = (own["log_time"] // schema.STEP_NANOSECONDS).tolist()
@@ -147,7 +147,7 @@ def test_every_agent_of_a_game_is_sent_where_it_acted(tmp_path):
 def test_episodes_of_a_vector_are_selected_and_located(tmp_path):
     run = record_poles(tmp_path)
     with open_recording(run.recording) as recording:
-        span = recording.episode_span("train", 4)
+        span = recording.train.episode_span(4)
         (chosen,) = select(recording, Request(episodes=((4, 5),))).train
         assert chosen.start <= span.start < span[-1] < chosen.stop
         assert chosen.start % N == chosen.stop % N == 0
@@ -187,7 +187,7 @@ def test_pictures_of_selected_episodes_of_a_vector_are_drawn(tmp_path):
         assert any("pictures of 3 of" in text for text in exported.selection.exported)
         steps = steps_of(recording)
         for number in (2, 3, 4):
-            span = recording.episode_span("train", number)
+            span = recording.train.episode_span(number)
             own = steps[np.isin(steps["step"], list(span))]["log_time"] // schema.STEP_NANOSECONDS
             shown = dict(picture_rows(exported, f"/train/env_{span.start % N}/frame"))
             with contextlib.closing(Pictures(recording, "train", number)) as expected:
@@ -210,7 +210,7 @@ def test_views_of_steps_show_the_time_of_the_chosen_episodes(tmp_path, is_vector
     with open_recording(run.recording) as recording:
         Exported(recording, tmp_path / "chosen.rrd", episodes=((2, 3),), with_default=True)
         Exported(recording, tmp_path / "whole.rrd")
-        span = recording.episode_span("train", 2)
+        span = recording.train.episode_span(2)
         steps = steps_of(recording)
     times = steps["log_time"] // schema.STEP_NANOSECONDS
     first, last = (int(times[steps["step"] == step][0]) for step in (span[0], span[-1]))
@@ -222,7 +222,7 @@ def test_views_of_steps_show_the_time_of_the_chosen_episodes(tmp_path, is_vector
 def test_each_environment_of_a_vector_has_pictures_by_default(tmp_path):
     with open_recording(record_poles(tmp_path, steps=60).recording) as recording:
         drawn = select(recording, Request(frames=True)).drawn["train"]
-        assert {recording.episode_span("train", number).start % N for number in drawn} == set(range(N))
+        assert {recording.train.episode_span(number).start % N for number in drawn} == set(range(N))
         assert not select(recording, Request()).drawn
 
 
@@ -287,7 +287,7 @@ def test_evaluations_of_a_loop_are_selected_by_number(tmp_path, monkeypatch):
             with env.phase(phase):
                 play_episode(env)
     with open_recording(env.run.recording) as recording:
-        spans = [recording.episode_span("eval", number) for number in range(3)]
+        spans = [recording.eval.episode_span(number) for number in range(3)]
         chosen = select(recording, Request(evaluations=(1,)))
         assert set(spans[1]) <= {step for _, steps in chosen.evaluations for step in steps}
         assert not set(spans[0]) & {step for _, steps in chosen.evaluations for step in steps}

@@ -64,7 +64,7 @@ def export(tmp_path, monkeypatch):
 
 def steps_of(path, phase, start=0, stop=None):
     with open_recording(path) as recording:
-        return np.concatenate([b.copy() for b in recording.blocks_of_episodes(phase, start, stop)])
+        return np.concatenate([b.copy() for b in recording.phase(phase).steps_of_episodes(start, stop)])
 
 
 def read_table(path):
@@ -89,7 +89,7 @@ def test_tables_hold_every_step_episode_and_measure(export, taxis, words):
             assert (found[f"reward_{agent}"].to_numpy() == recorded["rewards"][:, i]).all()
         assert (found["action_taxi_1"] * 6 + found["action_taxi_2"] == found["action"]).all()
         with open_recording(taxis.recording) as recording:
-            ended = recording.episodes(phase)
+            ended = recording.phase(phase).episodes.array()
         found = episodes[episodes["phase"] == phase]
         for name in ("episode", "length", "success"):
             assert (found[name].to_numpy() == ended[name]).all(), name
@@ -147,7 +147,7 @@ def test_minari_reads_the_episodes(export, taxis, phase, monkeypatch):
     dataset = minari.load_dataset(f"taxis-{taxis.run_id}-v0")
     recorded = steps_of(taxis.recording, phase)
     with open_recording(taxis.recording) as recording:
-        ended = recording.episodes(phase)
+        ended = recording.phase(phase).episodes.array()
         mdp = recording.mdp
     assert dataset.total_episodes == len(ended)
     assert dataset.total_steps == len(recorded)
@@ -196,7 +196,7 @@ def test_tensorboard_reads_the_measures(export, taxis):
             for name, value in found.values.items():
                 at = began + float(np.interp(found.position, clock.positions, clock.seconds))
                 expected.setdefault(f"{found.phase}/{name}", []).append((at, found.step, np.float32(value)))
-        episodes = recording.episodes("train")
+        episodes = recording.train.episodes.array()
     for tag, points in expected.items():
         assert [(e.wall_time, e.step, e.value) for e in events.Scalars(tag)] == points
     returns = events.Scalars("train/episode/return/taxi_2")
@@ -265,7 +265,7 @@ def test_the_layout_for_foxglove_names_what_a_recording_has(taxis):
                 field, _, index = field.partition("[")
                 (described,) = (one for one in topic.message.fields if one.stored_name == field)
                 assert bool(index) == described.repeated, path
-                assert recording.count(topic)
+                assert recording.table(topic).count()
             if "topicToRender" in panel:
                 assert panel["topicToRender"] in topics
 

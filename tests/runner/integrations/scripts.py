@@ -36,12 +36,14 @@ def the_run():
 
 def scalars(run):
     with runner.open_recording(run.recording) as recording:
-        return [(each["name"], each["value"], each["step"]) for each in recording.decoded(SCALAR_TOPIC)]
+        return [
+            (each["name"], each["value"], each["step"]) for each in recording.table(SCALAR_TOPIC).decoded()
+        ]
 
 
 def texts(run):
     with runner.open_recording(run.recording) as recording:
-        return {each["name"]: each["message"] for each in recording.decoded(recording.topic("/log"))}
+        return {each["name"]: each["message"] for each in recording.table("/log").decoded()}
 
 
 def arrays(run):
@@ -52,4 +54,4 @@ def arrays(run):
 def images(run):
     with runner.open_recording(run.recording) as recording:
         topic = recording.topic("/image")
-        return [(each["frame_id"], each["format"], each["data"]) for each in recording.decoded(topic)]
+        return [(each["frame_id"], each["format"], each["data"]) for each in recording.table(topic).decoded()]

@@ -212,7 +212,7 @@ def test_options_of_recording_can_be_given():
         env.reset(seed=1)
         env.step(0)
     with runner.open_recording(the_run().recording) as recording:
-        assert recording.count(recording.topic("/train/frame")) == 1
+        assert recording.train.frames.count() == 1
         assert recording.config["recording"]["steps"] == "actions"
     with pytest.warns(RuntimeWarning, match="the argument step='actions' has no effect here"):
         SummaryWriter(step="actions").close()

@@ -130,10 +130,10 @@ def test_what_it_learned_is_played_again(algorithm, run, tmp_path):
     played = evaluate(run, tmp_path, trials=20, seed=1)
     assert verify(played.recording).sound
     with open_recording(run.recording) as recording:
-        learned = live(run, recording.count(schema.TRAIN_STEP))
+        learned = live(run, recording.train.steps.count())
     with open_recording(played.recording) as recording:
         same(named_tables_at(recording, 0), learned)
-        steps = np.concatenate(list(recording.blocks(schema.EVAL_STEP)))
+        steps = recording.eval.steps.array()
         own = learned.model.own_action[steps["action"]]
     assert not steps["explored"].any()
     for i, table in enumerate(learned.named_tables(j) for j in range(len(learned.agents))):

@@ -108,10 +108,10 @@ def test_the_content_is_that_of_whole_steps_which_come_again(runs, tmp_path):
     with open_recording(actions.recording) as recording, open_recording(whole.recording) as full:
         assert not recording.has_steps
         for phase in ("train", "eval"):
-            assert recording.step_count(phase) == full.count(full.topic(f"/{phase}/step"))
-            kept = list(recording.actions(phase))
+            assert recording.phase(phase).steps.total() == full.phase(phase).steps.count()
+            kept = list(recording.phase(phase).steps.rows())
             assert len(kept) <= 1, "the blocks that were flushed in between are one"
-            steps = list(full.blocks(full.topic(f"/{phase}/step")))
+            steps = list(full.phase(phase).steps.blocks())
             for name in kept[0].dtype.names if kept else ():
                 if name != "digest":
                     found = np.concatenate([block[name] for block in kept])
@@ -127,7 +127,7 @@ def test_the_content_is_that_of_whole_steps_which_come_again(runs, tmp_path):
         assert not recording.leaves_out_steps
         for phase in ("train", "eval"):
             topic = full.topic(f"/{phase}/step")
-            parts = [[block.tobytes() for block in each.blocks(topic)] for each in (recording, full)]
+            parts = [[block.tobytes() for block in each.table(topic).blocks()] for each in (recording, full)]
             assert b"".join(parts[0]) == b"".join(parts[1])
     assert rerecord(after).summary == after.summary, "there is nothing left to do"
 
@@ -137,7 +137,7 @@ def test_one_episode_comes_again_alone(tmp_path):
     with open_recording(run.recording) as recording:
         (steps,) = runner.replay.environment.redo(recording, "train", [9])
         assert steps.difference is None
-        assert len(steps.recorded.rewards) == recording.episodes("train", 9, 10)["length"][0]
+        assert len(steps.recorded.rewards) == recording.train.episodes.array(9, 10)["length"][0]
 
 
 def test_replays_make_its_steps_again(tmp_path):
@@ -184,7 +184,7 @@ def test_another_reward_is_found_in_its_episode(tmp_path, monkeypatch):
     with open_recording(rec.run.recording) as recording:
         make = lambda: gymnasium.make("CartPole-v1")  # noqa: E731
         difference = [steps.difference for steps in runner.replay.environment.redo(recording, make=make)][-1]
-        ends = recording.episodes("train")["last_step"]
+        ends = recording.train.episodes.array()["last_step"]
     assert difference.field == "digest of the episode so far"
     assert difference.step == ends[np.searchsorted(ends, 69)]
 
@@ -341,7 +341,7 @@ def test_a_disk_without_space_for_both_keeps_the_small_chunks(tmp_path, monkeypa
     run = single("CartPole-v1")(tmp_path, steps="actions")
     assert sorted(path.name for path in run.folder.iterdir()) == ["recording.mcap", "run.json", "trust.json"]
     with open_recording(run.recording) as recording:
-        assert len(list(recording.actions("train"))) > 1
+        assert len(list(recording.train.steps.rows())) > 1
     assert verify(run.recording).verdict == "reproduced"
 
 
@@ -372,7 +372,7 @@ def test_an_episode_of_which_actions_were_lost_is_refused(tmp_path, monkeypatch)
         for _ in range(100):  # at the edge, where nothing happens
             rec.step(0)
     with open_recording(rec.run.recording) as recording:
-        assert recording.episode_span("train", 0) == range(100)
+        assert recording.train.episode_span(0) == range(100)
         with pytest.raises(RecordingError, match="steps of training episode 0 were lost"):
             whole_steps(recording, "train", 0)
 
@@ -394,5 +394,5 @@ def test_wide_actions_of_many_environments_stay_readable(tmp_path):
         zeros = np.zeros((600, 16))
         rec.batch(np.zeros((600, 16, 2), np.float32), actions, zeros, zeros > 1, zeros > 1)
     with open_recording(rec.run.recording) as recording:
-        found = np.concatenate([rows["action"] for rows in recording.actions("train")])
+        found = np.concatenate([rows["action"] for rows in recording.train.steps.rows()])
     assert found.tobytes() == actions.reshape(-1, 1024).tobytes()

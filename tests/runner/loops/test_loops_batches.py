@@ -94,11 +94,11 @@ def test_the_environments_need_only_a_name_and_their_arrays(tmp_path):
     assert verify(rec.run.recording).finding == ""
     with runner.open_recording(rec.run.recording) as recording:
         described = json.loads(recording.run["spaces"])
-        steps = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+        steps = recording.train.steps.array()
         assert steps["next_observation"].reshape(300, 3, 4).tolist() == observations.tolist()
         assert steps["action"].reshape(300, 3).tolist() == actions.tolist()
-        assert recording.extras("train").count == 900
-        assert recording.extras("train").of_episode(0)["value"].tolist()[0] == 2.0
+        assert recording.train.extras.count == 900
+        assert recording.train.extras.of_episode(0)["value"].tolist()[0] == 2.0
         assert described["observation"] | {"low": 0, "high": 0} == {
             "type": "Box",
             "dtype": "<f4",
@@ -132,12 +132,12 @@ def test_nested_observations_and_actions_of_a_continuous_space(tmp_path):
         rec.batch(seen, actions, rewards, ends)
     assert verify(rec.run.recording).finding == ""
     with runner.open_recording(rec.run.recording) as recording:
-        steps = next(recording.blocks(recording.topic("/train/step")))
+        steps = next(recording.train.steps.blocks())
         assert (steps["next_observation"]["eye"].reshape(50, 4, 3) == seen["eye"][1:]).all()
         assert (steps["next_observation"]["arm"]["0"].reshape(50, 4) == seen["arm"][0][1:]).all()
         assert (steps["next_observation"]["arm"]["1"].reshape(50, 4) == seen["arm"][1][1:]).all()
         assert (steps["action"].reshape(50, 4, 2) == actions).all()  # float64, as they came
-        returns = np.concatenate(list(recording.blocks(recording.topic("/train/episode"))))["returns"]
+        returns = recording.train.episodes.array()["returns"]
     total, expected, was_over = np.zeros(4), [], np.zeros(4, bool)
     for t in range(50):
         total = np.where(was_over, 0.0, total + rewards[t])
@@ -154,7 +154,7 @@ def test_unknown_last_observations_are_nan_with_a_warning_and_refused_of_whole_n
     with rec, pytest.warns(RuntimeWarning, match="pass final_observations"):
         rec.batch(np.ones((6, 2, 3)), np.zeros((5, 2), int), np.ones((5, 2)), ends)
     with runner.open_recording(rec.run.recording) as recording:
-        steps = next(recording.blocks(recording.topic("/train/step")))["next_observation"]
+        steps = next(recording.train.steps.blocks())["next_observation"]
         assert np.isnan(steps[5]).all()
         assert np.isfinite(np.delete(steps, 5, axis=0)).all()
     rec = runner.record_batches("gym/Grid", tmp_path, autoreset_mode="SameStep")

@@ -55,7 +55,7 @@ def recorded(folder, env, steps=150, **options):
 def rows(run, episode, phase="train"):
     """Return the steps of an episode, without what counts them over the run."""
     with open_recording(run.recording) as recording:
-        kept = recording.episode_steps(phase, episode)
+        kept = recording.phase(phase).episode_steps(episode)
         return repack_fields(kept[[name for name in kept.dtype.names if name in VALUES]])
 
 

@@ -15,7 +15,6 @@ import runner
 from runner.analysis.evaluations import loop_summary
 from runner.analysis.series import read_series
 from runner.export.contents import shortcomings
-from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.recording.run_file import Summary
 from runner.service.app import create_app
@@ -35,8 +34,8 @@ def test_ls_and_show_describe_loops(folder):
 @pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
 def test_ls_and_show_have_the_returns_of_a_loop_and_what_it_logged(folder, name):
     with open_recording(runner.find_run(name, folder).recording) as recording:
-        trials = recording.episodes("eval", 0, None)
-        episodes = recording.episodes("train", 0, None)[-100:]
+        trials = recording.eval.episodes.array(0, None)
+        episodes = recording.train.episodes.array(0, None)[-100:]
     row = next(
         run for run in json.loads(dualtaxi(folder, "ls", "--json").stdout)["runs"] if run["name"] == name
     )
@@ -198,8 +197,8 @@ def test_the_table_of_a_loop_is_its_latest_snapshot(tmp_path):
 
 def test_an_evaluation_of_a_loop_is_played(folder):
     with open_recording(runner.find_run("lake", folder).recording) as recording:
-        trained = recording.count(schema.TRAIN_EPISODE)
-        second = recording.episode_steps("eval", 1)["state"].tolist()
+        trained = recording.train.episodes.count()
+        second = recording.eval.episode_steps(1)["state"].tolist()
     done = dualtaxi(folder, "play", "lake", "--eval", f"{trained}:1", "--json")
     assert done.exit_code == 0, done.output
     assert [json.loads(line)["state"] for line in done.stdout.splitlines()] == second
@@ -215,8 +214,8 @@ def test_the_grid_of_a_loop_is_played(folder):
 def test_the_steps_of_any_loop_are_played(folder):
     for name in ("pole", "rooms"):
         with open_recording(runner.find_run(name, folder).recording) as recording:
-            length = int(recording.episodes("train", 1, 2)[0]["length"])
-            steps = [step for step in recording.transitions("train") if step["episode"] == 1]
+            length = int(recording.train.episodes.array(1, 2)[0]["length"])
+            steps = [step for step in recording.train.transitions() if step["episode"] == 1]
         frames = (
             dualtaxi(folder, "play", name, "--episode", "1").stdout.rstrip().split(f"\n\n{name}, seed 0: ")
         )

@@ -10,7 +10,6 @@ import gymnasium
 import numpy as np
 
 import runner
-from runner.recording import schema
 from runner.recording.reader import open_recording
 from tests.runner.loops.making import dualtaxi, make, play
 
@@ -25,7 +24,7 @@ def test_diff_names_the_step_at_which_loops_diverge(folder):
         open_recording(runner.find_run("lake", folder).recording) as a,
         open_recording(runner.find_run("other", folder).recording) as b,
     ):
-        left, right = (next(recording.blocks(schema.TRAIN_STEP)) for recording in (a, b))
+        left, right = (next(recording.train.steps.blocks()) for recording in (a, b))
     names = [name for name in left.dtype.names if not name.startswith("tag_")]
     first = next(k for k in range(len(left)) if left[k][names].tolist() != right[k][names].tolist())
     assert divergence["step"] == first
@@ -203,7 +202,7 @@ def test_other_rewards_of_loops_recorded_by_their_actions_are_found(tmp_path):
     assert divergence["field"] == "digest"
     assert divergence["a"] != divergence["b"]
     with open_recording(runner.find_run("a", tmp_path).recording) as recording:
-        ends = recording.episodes("train")["last_step"]
+        ends = recording.train.episodes.array()["last_step"]
     episode = int(np.searchsorted(ends, 20))
     assert (divergence["episode"], divergence["step"]) == (episode, ends[episode])
     text = dualtaxi(tmp_path, "diff", "a", "b").stdout

@@ -49,10 +49,10 @@ def test_all_steps_in_the_file_have_their_resets_and_episodes(tmp_path, kind):
     assert run.status == "failed"
     assert "File too large" in dualtaxi(tmp_path, "show", run.run_id).output
     with open_recording(run.recording) as recording:
-        assert recording.step_count("train") > 2_000
-        assert recording.whole_steps("train") == recording.step_count("train")
-        steps = np.concatenate(list(recording.rows(recording.phase("train").steps)))
+        assert recording.train.steps.total() > 2_000
+        assert recording.train.whole_steps() == recording.train.steps.total()
+        steps = np.concatenate(list(recording.train.steps.rows()))
         ended = int(np.count_nonzero(steps["terminated"] | steps["truncated"]))
-        assert recording.count(recording.topic("/train/episode")) >= ended
+        assert recording.train.episodes.count() >= ended
     found = verify(run.recording, sample=3)
     assert (found.sound, found.cut_off) == (True, 0)

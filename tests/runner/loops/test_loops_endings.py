@@ -134,5 +134,5 @@ def test_an_uncaught_exception_is_the_error_of_the_run(tmp_path, end, status, te
     (run,) = list_runs(tmp_path)
     assert (run.status, run.summary.get("error")) == (status, text)
     with open_recording(run.recording) as recording:
-        assert len(list(recording.transitions("train"))) == 1
+        assert len(list(recording.train.transitions())) == 1
     check_integrity(run.recording)

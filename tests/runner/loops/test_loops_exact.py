@@ -40,7 +40,7 @@ class Sensor(gymnasium.Env[Any, Any]):
 
 def steps_of(run: Any) -> Any:
     with open_recording(run.recording) as recording:
-        return np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+        return recording.train.steps.array()
 
 
 def test_a_rounded_observation_gives_one_warning(tmp_path):
@@ -117,7 +117,7 @@ def test_a_recording_without_steps_is_complete(tmp_path):
 
 def infos(run: Any) -> list[Any]:
     with open_recording(run.recording) as recording:
-        return [json.loads(one["json"])["info"] for one in recording.decoded(schema.TRAIN_INFO)]
+        return [json.loads(one["json"])["info"] for one in recording.train.infos.decoded()]
 
 
 def test_all_fields_of_info_are_recorded_by_a_star(tmp_path):
@@ -210,7 +210,7 @@ def test_a_log_of_zeros_is_encoded_as_protobuf_does(tmp_path):
         rec.step(0)
         rec.log("x", 3)
     with open_recording(rec.run.recording) as recording:
-        found = list(recording.decoded(schema.SCALAR_TOPIC))
+        found = list(recording.table(schema.SCALAR_TOPIC).decoded())
     assert np.array_equal([one["value"] for one in found], [*values, 3.0], equal_nan=True)
     assert [one["step"] for one in found] == [0, 0, 0, 0, 0, 1]
 
@@ -223,7 +223,9 @@ def test_numbers_of_ten_thousand_names_are_recorded_in_order(tmp_path):
                 rec.log(f"weight/{k}", value * k)
             rec.step(0)
     with open_recording(rec.run.recording) as recording:
-        found = [(one["name"], one["value"], one["step"]) for one in recording.decoded(schema.SCALAR_TOPIC)]
+        found = [
+            (one["name"], one["value"], one["step"]) for one in recording.table(schema.SCALAR_TOPIC).decoded()
+        ]
     expected = [
         (f"weight/{k}", value * k, step) for step, value in enumerate((1.5, 2.5)) for k in range(10_000)
     ]

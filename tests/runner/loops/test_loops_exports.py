@@ -28,7 +28,7 @@ def test_the_grid_of_a_loop_becomes_a_film(folder, tmp_path):
     done = dualtaxi(folder, "export", "film", "lake", "--episode", "2", "-o", str(tmp_path / "film.gif"))
     assert done.exit_code == 0, done.output
     with open_recording(runner.find_run("lake", folder).recording) as recording:
-        steps = len(recording.episode_steps("train", 2))
+        steps = len(recording.train.episode_steps(2))
     assert f"training episode 2, scene, {steps + 1} frames" in done.stdout
 
 
@@ -65,8 +65,8 @@ def test_a_loops_steps_are_exported_as_tables(folder, form, name, tmp_path):
     read = pandas.read_csv if form == "csv" else pandas.read_parquet
     steps, resets = (read(tmp_path / "tables" / f"{table}.{form}") for table in ("steps", "resets"))
     with open_recording(runner.find_run(name, folder).recording) as recording:
-        seen = [step for phase in ("train", "eval") for step in recording.transitions(phase)]
-        count = recording.count(recording.topic("/train/reset"))
+        seen = [step for phase in ("train", "eval") for step in recording.phase(phase).transitions()]
+        count = recording.train.resets.count()
     steps = steps.sort_values("position")
     assert steps["t"].tolist() == [step["t"] for step in seen]
     assert steps["reward"].tolist() == [step["rewards"][0] for step in seen]

@@ -78,7 +78,7 @@ def record_pole(folder, steps=600, **options):
 def test_extras_come_back_as_they_were_given_and_mark_the_steps_without(tmp_path):
     run, seen = record_pole(tmp_path)
     with runner.open_recording(run.recording) as recording:
-        extras = recording.extras("train")
+        extras = recording.train.extras
         kinds = {name: (kind.base.name, kind.shape) for name, kind in extras.items()}
         assert kinds == {
             "value": ("float64", ()),
@@ -91,10 +91,10 @@ def test_extras_come_back_as_they_were_given_and_mark_the_steps_without(tmp_path
             assert [name in each for each in seen] == (~missing).tolist()
             given = [each[name] for each in seen if name in each]
             np.testing.assert_array_equal(values.data[~missing], given)
-        evaluated = recording.extras("eval").of_episode(0)["value"]
+        evaluated = recording.eval.extras.of_episode(0)["value"]
         assert evaluated.tolist() == [2.5] * 4
-        steps = recording.episode_steps("train", 3)["step"]
-        assert recording.extras("train").of_episode(3)["value"].tolist() == [seen[k]["value"] for k in steps]
+        steps = recording.train.episode_steps(3)["step"]
+        assert recording.train.extras.of_episode(3)["value"].tolist() == [seen[k]["value"] for k in steps]
 
 
 def test_a_recording_with_extras_is_verified_archived_and_exported_with_the_same_content(tmp_path):
@@ -133,7 +133,7 @@ def test_rerun_has_extras_on_the_timeline_as_lines_or_as_bars(tmp_path):
     path = tmp_path / "run.rrd"
     with runner.open_recording(rec.run.recording) as recording:
         export([Source(recording, "a run")], Request(everything=True), path)
-        steps = next(recording.extras("train").blocks())["step"]
+        steps = next(recording.train.extras.blocks())["step"]
     chunks = RrdReader(str(path)).store().stream().to_chunks()
     rows = {"logits": [], "histogram": []}
     for chunk in chunks:
@@ -169,8 +169,8 @@ def test_extras_of_a_vector_belong_to_their_environment(tmp_path, mode):
                 rec.reset(options={"reset_mask": over})
     assert verify(rec.run.recording).finding == ""
     with runner.open_recording(rec.run.recording) as recording:
-        steps = recording.episode_steps("train", 2)["step"]
-        found = recording.extras("train").of_episode(2)
+        steps = recording.train.episode_steps(2)["step"]
+        found = recording.train.extras.of_episode(2)
         assert found["own"].tolist() == [10 * (k // 3) + k % 3 for k in steps.tolist()]
         assert found["late"][:, 1].tolist() == [k // 3 for k in steps.tolist()]
 
@@ -186,7 +186,7 @@ def test_extras_of_agents_are_named_by_agent_and_those_that_left_have_none(tmp_p
             rec.note_step(value=1.0)
     assert verify(rec.run.recording).finding == ""
     with runner.open_recording(rec.run.recording) as recording:
-        found = recording.extras("train").of_episode(1)
+        found = recording.train.extras.of_episode(1)
         assert {name: values.tolist() for name, values in found.items()} == {
             "a/value": [3, None, None],
             "b/value": [3, 2, None],
@@ -201,7 +201,7 @@ def test_tensors_and_spaces_of_varying_size_have_extras_too(tmp_path):
                 rec.note_step(value=Tensor(np.float32(k)), flag=k % 2 == 0)
     assert verify(rec.run.recording).finding == ""
     with runner.open_recording(rec.run.recording) as recording:
-        found = recording.extras("train").of_episode(0)
+        found = recording.train.extras.of_episode(0)
         assert found["value"].dtype == np.float32
         assert found["value"].tolist() == list(range(1, 1 + len(found["value"])))
         assert found["flag"].tolist() == [k % 2 == 0 for k in range(1, 1 + len(found["value"]))]
@@ -233,7 +233,7 @@ def test_what_does_not_fit_is_refused_with_the_reason_and_the_step_stays(tmp_pat
         rec.step(0, extras={"value": np.float32(2)})
     assert verify(rec.run.recording).finding == ""
     with runner.open_recording(rec.run.recording) as recording:
-        assert recording.extras("train").of_episode(0)["value"].tolist() == [1, None, 2]
+        assert recording.train.extras.of_episode(0)["value"].tolist() == [1, None, 2]
 
 
 def test_only_the_last_step_of_the_phase_can_be_extended(tmp_path):
@@ -278,7 +278,7 @@ def test_extras_are_sound_where_the_steps_were_left_out(tmp_path):
     found = verify(rec.run.recording)
     assert found.sound, found.finding
     with open_recording(rec.run.recording) as recording:
-        (block,) = recording.extras("train").blocks()
+        (block,) = recording.train.extras.blocks()
     assert block["values"]["value"].tolist() == [0.0, 0.5, 1.0, 1.5, 2.0]
 
 
@@ -293,7 +293,7 @@ def test_a_killed_loop_keeps_its_extras_and_a_repair_too(tmp_path):
         done = dualtaxi(tmp_path, command, run)
         assert done.exit_code == 0, done.output
     with runner.open_recording(next(tmp_path.glob("*/recording.mcap"))) as recording:
-        blocks = list(recording.extras("train").blocks())
+        blocks = list(recording.train.extras.blocks())
         found = np.concatenate([block["values"]["k"] for block in blocks])
         assert found.tolist() == list(range(len(found)))
         assert len(found) >= 3000
@@ -317,14 +317,14 @@ def test_recordings_with_message_indexes_of_extras_are_read_as_those_without(tmp
     assert verdicts[0].finding == verdicts[1].finding == ""
     with runner.open_recording(earlier) as old, runner.open_recording(run.recording) as new:
         for phase in ("train", "eval"):
-            pairs = zip(old.extras(phase).blocks(), new.extras(phase).blocks(), strict=True)
+            pairs = zip(old.phase(phase).extras.blocks(), new.phase(phase).extras.blocks(), strict=True)
             assert all((a.tobytes() == b.tobytes()) for a, b in pairs)
     with run.recording.open("rb") as stream:
         reader = make_reader(stream)
         assert sum(1 for _ in reader.iter_messages(topics=["/train/extra"])) == 9000
     (tmp_path / "cut.mcap").write_bytes(run.recording.read_bytes()[:-9000])  # without its summary
     with runner.open_recording(tmp_path / "cut.mcap") as recording:
-        assert len(recording.extras("train")) == 3
+        assert len(recording.train.extras) == 3
 
 
 def test_forged_names_are_refused(tmp_path):
@@ -338,7 +338,7 @@ def test_forged_names_are_refused(tmp_path):
         path.unlink(missing_ok=True)
         forge(run.recording, path, encode(schema.EXTRA_COLUMNS, {"json": text}))
         with runner.open_recording(path) as recording, pytest.raises(RecordingError, match="names of extras"):
-            recording.extras("train")
+            _ = recording.train.extras
 
 
 def forge(source: Path, path: Path, payload: bytes) -> None:

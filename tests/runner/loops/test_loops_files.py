@@ -57,7 +57,7 @@ def test_the_official_reader_reads_every_message(whole):
         assert counts.pop("/clock") >= 2  # where it began, and where it ended
         counts.pop("/host", None)  # of a loop that takes over a second
         assert dict(counts) == recording.result["messages"]
-        one = next(recording.transitions("train"))
+        one = next(recording.train.transitions())
     assert first.step == 0
     assert list(first.rewards) == one["rewards"].tolist()
     if KINDS[name] != "step":
@@ -76,7 +76,7 @@ def test_a_damaged_chunk_is_reported_and_the_rest_is_read(whole, tmp_path):
     data = bytearray(path.read_bytes())
     with open_recording(path) as recording:
         topic = recording.topic("/train/step")
-        before = recording.count(topic)
+        before = recording.table(topic).count()
         entry = recording.table(topic).entry(1 if KINDS[name] != "variable" else 0)
     at = entry.offset + entry.length - 40
     data[at : at + 8] = b"\xff" * 8
@@ -85,12 +85,12 @@ def test_a_damaged_chunk_is_reported_and_the_rest_is_read(whole, tmp_path):
     check_integrity(damaged)
     assert not done.lossless
     with open_recording(damaged) as recording:
-        kept = [int(step["step"]) for step in recording.transitions("train")]
+        kept = [int(step["step"]) for step in recording.train.transitions()]
         assert before - len(kept) > 0 or KINDS[name] == "variable"
         if KINDS[name] != "variable":
             ((start, stop),) = recording.lost["/train/step"]
             assert kept == [k for k in range(before) if not start <= k < stop]
-        assert recording.count(recording.topic("/eval/step")) == 300
+        assert recording.eval.steps.count() == 300
 
 
 @pytest.fixture(scope="session")
@@ -152,7 +152,7 @@ def test_false_metadata_is_refused(pole, tmp_path, metadata, message):
         pytest.raises(RecordingError, match=message),
         open_recording(altered(pole, tmp_path, **metadata)) as recording,
     ):
-        for _ in recording.transitions("train"):
+        for _ in recording.train.transitions():
             pass
 
 

@@ -49,7 +49,7 @@ def test_each_picture_of_a_vector_shows_its_environment_at_its_step(tmp_path, mo
     path = record_counting(tmp_path, mode, kind)
     check_integrity(path)
     with open_recording(path) as recording:
-        episodes = recording.episodes("train")
+        episodes = recording.train.episodes.array()
         assert len(episodes) > 2 * N
         for number, episode in enumerate(episodes):
             i, length = int(episode["last_step"]) % N, int(episode["length"])
@@ -67,9 +67,9 @@ def test_each_picture_of_a_vector_shows_its_environment_at_its_step(tmp_path, mo
 def test_frames_now_and_then_are_the_last_ones_up_to_each_step(tmp_path):
     path = record_counting(tmp_path, AutoresetMode.NEXT_STEP, frames_every=3, frame_format="png")
     with open_recording(path) as recording:
-        count = recording.count(recording.topic("/train/frame"))
-        assert count < recording.count(recording.topic("/train/step"))
-        for number, episode in enumerate(recording.episodes("train")):
+        count = recording.train.frames.count()
+        assert count < recording.train.steps.count()
+        for number, episode in enumerate(recording.train.episodes.array()):
             # Rendered again where the environment can be made again; here it cannot.
             shown = shown_states(recording, "train", number)
             over = bool(episode["terminated"])
@@ -82,9 +82,9 @@ def test_frames_now_and_then_are_the_last_ones_up_to_each_step(tmp_path):
 def test_frames_of_chosen_environments(tmp_path):
     path = record_counting(tmp_path, AutoresetMode.NEXT_STEP, frames_of=[2])
     with open_recording(path) as recording:
-        ids = {frame["frame_id"] for frame in recording.decoded(recording.topic("/train/frame"))}
+        ids = {frame["frame_id"] for frame in recording.train.frames.decoded()}
         assert ids == {"train/2", "train/2/reset"}
-        for number, episode in enumerate(recording.episodes("train")):
+        for number, episode in enumerate(recording.train.episodes.array()):
             with contextlib.closing(Pictures(recording, "train", number)) as shown:
                 is_chosen = int(episode["last_step"]) % N == 2
                 assert shown.source is (Source.RECORDED if is_chosen else Source.VALUES)
@@ -167,7 +167,7 @@ def test_frames_are_exact_and_carry_their_moment(tmp_path):
     with runner.record(Rooms(), tmp_path, frames_every=4) as rec:
         list(play(rec, 40))
     with open_recording(rec.run.recording) as recording:
-        found = list(recording.decoded(schema.TRAIN_FRAME))
+        found = list(recording.train.frames.decoded())
     assert len(expected) > 12
     for one, (moment, pixels) in zip(found, expected, strict=True):
         assert one["log_time"] == moment * schema.STEP_NANOSECONDS

@@ -135,7 +135,7 @@ def test_the_action_of_the_policy_is_recorded_and_reproduces_the_run(way, tmp_pa
             halved(changed)
             assert repr(given) == repr(changed)  # what the environment was given is the caller's own array
     with runner.open_recording(rec.run.recording) as recording:
-        rows = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+        rows = recording.train.steps.array()
     recorded = rows["action"]
     if recorded.dtype.names:
         recorded = structured_to_unstructured(recorded)

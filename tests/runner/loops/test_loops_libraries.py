@@ -91,8 +91,8 @@ def test_an_environment_in_the_shape_of_supersuit_is_recorded(tmp_path):
             rec.step(np.zeros(2, int))
     check_integrity(rec.run.recording)
     with open_recording(rec.run.recording) as recording:
-        steps = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
-        assert recording.episodes("train")["length"].tolist() == [3] * 4
+        steps = recording.train.steps.array()
+        assert recording.train.episodes.array()["length"].tolist() == [3] * 4
     assert steps["next_observation"][::2].ravel().tolist() == [1, 2, 3, 1, 2, 3]
 
 
@@ -146,7 +146,7 @@ def test_values_of_any_space_are_recorded(tmp_path, space, value, expected):
         rec.step(1)
     check_integrity(rec.run.recording)
     with open_recording(rec.run.recording) as recording:
-        (step,) = recording.transitions("train")
+        (step,) = recording.train.transitions()
     assert step["next_observation"] == expected
 
 
@@ -163,7 +163,7 @@ def test_a_graph_is_recorded_as_json(tmp_path):
     with runner.record(World(), tmp_path) as rec:
         rec.reset()
     with open_recording(rec.run.recording) as recording:
-        (reset,) = recording.resets("train")
+        (reset,) = recording.train.reset_values()
     assert json.loads(reset["observation"]).keys() == {"nodes", "edges", "edge_links"}
 
 
@@ -260,7 +260,7 @@ def test_tensors_and_dictionaries_of_them_are_recorded(tmp_path):
             rec.snapshot("opt", {"w": [1.0], "groups": [{"lr": 1}]})
     with open_recording(rec.run.recording) as recording:
         arrays = {array.name: array.values.tolist() for array in recording.arrays()}
-        logged = {one["name"]: one["value"] for one in recording.decoded(recording.topic("/scalar"))}
+        logged = {one["name"]: one["value"] for one in recording.table("/scalar").decoded()}
     assert arrays == {"net/w": [1, 2], "net/inner/b": [0.5]}
     assert logged == {"loss": 2, "lone": 3, "eval/return": 3}
 

@@ -367,7 +367,7 @@ def test_the_agents_of_a_game_have_names_of_actions(tmp_path):
     with open_recording(rec.run.recording) as recording:
         assert recording.action_names("train", "agent_1") == ("no action", "left", "right", "down", "up")
         assert recording.action_names("train") == ()
-        described, _ = describer(recording, "train")(next(recording.transitions("train")))
+        described, _ = describer(recording, "train")(next(recording.train.transitions()))
         (first, *_) = Episode(recording, named_episode(recording, "train", 0), "").steps()
     assert described == "agent 0 no action, agent 1 right, agent 2 up"
     assert first["action_in_words"] == {"agent_0": "no action", "agent_1": "right", "agent_2": "up"}

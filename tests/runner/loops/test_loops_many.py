@@ -45,11 +45,11 @@ def test_recording_changes_nothing_for_a_vector_loop(tmp_path, name, mode):
     assert all(map(alike, seen, drive(vector(name, mode), 300)))
     check_integrity(envs.run.recording)
     with open_recording(envs.run.recording) as recording:
-        ended = recording.episodes("train")
+        ended = recording.train.episodes.array()
         assert recording.environments == N
         assert len(ended) > 10
-        steps = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
-        resets = np.concatenate(list(recording.blocks(recording.topic("/train/reset"))))
+        steps = recording.train.steps.array()
+        resets = recording.train.resets.array()
         assert len(steps) == 300 * N
         for number, episode in enumerate(ended):
             check_episode(recording, number, episode)
@@ -65,7 +65,7 @@ def test_recording_changes_nothing_for_a_vector_loop(tmp_path, name, mode):
 
 def check_episode(recording: Recording, number: int, episode: Any) -> None:
     """The steps of an episode belong to one environment, are complete, and add up."""
-    own = recording.episode_steps("train", number)
+    own = recording.train.episode_steps(number)
     assert own["t"].tolist() == list(range(int(episode["length"])))
     assert own["rewards"].sum() == pytest.approx(float(episode["returns"][0]))
     assert len(set((own["step"] % N).tolist())) == 1
@@ -93,7 +93,7 @@ def test_final_observations_belong_to_their_episode(tmp_path, mode):
     with runner.record_vector(vector("CartPole-v1", mode), tmp_path) as envs:
         drive(envs, 300)
     with open_recording(envs.run.recording) as recording:
-        steps = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+        steps = recording.train.steps.array()
     last = steps["next_observation"][steps["terminated"]]
     assert len(last) > 20
     assert ((np.abs(last[:, 2]) > 0.2094) | (np.abs(last[:, 0]) > 2.4)).all()
@@ -116,9 +116,9 @@ def test_recording_changes_nothing_for_a_parallel_game(tmp_path):
     check_integrity(game.run.recording)
     played = [entry for entry in seen if entry[0] != "reset"]
     with open_recording(game.run.recording) as recording:
-        steps = list(recording.transitions("train"))
-        ended = recording.episodes("train")
-        first = list(recording.resets("train"))
+        steps = list(recording.train.transitions())
+        ended = recording.train.episodes.array()
+        first = list(recording.train.reset_values())
         assert recording.run["agents"] == '["taxi_1", "taxi_2"]'
     assert len(steps) == len(played)
     for one, (actions, observations, rewards, _, _) in zip(steps, played, strict=True):
@@ -136,9 +136,9 @@ def test_agents_that_leave_are_recorded(tmp_path):
     with runner.record_parallel(Leaving(), tmp_path, info=["left"]) as game:
         parallel(game, 2)
     with open_recording(game.run.recording) as recording:
-        steps = list(recording.transitions("train"))
-        ended = recording.episodes("train")
-        infos = list(recording.decoded(schema.TRAIN_INFO))
+        steps = list(recording.train.transitions())
+        ended = recording.train.episodes.array()
+        infos = list(recording.train.infos.decoded())
     assert [int(one["acted"]) for one in steps[:3]] == [0b111, 0b110, 0b100]
     assert [int(one["agents_terminated"]) for one in steps[:3]] == [0b001, 0b010, 0b100]
     assert [bool(one["terminated"]) for one in steps[:3]] == [False, False, True]
@@ -190,7 +190,7 @@ def test_rooms_of_every_kind_of_space_come_back_from_a_vector(tmp_path):
         seen = [envs.reset(seed=1)[0]]
         seen += [envs.step(envs.action_space.sample())[0] for _ in range(5)]
     with open_recording(envs.run.recording) as recording:
-        steps = next(recording.blocks(recording.topic("/train/step")))["next_observation"]
+        steps = next(recording.train.steps.blocks())["next_observation"]
     for k, observation in enumerate(seen[1:]):
         rows = steps[k * N : (k + 1) * N]
         assert np.array_equal(rows["position"], observation["position"])
@@ -301,7 +301,7 @@ def test_logged_values_have_the_place_of_their_step(tmp_path):
             rec.log("k", float(k))
             expected.append(((k + 1) * N, ended))
     with open_recording(rec.run.recording) as recording:
-        logged = list(recording.decoded(schema.SCALAR_TOPIC))
+        logged = list(recording.table(schema.SCALAR_TOPIC).decoded())
     assert ended > 5
     assert [(one["step"], one["episode"]) for one in logged] == expected
 
@@ -315,7 +315,7 @@ def test_options_are_recorded_as_they_were_before_a_game_took_them(tmp_path):
     with runner.record_parallel(Taking(), tmp_path) as rec:
         rec.reset(options={"map": "small"})
     with open_recording(rec.run.recording) as recording:
-        (info,) = recording.decoded(schema.TRAIN_INFO)
+        (info,) = recording.train.infos.decoded()
     assert json.loads(info["json"])["reset"] == {"options": {"map": "small"}}
 
 

@@ -126,7 +126,7 @@ def test_a_reward_may_stand_in_an_array_of_one(reward, tmp_path):
         rec.reset()
         rec.step(np.zeros(2, np.float32))
     with open_recording(rec.run.recording) as recording:
-        assert next(recording.transitions("train"))["rewards"] == 1
+        assert next(recording.train.transitions())["rewards"] == 1
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_a_forked_process_leaves_the_recording_alone(tmp_path):
         rec.step(1)
     assert rec.run.summary["train_steps"] == 2
     with open_recording(rec.run.recording) as recording:
-        assert len(list(recording.transitions("train"))) == 2
+        assert len(list(recording.train.transitions())) == 2
 
 
 def test_a_second_environment_without_pictures_is_refused(tmp_path):
@@ -206,7 +206,7 @@ def test_a_single_number_of_any_type_is_logged(tmp_path, value):
     with runner.record(pole(), tmp_path) as rec:
         rec.log("loss", value)
     with open_recording(rec.run.recording) as recording:
-        (scalar,) = recording.decoded(recording.topic("/scalar"))
+        (scalar,) = recording.table("/scalar").decoded()
     assert scalar["value"] == 1.5
 
 

@@ -165,7 +165,7 @@ def test_extras_that_cannot_be_recorded_are_left_out_of_their_step(tmp_path):
     run = only_run(tmp_path / "one")
     assert (run.status, run.summary.train_steps) == ("finished", 3)
     with open_recording(run.recording) as recording:
-        assert recording.extras("train").at(np.arange(3))["v"].tolist() == [1, None, 3]
+        assert recording.train.extras.at(np.arange(3))["v"].tolist() == [1, None, 3]
 
     base = SyncVectorEnv([Odd, Odd])
     with runner.record_vector(base, tmp_path / "vector", on_error="warn") as envs:

@@ -98,7 +98,7 @@ def test_a_checkpoint_is_played_in_the_recorded_environment(folder):
     assert run.name == "pole.evaluated"
     assert verify(run.recording).finding == ""
     with runner.open_recording(run.recording) as recording:
-        assert [int(reset["seed"]) for reset in recording.resets("eval")] == [7, 8, 9]
+        assert [int(reset["seed"]) for reset in recording.eval.reset_values()] == [7, 8, 9]
         assert recording.config["config"] == {"origin": expected, "policy": "agent_of_test:policy"}
     again = play_checkpoint(origin, checkpoint, "agent_of_test:policy", folder, 3, 7)
     assert again.summary.content_digest == run.summary.content_digest
@@ -110,8 +110,8 @@ def test_values_along_an_episode_are_those_of_its_observations(folder):
     words = ["--episode", "2", "--checkpoint", "@latest", "--policy", "agent_of_test:values"]
     shown = json.loads(dualtaxi(folder, "values", run.run_id, *words, "--json").stdout)["steps"]
     with runner.open_recording(run.recording) as recording:
-        steps = recording.episode_steps("train", 2)
-        first = [r["observation"] for r in recording.resets("train") if r["episode"] == 2]
+        steps = recording.train.episode_steps(2)
+        first = [r["observation"] for r in recording.train.reset_values() if r["episode"] == 2]
         observed = np.concatenate([first, steps["next_observation"][:-1]])
         q = np.stack([observation @ BALANCING for observation in observed])
         along = values_along(recording, "train", 2, run.checkpoints()[-1], "agent_of_test:values")
@@ -132,7 +132,7 @@ def test_observations_come_nested_as_their_space(folder):
     with runner.open_recording(run.recording) as recording:
         (checkpoint,) = run.checkpoints()
         along = values_along(recording, "train", 1, checkpoint, "agent_of_test:of_rooms")
-        assert along.values["value"].shape == (len(recording.episode_steps("train", 1)), 2)
+        assert along.values["value"].shape == (len(recording.train.episode_steps(1)), 2)
         along = values_along(recording, "train", 1, checkpoint, "agent_of_test:number")
         assert set(along.values["value"].tolist()) == {4.0}
 

@@ -52,7 +52,7 @@ def recorded_extras(recording, phase):
     """Return the recorded extras by step and name."""
     return {
         int(row["step"]): {name: row["values"][name].tolist() for name in names if row["given"][name]}
-        for block in recording.extras(phase).blocks()
+        for block in recording.phase(phase).extras.blocks()
         if (names := block["values"].dtype.names)
         for row in block
     }
@@ -106,9 +106,13 @@ def test_a_loop_is_recorded_as_it_was_seen(seed, make, length):
                     ("action", "next_state") if recording.kind == "step" else ("action", "next_observation")
                 )
                 fields = (*names_of, "rewards", "terminated", "truncated")
-                found = [tuple(flat(row[name]) for name in fields) for row in recording.transitions(each)]
+                found = [
+                    tuple(flat(row[name]) for name in fields) for row in recording.phase(each).transitions()
+                ]
                 assert found == [(a, o, [r], te, tr) for a, o, r, te, tr in steps[each]]
-                found = [(row["step"], flat(row["observation"])) for row in recording.resets(each)]
+                found = [
+                    (row["step"], flat(row["observation"])) for row in recording.phase(each).reset_values()
+                ]
                 assert found == resets[each]
                 expected = {
                     step: {name: value.tolist() for name, value in own.items()}
@@ -117,7 +121,8 @@ def test_a_loop_is_recorded_as_it_was_seen(seed, make, length):
                 }
                 assert recorded_extras(recording, each) == expected
             found = [
-                (row["phase"], row["step"], row["value"]) for row in recording.decoded(schema.SCALAR_TOPIC)
+                (row["phase"], row["step"], row["value"])
+                for row in recording.table(schema.SCALAR_TOPIC).decoded()
             ]
             assert found == logged
         found = [(one.phase, one.step, one.digest) for one in rec.run.checkpoints()]
@@ -173,7 +178,7 @@ def test_a_loop_over_a_vector_is_recorded_as_it_was_seen(seed, mode, length):
                 rewards += reward.tolist()
                 ends += over.tolist()
         with open_recording(rec.run.recording) as recording:
-            rows = list(recording.transitions("train"))
+            rows = list(recording.train.transitions())
             assert [row["action"].tolist() for row in rows] == actions
             assert [row["next_observation"].tolist() for row in rows] == after
             assert [row["rewards"][0] for row in rows] == rewards

@@ -156,7 +156,7 @@ def test_an_episode_follows_from_the_state_before_its_reset(name, tmp_path):
     with runner.record(ENVIRONMENTS[name](), tmp_path) as env:
         episodes = unseeded(env, STEPS)
     with open_recording(env.run.recording) as recording:
-        states = list(recording.reset_states("train"))
+        states = list(recording.train.reset_states())
         assert 2 <= len(states) <= 4
     for state in states:
         with ENVIRONMENTS[name]() as fresh:
@@ -184,8 +184,8 @@ def test_the_seeds_that_a_vector_draws_are_recorded(kind, mode, tmp_path):
             if mode == AutoresetMode.DISABLED and over.any():
                 rec.reset(options={"reset_mask": over})
     with open_recording(rec.run.recording) as recording:
-        states = list(recording.reset_states("train"))
-        resets = {int(one["reset"]): one for one in recording.resets("train")}
+        states = list(recording.train.reset_states())
+        resets = {int(one["reset"]): one for one in recording.train.reset_values()}
         assert recording.maker is not None
         assert recording.maker.vector is not None
         assert recording.maker.vector.number == 3
@@ -221,7 +221,7 @@ def test_an_environment_that_never_draws_has_no_state_and_gets_no_generator(tmp_
             rec.step(0)
     assert env._np_random is None
     with open_recording(rec.run.recording) as recording:
-        assert list(recording.reset_states("train")) == []
+        assert list(recording.train.reset_states()) == []
 
 
 def test_each_phase_begins_with_a_state(tmp_path):
@@ -233,7 +233,7 @@ def test_each_phase_begins_with_a_state(tmp_path):
         rec.reset()
         rec.step(0)
     with open_recording(rec.run.recording) as recording:
-        train, evaluation = (list(recording.reset_states(phase)) for phase in ("train", "eval"))
+        train, evaluation = (list(recording.phase(phase).reset_states()) for phase in ("train", "eval"))
     assert [state.reset for state in train] == [0, 1]
     assert [state.reset for state in evaluation] == [0]
     assert train[0].np_random_seed is not None

@@ -78,7 +78,7 @@ def test_steps_have_the_values_of_the_loop(loop):
     _, path, seen = loop
     steps = [entry for entry in seen if entry[0] == "step"]
     with open_recording(path) as recording:
-        found = list(recording.transitions("train"))
+        found = list(recording.train.transitions())
         after = "next_state" if recording.kind == "step" else "next_observation"
     assert len(found) == len(steps) == STEPS
     for one, (_, action, observation, reward, terminated, truncated, _) in zip(found, steps, strict=True):
@@ -92,7 +92,7 @@ def test_resets_have_seed_and_observation(loop):
     _, path, seen = loop
     resets = [entry for entry in seen if entry[0] == "reset"]
     with open_recording(path) as recording:
-        found = list(recording.resets("train"))
+        found = list(recording.train.reset_values())
     assert len(found) == len(resets) >= 1
     assert [bool(one["seeded"]) for one in found] == [True] + [False] * (len(resets) - 1)
     assert found[0]["seed"] == 5
@@ -115,9 +115,9 @@ def test_steps_and_episodes_are_numbered_as_they_come(loop):
             returns.append(total)
             total = 0.0
     with open_recording(path) as recording:
-        found = list(recording.transitions("train"))
-        ended = recording.episodes("train")
-        first = list(recording.resets("train"))
+        found = list(recording.train.transitions())
+        ended = recording.train.episodes.array()
+        first = list(recording.train.reset_values())
     assert [int(one["step"]) for one in found] == list(range(STEPS))
     assert [int(one["episode"]) for one in found] == episodes
     assert [int(one["t"]) for one in found] == t
@@ -129,7 +129,7 @@ def test_steps_and_episodes_are_numbered_as_they_come(loop):
 
 def test_times_follow_the_steps(loop):
     with open_recording(loop[1]) as recording:
-        times = [int(one["log_time"]) for one in recording.transitions("train")]
+        times = [int(one["log_time"]) for one in recording.train.transitions()]
     assert times == [schema.STEP_NANOSECONDS * (k + 1) for k in range(STEPS)]
 
 
@@ -139,8 +139,8 @@ def test_a_tabular_environment_is_attached_and_its_events_are_counted(tmp_path):
     with open_recording(path) as recording:
         assert recording.mdp.states == 48
         state, action = 36, 1
-        ends = recording.episodes("train")
-        steps = next(recording.blocks(schema.TRAIN_STEP))
+        ends = recording.train.episodes.array()
+        steps = next(recording.train.steps.blocks())
         assert (recording.mdp.next_state[state, action] == 36).any()
     assert steps["state"][1:].tolist() == [
         int(b) if not over else int(s)
@@ -164,8 +164,8 @@ def test_scalars_texts_and_arrays_are_recorded_with_their_step(tmp_path):
         env.log("note", "half way")
         env.snapshot("q", q)
     with open_recording(env.run.recording) as recording:
-        scalars = list(recording.decoded(schema.SCALAR_TOPIC))
-        (text,) = recording.decoded(schema.LOG_TOPIC)
+        scalars = list(recording.table(schema.SCALAR_TOPIC).decoded())
+        (text,) = recording.table(schema.LOG_TOPIC).decoded()
         (array,) = recording.arrays()
     assert [one["step"] for one in scalars] == list(range(1, 51))
     assert {one["name"] for one in scalars} == {"loss"}
@@ -182,7 +182,7 @@ def test_phases_have_steps_and_episodes_of_their_own(tmp_path):
                 list(play(env, 30))
     with open_recording(env.run.recording) as recording:
         trained, evaluated = (
-            np.concatenate(list(recording.blocks(topic))) for topic in (schema.TRAIN_STEP, schema.EVAL_STEP)
+            recording.table(topic).array() for topic in (schema.TRAIN_STEP, schema.EVAL_STEP)
         )
         assert recording.result["train_steps"] == 120
         assert recording.result["eval_steps"] == 90
@@ -199,8 +199,8 @@ def test_a_second_environment_is_recorded_into_the_same_run(tmp_path):
         other.close()
         list(play(env, 40))  # the recording is the first environment's to close
     with open_recording(env.run.recording) as recording:
-        assert recording.count(schema.EVAL_STEP) > 20
-        assert recording.count(schema.TRAIN_STEP) > 60
+        assert recording.eval.steps.count() > 20
+        assert recording.train.steps.count() > 60
     with pytest.raises(ConfigError, match="other spaces"):
         runner.record(make("Taxi-v4"), into=env, phase="eval")
 
@@ -212,7 +212,7 @@ def test_chosen_fields_of_info_are_recorded_where_they_occur(tmp_path):
         for _ in range(6):
             env.step(env.action_space.sample())
     with open_recording(env.run.recording) as recording:
-        infos = list(recording.decoded(schema.TRAIN_INFO))
+        infos = list(recording.train.infos.decoded())
     records = [(one["step"], one["reset"], json.loads(one["json"])) for one in infos]
     assert records[0] == (0, True, {"info": {"first": True}, "reset": {"options": options}})
     assert records[1:] == [(step, False, {"info": {"luck": 0.5}}) for step in (0, 2, 4)]
@@ -227,10 +227,10 @@ def test_a_reset_ends_an_episode_in_progress(tmp_path):
         env.reset()
         env.reset()
     with open_recording(env.run.recording) as recording:
-        ended = recording.episodes("train")
+        ended = recording.train.episodes.array()
         assert ended["length"].tolist() == [3, 5]
         assert not (ended["terminated"] | ended["truncated"]).any()
-        assert [int(one["episode"]) for one in recording.resets("train")] == [0, 1, 2, 2]
+        assert [int(one["episode"]) for one in recording.train.reset_values()] == [0, 1, 2, 2]
 
 
 def test_an_error_in_the_loop_is_in_the_complete_recording(tmp_path):
@@ -290,10 +290,10 @@ def test_a_killed_loop_leaves_its_steps(tmp_path, end, status):
     assert run.status == status
     killed = "KILL" in end
     with open_recording(run.recording) as recording:
-        steps = list(recording.transitions("train"))
+        steps = list(recording.train.transitions())
         assert len(steps) == (3000 if killed else 3001)
         assert [int(one["step"]) for one in steps] == list(range(len(steps)))
-        assert sum(1 for _ in recording.decoded(schema.SCALAR_TOPIC)) == 3000
+        assert sum(1 for _ in recording.table(schema.SCALAR_TOPIC).decoded()) == 3000
         assert recording.finished != killed
     if killed:
         from runner.recording.repair import repair
@@ -424,7 +424,7 @@ def test_returns_before_a_wrapper_changed_the_rewards_are_logged(tmp_path, mode)
                     statistics = infos.get("final_info", infos)["episode"]
                     returns.append(float(np.mean(statistics["r"])))
     with open_recording(env.run.recording) as recording:
-        logged = [(each["name"], each["value"]) for each in recording.decoded(schema.SCALAR_TOPIC)]
+        logged = [(each["name"], each["value"]) for each in recording.table(schema.SCALAR_TOPIC).decoded()]
     assert len(returns) > 1
     assert logged == [("return before NormalizeReward", value) for value in returns]
 
@@ -443,7 +443,7 @@ def test_arrays_pictures_and_histograms_are_logged_as_such(tmp_path):
             rec.log("thing", Histogram(np_histogram=([1],)))
     with runner.open_recording(rec.run.recording) as recording:
         arrays = {each.name: (each.step, each.values.tolist()) for each in recording.arrays()}
-        pictures = [each["frame_id"] for each in recording.decoded(recording.topic("/image"))]
+        pictures = [each["frame_id"] for each in recording.table("/image").decoded()]
     assert (arrays["q"], arrays["counts"]) == ((1, [0, 1, 2]), (1, [1, 2]))
     assert sum(arrays["weights/counts"][1]) == 128
     assert pictures == ["nested/figure", "view"]

@@ -55,8 +55,8 @@ def test_a_game_in_turns_comes_out_again(name, is_seeded, tmp_path):
         got = play(rec, 3, np.random.default_rng(5), is_seeded)
     check_integrity(rec.run.recording)
     with open_recording(rec.run.recording) as recording:
-        episodes = recording.episodes("train")
-        steps = list(recording.transitions("train"))
+        episodes = recording.train.episodes.array()
+        steps = list(recording.train.transitions())
         assert recording.maker.spec
     assert len(episodes) == 3
     for episode, total in zip(episodes, got, strict=True):
@@ -82,7 +82,7 @@ def test_steps_are_those_of_one_agent_with_what_all_can_observe(tmp_path):
         rec.step(None)
         assert rec.agents == []
     with open_recording(rec.run.recording) as recording:
-        steps = list(recording.transitions("train"))
+        steps = list(recording.train.transitions())
         assert [int(step["acted"]) for step in steps] == [1, 2, 1, 2, 1]
         assert [step["rewards"].tolist() for step in steps][-2:] == [[0, 0], [1, -1]]
         assert (steps[-1]["agents_terminated"], steps[-1]["terminated"]) == (3, True)
@@ -90,7 +90,7 @@ def test_steps_are_those_of_one_agent_with_what_all_can_observe(tmp_path):
         assert first["player_1"]["observation"][0, 0].tolist() == [1, 0]
         assert first["player_2"]["observation"][0, 0].tolist() == [0, 1]
         assert first["player_2"]["action_mask"].tolist() == [0, *[1] * 8]
-        assert set(recording.extras("train")) == {"player_1/value", "player_2/value"}
+        assert set(recording.train.extras) == {"player_1/value", "player_2/value"}
 
 
 def test_pages_films_and_diffs_show_games_in_turns(tmp_path):
@@ -118,7 +118,7 @@ def test_a_branch_of_a_game_in_turns(tmp_path):
             rec.step(action)
     branch = runner.branch(rec.run, at="0:3", action="player_2=2", policy="random", recordings=tmp_path)
     with open_recording(branch.run.recording) as recording:
-        actions = [int(step["action"][f"player_{step['acted']}"]) for step in recording.transitions("train")]
+        actions = [int(step["action"][f"player_{step['acted']}"]) for step in recording.train.transitions()]
     assert actions[:4] == [0, 3, 1, 2]
     with pytest.raises(ConfigError, match="an agent that acts at this step: player_2"):
         runner.branch(rec.run, at="0:3", action="player_1=2", recordings=tmp_path)

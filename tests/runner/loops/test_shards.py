@@ -49,11 +49,11 @@ def test_a_run_is_the_same_whichever_process_is_faster(tmp_path):
         assert recording.done()["train_steps"] == 250 + 270 + 340 + 900
         assert recording.done()["eval_steps"] == 120
         # The evaluation stands where its process said, after 500 training steps and those of episodes begun.
-        first = next(recording.blocks(recording.topic("/eval/reset")))[0]
+        first = next(recording.eval.resets.blocks())[0]
         assert 500 <= first["log_time"] // 10**8 < 800
-        values = recording.extras("train").of_episode(3)["value"]
+        values = recording.train.extras.of_episode(3)["value"]
         assert np.array_equal(np.diff(values), np.full(len(values) - 1, 0.5))
-        times = [one["log_time"] for one in recording.decoded(recording.topic("/scalar"))]
+        times = [one["log_time"] for one in recording.table("/scalar").decoded()]
         assert times == sorted(times)
         assert len(times) == 3 + sum(-(-steps // 50) for steps in (250, 270, 340, 900))
     assert not shards_of(runs[0])
@@ -65,7 +65,7 @@ def test_episodes_are_put_in_order_of_the_steps_of_their_processes(tmp_path):
         for shard in ("b", "a"):  # the order in which they come does not matter
             work(rec.run, shard, 300, 3)
     with open_recording(rec.run.recording) as recording:
-        resets = np.concatenate(list(recording.blocks(recording.topic("/train/reset"))))
+        resets = recording.train.resets.array()
     # Both did the same, so each episode of `a` is followed by that of `b`.
     assert resets["environment"].tolist() == [1, 2] * (len(resets) // 2)
     assert (resets["observation"][::2] == resets["observation"][1::2]).all()
@@ -140,10 +140,8 @@ def test_the_widest_actions_and_all_extras_are_kept(tmp_path):
                     own.reset()
         other.close()
     with open_recording(rec.run.recording) as recording:
-        actions = np.concatenate(
-            [block["action"] for block in recording.blocks(recording.topic("/train/step"))]
-        )
-        extras = recording.extras("train").at(np.arange(60))
+        actions = np.concatenate([block["action"] for block in recording.train.steps.blocks()])
+        extras = recording.train.extras.at(np.arange(60))
     assert actions.dtype == np.float64
     expected = [np.float32(k / 7) for k in range(30)] + [k / 7 for k in range(30)]
     assert sorted(actions.ravel()) == sorted(map(float, expected))
@@ -169,19 +167,19 @@ def test_texts_infos_options_frames_and_checkpoints_come_along(tmp_path):
         with runner.record(Rooms(with_text=True), join=rec.run, shard="two", **options) as two:
             do(two, 2)
     with open_recording(rec.run.recording) as recording:
-        infos = [one["json"] for one in recording.decoded(recording.topic("/train/info"))]
+        infos = [one["json"] for one in recording.train.infos.decoded()]
         assert sum('"start": 1' in info for info in infos) == sum('"start": 2' in info for info in infos) == 1
-        logs = [one["message"] for one in recording.decoded(recording.topic("/log"))]
+        logs = [one["message"] for one in recording.table("/log").decoded()]
         assert sorted(logs) == ["of 1", "of 2"]
-        frames = recording.count(recording.topic("/train/frame"))
-        resets = recording.count(recording.topic("/train/reset"))
+        frames = recording.train.frames.count()
+        resets = recording.train.resets.count()
         assert frames == 40 + resets
-        missions = {step["next_observation"]["mission"] for step in recording.transitions("train")}
+        missions = {step["next_observation"]["mission"] for step in recording.train.transitions()}
         assert missions
     checkpoints = rec.run.checkpoints()
     assert sorted(checkpoint.load() for checkpoint in checkpoints) == [b"\1", b"\2"]
     with open_recording(rec.run.recording) as recording:
-        for episode in range(recording.count(recording.topic("/train/episode"))):
+        for episode in range(recording.train.episodes.count()):
             from runner.replay.steps import recorded_frames
 
             assert len(list(recorded_frames(recording, "train", episode))) > 1
@@ -353,7 +351,7 @@ def test_events_of_a_table_are_counted_over_all_processes(tmp_path):
             play(two, 500, 2)
     with open_recording(rec.run.recording) as recording:
         assert recording.tabular
-        assert recording.episodes("train")["penalties"].sum() > 0
+        assert recording.train.episodes.array()["penalties"].sum() > 0
         assert recording.result.rewards_off_table == 0
     assert verify(rec.run.recording).sound
     assert verify(rec.run.recording).verdict == "reproduced"

@@ -15,7 +15,6 @@ from runner.execution.verify import verify
 from runner.loops.copied_rows import CopiedRows
 from runner.loops.fold import fold_if_over
 from runner.recording.reader import open_recording
-from runner.recording.schema import TRAIN_TRANSITION
 from runner.runs.listing import run_at
 from runner.runs.shards import shards_of
 from tests.runner.loops.making import dualtaxi
@@ -46,14 +45,14 @@ def run(unfolded, tmp_path) -> runner.Run:
 
 def chunks_of_steps(path: Path) -> list[slice]:
     with open_recording(path) as recording:
-        chunks = recording.table(TRAIN_TRANSITION)
+        chunks = recording.train.steps
         entries = [chunks.entry(k) for k in range(len(chunks))]
     return [slice(entry.offset, entry.offset + entry.length) for entry in entries]
 
 
 def steps_in(path: Path) -> int:
     with open_recording(path) as recording:
-        return sum(len(block) for block in recording.blocks(TRAIN_TRANSITION))
+        return sum(len(block) for block in recording.train.steps.blocks())
 
 
 def test_a_repaired_shard_is_kept_if_steps_in_it_are_not_in_the_run(run):

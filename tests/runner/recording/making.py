@@ -76,7 +76,7 @@ def make_run(folder: Path, *parts: dict[str, Any], seed: int = 0, **values: Any)
 def training(run: Run, start: int = 0, stop: int | None = None) -> NDArray[np.void]:
     """Return recorded training steps of a run."""
     with open_recording(run.recording) as recording:
-        blocks = recording.blocks(schema.TRAIN_STEP, start, stop)
+        blocks = recording.train.steps.blocks(start, stop)
         return np.concatenate([np.empty(0, recording.dtypes[schema.TRAIN_STEP]), *blocks])
 
 

@@ -27,13 +27,13 @@ def recording(taxis):
 @pytest.fixture(scope="module")
 def whole(recording):
     """Return all messages of each topic of fixed width."""
-    return {topic: np.concatenate(list(recording.blocks(topic))) for topic in schema.BLOCK_TOPICS}
+    return {topic: recording.table(topic).array() for topic in schema.BLOCK_TOPICS}
 
 
 @settings(deadline=None, max_examples=200)
 @given(topic=topics, start=places, stop=places | st.none())
 def test_a_piece_is_that_piece_of_the_whole(topic, start, stop, recording, whole):
-    blocks = list(recording.blocks(topic, start, stop))
+    blocks = list(recording.table(topic).blocks(start, stop))
     expected = whole[topic][start:stop]
     assert b"".join(block.tobytes() for block in blocks) == expected.tobytes()
     assert all(len(block) for block in blocks) or start >= (len(whole[topic]) if stop is None else stop)
@@ -41,13 +41,13 @@ def test_a_piece_is_that_piece_of_the_whole(topic, start, stop, recording, whole
 
 def test_messages_are_numbered_from_0_without_a_gap(whole, recording):
     for topic, messages in whole.items():
-        assert recording.count(topic) == len(messages) > 0
+        assert recording.table(topic).count() == len(messages) > 0
         number = "step" if topic.message is schema.STEP else "episode"
         assert messages[number].tolist() == list(range(len(messages)))
 
 
 def test_blocks_are_chunks_and_cannot_be_written_to(recording, whole):
-    blocks = list(recording.blocks(schema.TRAIN_STEP))
+    blocks = list(recording.train.steps.blocks())
     assert len(blocks) > 5
     assert max(len(block) for block in blocks) == 256
     with pytest.raises(ValueError, match="read-only"):
@@ -56,23 +56,23 @@ def test_blocks_are_chunks_and_cannot_be_written_to(recording, whole):
 
 def test_a_piece_is_read_from_its_own_chunks_alone(taxis, monkeypatch):
     with open_recording(taxis.recording) as recording:
-        recording.count(schema.TRAIN_STEP)
+        recording.train.steps.count()
         read = []
         original = RecordStore.chunk_body
         monkeypatch.setattr(
             RecordStore, "chunk_body", lambda self, *at: read.append(at) or original(self, *at)
         )
-        assert len(list(recording.blocks(schema.TRAIN_STEP, 1000, 1010))) == 1
+        assert len(list(recording.train.steps.blocks(1000, 1010))) == 1
         assert len(read) == 1
 
 
 @pytest.mark.parametrize("phase", ["train", "eval"])
 def test_the_steps_of_each_episode_are_its_own(phase, recording, whole):
     steps = whole[schema.TRAIN_STEP if phase == "train" else schema.EVAL_STEP]
-    episodes = recording.episodes(phase)
+    episodes = recording.phase(phase).episodes.array()
     assert len(episodes) >= 12
     for episode in episodes:
-        own = recording.episode_steps(phase, int(episode["episode"]))
+        own = recording.phase(phase).episode_steps(int(episode["episode"]))
         assert own.tobytes() == steps[steps["episode"] == episode["episode"]].tobytes()
         assert own["t"].tolist() == list(range(episode["length"]))
         assert own["rewards"].sum(axis=0).tolist() == episode["returns"].tolist()
@@ -84,7 +84,7 @@ def test_the_steps_of_each_episode_are_its_own(phase, recording, whole):
 @pytest.mark.parametrize("number", [-1, 60, 61, 10**12])
 def test_an_episode_that_is_not_there_is_refused(number, recording):
     with pytest.raises(RecordingError, match=rf"no training episode {number:,}; there are 60"):
-        recording.episode_steps("train", number)
+        recording.train.episode_steps(number)
 
 
 def test_the_recording_describes_itself(recording, taxis):

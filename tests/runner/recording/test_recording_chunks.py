@@ -22,12 +22,15 @@ def run(request, tmp_path):
     return make_run(tmp_path, LAKE, request.param, CHUNKED, snapshots={"every": None})
 
 
+def in_chunks(recording):
+    tables = [recording.table(topic) for topic in recording.topics]
+    return {table.topic.name: table.places.tolist() for table in tables if table}
+
+
 def places(run):
     """Return what each topic's chunks are."""
     with open_recording(run.recording) as recording:
-        return {
-            topic.name: chunks.tolist() for topic, chunks in recording._chunk_numbers.items() if len(chunks)
-        }
+        return in_chunks(recording)
 
 
 def test_few_chunks_of_a_long_recording_are_unpacked_to_learn_their_topic(run, monkeypatch):
@@ -54,14 +57,12 @@ def test_counts_that_the_inferred_chunks_do_not_give_make_all_be_unpacked(run, m
         counts = recording._index.message_counts
         for channel in counts:
             counts[channel] += 7
-        found = {
-            topic.name: chunks.tolist() for topic, chunks in recording._chunk_numbers.items() if len(chunks)
-        }
+        found = in_chunks(recording)
     assert found == expected
 
 
 def test_the_steps_are_those_of_the_run(run):
     with open_recording(run.recording) as recording:
         for phase in ("train", "eval"):
-            steps = np.concatenate([b["step"] for b in recording.blocks(recording.topic(f"/{phase}/step"))])
+            steps = np.concatenate([b["step"] for b in recording.phase(phase).steps.blocks()])
             assert np.array_equal(steps, np.arange(run.summary[f"{phase}_steps"]))

@@ -39,12 +39,12 @@ def all_messages(recording) -> dict[str, list]:
     """Return every message of every topic, those of fixed width as blocks."""
     found = {}
     for topic in schema.KINDS["job"]:
-        found[topic.name] = list(recording.messages(topic))
+        found[topic.name] = list(recording.table(topic).messages())
         if topic in schema.BLOCK_TOPICS:
-            blocks = list(recording.blocks(topic))
+            blocks = list(recording.table(topic).blocks())
             rows = np.concatenate(blocks) if blocks else np.empty(0, recording.dtypes[topic])
             assert rows["log_time"].tolist() == [time for time, _ in found[topic.name]]
-            assert recording.count(topic) == len(rows)
+            assert recording.table(topic).count() == len(rows)
     return found
 
 
@@ -124,13 +124,13 @@ def test_the_steps_of_an_episode_that_never_ended_are_returned(tmp_path):
     path = tmp_path / "cut.mcap"
     path.write_bytes(data[:cut])
     with open_recording(path) as recording:
-        assert recording.count(schema.TRAIN_EPISODE) == 0
-        steps = recording.episode_steps("train", 0)
-        assert len(steps) == recording.count(schema.TRAIN_STEP) > 100
+        assert recording.train.episodes.count() == 0
+        steps = recording.train.episode_steps(0)
+        assert len(steps) == recording.train.steps.count() > 100
         with pytest.raises(RecordingError, match="no training episode 1"):
-            recording.episode_steps("train", 1)
+            recording.train.episode_steps(1)
         with pytest.raises(RecordingError, match="no evaluation steps"):
-            recording.episode_steps("eval", 0)
+            recording.eval.episode_steps(0)
 
 
 def _channel(data: bytes, chunk: int) -> int:

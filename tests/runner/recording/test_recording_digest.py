@@ -119,9 +119,9 @@ def test_leaving_the_steps_out_leaves_only_them_out(taxis, tmp_path):
     run = make_run(tmp_path, TAXIS, recording={"steps": "none"})
     assert run.summary["messages"] == taxis.summary["messages"], "what was done is counted all the same"
     with open_recording(run.recording) as bare, open_recording(taxis.recording) as full:
-        assert bare.count(schema.TRAIN_STEP) == bare.count(schema.EVAL_STEP) == 0
+        assert bare.train.steps.count() == bare.eval.steps.count() == 0
         for topic in set(schema.TOPICS) - {schema.TRAIN_STEP, schema.EVAL_STEP}:
-            assert list(bare.messages(topic)) == list(full.messages(topic))
+            assert list(bare.table(topic).messages()) == list(full.table(topic).messages())
     _, topics = digest_of(run.recording)
     assert topics == {
         topic: found for topic, found in recorded_digests(taxis)[1].items() if not topic.endswith("/step")
@@ -142,7 +142,7 @@ def test_recording_changes_nothing(made_of, tmp_path):
     twin.train(config.episodes, 10**9)
     with open_recording(run.recording) as recording:
         last = list(recording.snapshots())[-len(twin.tables) :]
-        steps = np.concatenate(list(recording.blocks(schema.TRAIN_STEP)))
+        steps = recording.train.steps.array()
     for i, table in enumerate(twin.tables):
         assert last[i].values.tobytes() == learner.table(i).tobytes() == np.array(table).tobytes()
     for name in ("step", "episode", "t", "state", "action", "next_state", "rewards", "explored"):

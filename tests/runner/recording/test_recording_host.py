@@ -35,7 +35,7 @@ def often(monkeypatch):
 
 def samples_in(run):
     with open_recording(run.recording) as recording:
-        return len(list(recording.messages(schema.HOST_TOPIC)))
+        return len(list(recording.table(schema.HOST_TOPIC).messages()))
 
 
 def test_a_loop_has_what_its_process_and_its_host_used(tmp_path, often):

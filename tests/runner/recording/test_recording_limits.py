@@ -39,8 +39,8 @@ def record_and_read(episodes):
         env={"id": "FrozenLake-v1"}, recording={"level": -7},
     )
     with open_recording(run.recording) as recording:
-        steps = sum(len(block) for block in recording.blocks(schema.TRAIN_STEP))
-        messages = sum(1 for _, _ in zip(recording.messages(schema.TRAIN_STEP), range(100_000)))
+        steps = sum(len(block) for block in recording.train.steps.blocks())
+        messages = sum(1 for _, _ in zip(recording.train.steps.messages(), range(100_000)))
     assert steps == run.summary["train_steps"]
     return steps
 
@@ -86,7 +86,7 @@ def run_on_small_disk(folder: Path, size: int, *parts, **values):
 def train_steps(path: Path) -> bytes:
     """Return the training steps of a recording, as bytes."""
     with open_recording(path) as recording:
-        return b"".join(block.tobytes() for block in recording.blocks(schema.TRAIN_STEP))
+        return b"".join(block.tobytes() for block in recording.train.steps.blocks())
 
 
 LARGE = LAKE | {"episodes": 400, "recording": {"chunk_steps": 256, "compression": "none", "index": "chunk"}}

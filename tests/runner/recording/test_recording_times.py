@@ -18,7 +18,7 @@ TENTH = 100_000_000
 
 
 def all_of(recording, topic):
-    return np.concatenate(list(recording.blocks(topic)))
+    return recording.table(topic).array()
 
 
 @pytest.fixture(
@@ -54,14 +54,14 @@ def test_an_episode_has_the_time_of_its_last_step(recording):
         (schema.TRAIN_STEP, schema.TRAIN_EPISODE),
         (schema.EVAL_STEP, schema.EVAL_EPISODE),
     ):
-        if recording.count(steps):
+        if recording.table(steps).count():
             ended, taken = all_of(recording, episodes), all_of(recording, steps)
             assert ended["log_time"].tolist() == taken["log_time"][ended["last_step"]].tolist()
 
 
 def test_measures_and_tables_have_the_time_of_the_last_step_before_them(recording):
     training = all_of(recording, schema.TRAIN_STEP)
-    evaluated = all_of(recording, schema.EVAL_STEP) if recording.count(schema.EVAL_STEP) else training[:0]
+    evaluated = all_of(recording, schema.EVAL_STEP) if recording.eval.steps.count() else training[:0]
     times = np.sort(np.concatenate([training["log_time"], evaluated["log_time"]]))
     assert recording.metrics("train"), "the case must have measures of training"
     for metrics in recording.metrics("train"):
@@ -70,7 +70,7 @@ def test_measures_and_tables_have_the_time_of_the_last_step_before_them(recordin
         trials = evaluated["episode"] // metrics["trials"]
         assert metrics["evaluation"] == number
         assert metrics["log_time"] == evaluated["log_time"][trials == number][-1]
-    for log_time, payload in recording.messages(schema.Q_TABLE_TOPIC):
+    for log_time, payload in recording.table(schema.Q_TABLE_TOPIC).messages():
         step = message_class(schema.Q_TABLE).FromString(payload).step
         assert log_time == 0 or log_time in times
         assert (training["log_time"] <= log_time).sum() == step
@@ -89,7 +89,7 @@ def test_times_do_not_decrease_within_a_topic_and_equal_publish_times(recording)
 def test_the_time_in_a_text_is_that_of_its_message(recording):
     lines = [
         (time, message_class(schema.LOG).FromString(payload))
-        for time, payload in recording.messages(schema.LOG_TOPIC)
+        for time, payload in recording.table(schema.LOG_TOPIC).messages()
     ]
     assert len(lines) >= 2
     for time, line in lines:

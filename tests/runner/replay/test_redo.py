@@ -67,8 +67,8 @@ def test_an_environment_comes_out_again(name, seeding, tmp_path):
     path = record(make(), tmp_path, steps, seeding, make=own)
     assert redone(path, trust=own is not None) == (steps, None)
     with open_recording(path) as recording:
-        last = recording.count(recording.topic("/train/episode")) - 1
-        length = len(recording.episode_span("train", max(last, 0)))
+        last = recording.train.episodes.count() - 1
+        length = len(recording.train.episode_span(max(last, 0)))
     for episode in {max(last, 0), 0}:
         found = redone(path, "train", [episode], trust=own is not None)
         assert found[1] is None
@@ -105,7 +105,7 @@ def test_the_unfinished_episode_of_a_vector_of_one_begins_with_its_first_step(tm
         for _ in range(4):  # of which the first only resets the environment
             recorded.step(np.zeros(1, int))
     with open_recording(recorded.run.recording) as recording:
-        assert recording.episode_steps("train", 1)["t"].tolist() == [0, 1, 2]
+        assert recording.train.episode_steps(1)["t"].tolist() == [0, 1, 2]
     assert redone(recorded.run.recording, "train", [1]) == (3, None)
 
 
@@ -124,11 +124,11 @@ def check_vector(envs, seeding, folder):
                     recorded.reset(options={"reset_mask": over})
     path = recorded.run.recording
     with open_recording(path) as recording:
-        steps = [block["t"] for block in recording.blocks(recording.topic("/train/step"))]
+        steps = [block["t"] for block in recording.train.steps.blocks()]
         resets_alone = int(np.count_nonzero(np.concatenate(steps) == 2**32 - 1))
-        ended = recording.count(recording.topic("/train/episode"))
+        ended = recording.train.episodes.count()
         numbers = sorted({0, 5 % ended, min(12, ended - 1)})
-        spans = [recording.episode_span("train", k) for k in numbers]
+        spans = [recording.train.episode_span(k) for k in numbers]
     assert redone(path) == (250 * recorded.num_envs - resets_alone, None)
     for number, span in zip(numbers, spans, strict=True):
         assert redone(path, "train", [number]) == (len(span), None)
@@ -171,7 +171,7 @@ def test_options_that_the_environment_changes_are_recorded_as_they_were(tmp_path
         env.reset(seed=1, options={"start": {"add": 500}})
         env.step(0)
     with open_recording(env.run.recording) as recording:
-        (info,) = recording.decoded(recording.topic("/train/info"))
+        (info,) = recording.train.infos.decoded()
     assert json.loads(info["json"])["reset"] == {"options": {"start": {"add": 500}}}
 
 
@@ -199,7 +199,7 @@ def test_evaluations_between_training_episodes_come_out_again(is_shared, tmp_pat
                         pass
     path = env.run.recording
     with open_recording(path) as recording:
-        evaluated = recording.count(recording.topic("/eval/step"))
+        evaluated = recording.eval.steps.count()
     assert evaluated > 20
     assert redone(path) == (400 + evaluated, None)
     assert redone(path, "eval", [1])[1] is None
@@ -237,9 +237,9 @@ def test_a_vector_that_cannot_be_taken_apart_draws_its_episodes(kind, tmp_path):
         [envs.step(action), envs.render()[1].copy()][1] for action in actions
     ]
     with open_recording(recorded.run.recording) as recording:
-        own = (k for k in range(12) if recording.episode_span("train", k).start % 3 == 1)
+        own = (k for k in range(12) if recording.train.episode_span(k).start % 3 == 1)
         first, second = next(own), next(own)
-        spans = [recording.episode_span("train", k) for k in (first, second)]
+        spans = [recording.train.episode_span(k) for k in (first, second)]
     for number, span in ((first, spans[0]), (second, spans[1])):
         blocks = list(redo_in_child(recorded.run.recording, "train", [number], render=True))
         assert all(block.difference is None for block in blocks)
@@ -262,7 +262,7 @@ def test_a_child_process_draws_the_pictures_of_an_episode(tmp_path):
     path = record(gymnasium.make("CartPole-v1"), tmp_path, 200)
     blocks = list(redo_in_child(path, "train", [3], render=True))
     with open_recording(path) as recording:
-        steps = recording.episode_steps("train", 3)
+        steps = recording.train.episode_steps(3)
         assert source_of(recording, "train") == (Source.REDRAWN, "")
         (in_process,) = (b for b in redo(recording, "train", [3], render=True) if b.starts)
     frames = [frame for block in blocks for frame in block.frames]
@@ -280,7 +280,7 @@ def test_a_child_process_draws_the_pictures_of_an_episode(tmp_path):
 def test_a_run_that_was_killed_comes_out_again_with_both_of_its_environments(tmp_path):
     def counted(path):
         with open_recording(path) as recording:
-            return [recording.count(recording.topic(f"/{phase}/step")) for phase in ("train", "eval")]
+            return [recording.phase(phase).steps.count() for phase in ("train", "eval")]
 
     with runner.record(gymnasium.make("CartPole-v1"), tmp_path) as env:
         other = runner.record(gymnasium.make("CartPole-v1"), into=env, phase="eval")

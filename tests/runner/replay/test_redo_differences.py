@@ -47,7 +47,7 @@ def test_another_constant_is_found_in_the_first_step(pole):
     assert (difference.phase, difference.episode, difference.t, difference.step) == ("train", 0, 0, 0)
     assert difference.field == "observation[1]"  # gravity acts on both velocities, and not yet on places
     with open_recording(pole) as recording:
-        first = recording.episode_steps("train", 0)[0]["next_observation"]
+        first = recording.train.episode_steps(0)[0]["next_observation"]
     assert np.float32(difference.recorded) == first[1] != np.float32(difference.got)
     assert str(difference).startswith("train episode 0, t 0: observation[1]: recorded ")
 
@@ -55,7 +55,7 @@ def test_another_constant_is_found_in_the_first_step(pole):
 def test_another_rule_of_the_end_is_found_where_it_first_matters(pole):
     steps, difference = redone(pole, make=lambda: cart_pole(theta_threshold_radians=math.radians(11)))
     with open_recording(pole) as recording:
-        rows = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+        rows = recording.train.steps.array()
     beyond = np.abs(rows["next_observation"][:, 2]) > math.radians(11)
     expected = int(np.argmax(beyond & ~rows["terminated"]))
     assert (steps, difference.step, difference.field) == (expected + 1, expected, "terminated")
@@ -152,7 +152,7 @@ def test_small_differences_are_accepted_within_a_tolerance(pole):
 def test_a_recording_that_was_cut_by_a_kill_is_done_again_as_far_as_it_goes(pole, tmp_path):
     data = pole.read_bytes()
     with open_recording(pole) as recording:
-        spans = [recording.episode_span("train", k) for k in (0, 1)]
+        spans = [recording.train.episode_span(k) for k in (0, 1)]
     done = []
     for share in (0.5, 0.8, 0.97):
         cut = tmp_path / f"{share}.mcap"
@@ -287,7 +287,7 @@ def test_an_environment_that_cannot_draw_says_so(make, reason, tmp_path):
 def test_a_loop_is_verified_by_doing_it_again(pole):
     found = verify(pole)
     with open_recording(pole) as recording:
-        episodes = recording.count(recording.topic("/train/episode"))
+        episodes = recording.train.episodes.count()
     assert (found.verdict, found.steps, found.difference) == ("reproduced", 600, None)
     assert found.episodes in (episodes, episodes + 1)
     sample = verify(pole, sample=4)

@@ -33,15 +33,11 @@ VECTORS = {
 def check(path, generator):
     """Check that all steps come out again, and some single episodes."""
     with open_recording(path) as recording:
-        rows = [
-            block["t"]
-            for phase in ("train", "eval")
-            for block in recording.blocks(recording.topic(f"/{phase}/step"))
-        ]
+        rows = [block["t"] for phase in ("train", "eval") for block in recording.phase(phase).steps.blocks()]
         spans = {
-            (phase, number): len(recording.episode_span(phase, number))
+            (phase, number): len(recording.phase(phase).episode_span(number))
             for phase in ("train", "eval")
-            for number in range(recording.count(recording.topic(f"/{phase}/episode")))
+            for number in range(recording.phase(phase).episodes.count())
         }
     assert redone(path) == (int((np.concatenate(rows) != 2**32 - 1).sum()), None)
     for (phase, number), length in generator.sample(sorted(spans.items()), min(4, len(spans))):

@@ -83,7 +83,7 @@ def test_a_branch_takes_an_action_as_json(tmp_path, monkeypatch):
         env.run, at="0:2", action="[[1, 2]]", policy="recorded", recordings=tmp_path, trust=True
     )
     with open_recording(branch.run.recording) as recording:
-        actions = [step["action"] for step in recording.transitions("train")]
+        actions = [step["action"] for step in recording.train.transitions()]
     assert actions[1:4] == ["[]", "[[1.0, 2.0]]", "[]"]
     with pytest.raises(ConfigError, match="expected JSON for Sequence"):
         runner.branch(env.run, at="0:2", action="[1, 2", recordings=tmp_path, trust=True)

@@ -35,7 +35,7 @@ def archived(recording, path):
 
 
 def last_tables(recording, path):
-    TableReplay(recording, 0).advance(recording.count(schema.TRAIN_STEP))
+    TableReplay(recording, 0).advance(recording.train.steps.count())
 
 
 @pytest.mark.parametrize("use", [exported, archived, last_tables])
@@ -93,7 +93,7 @@ def lossy(tmp_path):
 
 def test_the_tables_are_known_up_to_lost_steps_and_from_the_next_snapshot_on(lossy):
     recording, whole = lossy
-    middle, total = [one.step for one in recording.snapshots()][2], recording.count(schema.TRAIN_STEP)
+    middle, total = [one.step for one in recording.snapshots()][2], recording.train.steps.count()
     assert known_steps(recording) == [(0, 512), (middle, total)]
     assert known_steps(whole) == [(0, total)]
     for step in (0, 512, middle, total):
@@ -117,7 +117,7 @@ def test_an_export_leaves_out_the_q_values_that_are_unknown(lossy, tmp_path):
     rewards = column(tmp_path / "lossy.rrd", "/train/reward", "Scalars:scalars")
     found = column(tmp_path / "lossy.rrd", "/train/q", "Scalars:scalars")
     expected = column(tmp_path / "whole.rrd", "/train/q", "Scalars:scalars")
-    steps = np.concatenate(list(recording.blocks(schema.TRAIN_STEP)))
+    steps = recording.train.steps.array()
     known = (steps["step"] <= 512) | (steps["step"] >= middle)
     times = steps["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS
     assert sorted(rewards) == times.tolist()

@@ -60,7 +60,7 @@ def as_bytes(held):
 def test_the_second_replay_takes_few_steps_and_gives_the_same(tmp_path, applied, kind):
     run = make_run(tmp_path, KINDS[kind], **SPARSE)
     with open_recording(run.recording) as recording:
-        last = recording.count(schema.TRAIN_STEP)
+        last = recording.train.steps.count()
         steps = [last - 1, 299, 300, 301, 650, 900]
         first = as_bytes(TableReplay(recording, last - 1).named_tables)
         assert sum(applied) == last - 1
@@ -78,7 +78,7 @@ def test_the_second_replay_takes_few_steps_and_gives_the_same(tmp_path, applied,
 def test_snapshots_that_are_near_need_no_checkpoints(tmp_path):
     run = make_run(tmp_path, LAKE)
     with open_recording(run.recording) as recording:
-        for step in range(recording.count(schema.TRAIN_STEP)):
+        for step in range(recording.train.steps.count()):
             tables_at(recording, step)
     assert files() == []
 

@@ -103,7 +103,7 @@ def test_the_greedy_action_is_the_first_of_the_best(run, steps):
 def test_the_history_of_a_state(run, steps, share):
     step = int(share * steps)
     with open_recording(run.recording) as recording:
-        records = np.concatenate([*recording.blocks(schema.TRAIN_STEP, 0, step)] or [empty(recording)])
+        records = np.concatenate([*recording.train.steps.blocks(0, step)] or [empty(recording)])
         states = np.unique(records["state"])[:3].tolist() or [0]
         for state in states:
             found = history_of(recording, state, step)
@@ -179,7 +179,7 @@ def test_without_steps_there_are_the_snapshots(tmp_path):
 def test_behind_a_hole_there_are_no_tables(tmp_path):
     run = make_run(tmp_path, TAXIS, recording={"chunk_steps": 256}, snapshots={"every": None})
     with open_recording(run.recording) as recording:
-        total = recording.count(schema.TRAIN_STEP)
+        total = recording.train.steps.count()
     first = without_chunk(run.recording, schema.TRAIN_STEP, 1)
     with open_recording(run.recording) as recording:
         assert tables_at(recording, first)

@@ -22,7 +22,7 @@ def recording(request, tmp_path_factory):
 
 
 def whole(recording, topic):
-    return joined(recording, topic, recording.blocks(topic))
+    return joined(recording, topic, recording.table(topic).blocks())
 
 
 def joined(recording, topic, blocks):
@@ -39,7 +39,7 @@ def test_by_time(recording, topic):
         moments += [int(times[-1]), int(times[-1]) + 1]
     for start in moments:
         for stop in moments:
-            found = joined(recording, topic, recording.table(topic).blocks_between(range(start, stop)))
+            found = joined(recording, topic, recording.table(topic).rows(range(start, stop)))
             expected = records[(times >= max(start, 0)) & (times < max(stop, 0))]
             assert found.tobytes() == expected.tobytes()
 
@@ -47,10 +47,10 @@ def test_by_time(recording, topic):
 @pytest.mark.parametrize("phase", ["train", "eval"])
 def test_by_episode(recording, phase):
     topic, episodes = schema.PHASES[phase]
-    records, ended = whole(recording, topic), recording.count(episodes)
+    records, ended = whole(recording, topic), recording.table(episodes).count()
     for start in (0, 1, ended // 2, ended - 1, ended, ended + 5):
         for stop in (0, 1, ended // 2, ended, ended + 5, None):
-            found = joined(recording, topic, recording.blocks_of_episodes(phase, start, stop))
+            found = joined(recording, topic, recording.phase(phase).steps_of_episodes(start, stop))
             behind = 10**9 if stop is None else stop
             expected = records[(records["episode"] >= start) & (records["episode"] < behind)]
             assert found.tobytes() == expected.tobytes()
@@ -59,5 +59,5 @@ def test_by_episode(recording, phase):
 def test_where_there_is_nothing(tmp_path):
     run = make_run(tmp_path, TAXIS, recording={"steps": "none"})
     with open_recording(run.recording) as recording:
-        assert not list(recording.table(schema.TRAIN_STEP).blocks_between(range(2**62)))
-        assert not list(recording.blocks_of_episodes("train", 0, None))
+        assert not list(recording.train.steps.rows(range(2**62)))
+        assert not list(recording.train.steps_of_episodes(0, None))

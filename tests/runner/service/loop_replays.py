@@ -111,4 +111,4 @@ def taken(words):
 
 def steps_of(folder, name, phase, episode):
     with open_recording(find_run(name, folder).recording) as recording:
-        return recording.episode_steps(phase, episode)
+        return recording.phase(phase).episode_steps(episode)

@@ -212,7 +212,7 @@ def test_any_episode_is_scrubbed_and_each_step_has_an_address(page, folder, addr
     browser = page(f"/runs/first/replay/{address}?t=2")
     with open_recording(find_run("first", folder).recording) as recording:
         mdp = recording.mdp
-        steps = recording.episode_steps(phase, number)
+        steps = recording.phase(phase).episode_steps(number)
     states = np.append(steps["state"], steps["next_state"][-1])
     places = Drawing(mdp.scene).places(mdp, states)
     slider = browser.find_element(By.CSS_SELECTOR, ".step")
@@ -280,7 +280,7 @@ def test_a_step_is_opened_in_rerun(page, folder):
     browser.switch_to.frame(browser.find_element(By.CSS_SELECTOR, "iframe.viewer"))
     wait(browser, lambda: browser.execute_script("return document.body.dataset.opened"), 240)
     with open_recording(find_run("first", folder).recording) as recording:
-        step = recording.episode_steps("train", 7)[2]
+        step = recording.train.episode_steps(7)[2]
     opened = browser.execute_script(
         "return [document.body.dataset.opened, document.getElementById('message').hidden]"
     )

@@ -191,7 +191,7 @@ def test_only_the_frame_of_the_viewer_may_compile(client):
 
 def test_the_parts_of_an_episode_are_the_recorded_steps(client, recordings):
     with open_recording(find_run("first", recordings).recording) as recording:
-        steps = recording.episode_steps("train", 2)
+        steps = recording.train.episode_steps(2)
         mdp, words = recording.mdp, states_in_words(recording.mdp)
     whole = client.get("/api/v1/runs/first/replay/train/2?steps=2000").json()["episode"]
     assert whole["length"] == len(steps)

@@ -22,7 +22,7 @@ def test_recorded_frames_are_passed_on_as_they_are(loops_client, loops, monkeypa
     monkeypatch.setattr("runner.export.pictures.why_not_redone", lambda *_: "It is not installed.")
     length = len(steps_of(loops, "framed", "train", 1))
     with open_recording(find_run("framed", loops).recording) as recording:
-        recorded = [frame["data"] for frame in recording.decoded(recording.topic("/train/frame"))]
+        recorded = [frame["data"] for frame in recording.train.frames.decoded()]
     found, problem = pictures(loops_client, "framed/replay/train/1", steps=1000)
     assert problem == ""
     assert len(found) == length + 1

@@ -59,14 +59,14 @@ def test_a_range_of_records_that_is_too_long_is_refused(connect, settings):
 @pytest.mark.parametrize("phase", ["train", "eval"])
 def test_steps_and_episodes_are_those_recorded(client, recording, phase):
     steps = client.get(f"{RUN}/steps/{phase}", params={"start": 10, "stop": 40}).json()
-    (block,) = recording.blocks(recording.topic(f"/{phase}/step"), 10, 40)
-    assert steps["total"] == recording.count(recording.topic(f"/{phase}/step"))
+    (block,) = recording.phase(phase).steps.blocks(10, 40)
+    assert steps["total"] == recording.phase(phase).steps.count()
     assert steps["columns"]["state"] == block["state"].tolist()
     assert steps["columns"]["reward.agency"] == block["rewards"][:, 0].tolist()
     one = client.get(f"{RUN}/steps/{phase}", params={"episode": 2}).json()
-    assert one["columns"]["t"] == list(range(len(recording.episode_steps(phase, 2))))
+    assert one["columns"]["t"] == list(range(len(recording.phase(phase).episode_steps(2))))
     episodes = client.get(f"{RUN}/episodes/{phase}", params={"start": 1, "stop": 3}).json()
-    assert episodes["columns"]["length"] == recording.episodes(phase, 1, 3)["length"].tolist()
+    assert episodes["columns"]["length"] == recording.phase(phase).episodes.array(1, 3)["length"].tolist()
 
 
 def test_arrow_has_the_same_columns(client):
@@ -149,7 +149,7 @@ def test_runs_that_differ_in_the_seed_are_one_curve_with_a_band(recordings, clie
 def test_histograms_count_every_step(client, recording):
     found = client.get(f"{RUN}/histograms", params={"axis": "steps"}).json()
     rewards = [each for each in found["histograms"] if each["quantity"] == "reward"]
-    steps = recording.count(recording.topic("/train/step"))
+    steps = recording.train.steps.count()
     assert [sum(map(sum, each["counts"])) for each in rewards] == [steps] * len(rewards)
     assert client.get(f"{RUN}/histograms", params={"axis": "none"}).status_code == 400
 

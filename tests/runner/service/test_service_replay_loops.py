@@ -27,7 +27,7 @@ def test_a_part_has_the_recorded_values_from_the_reset_on(loops_client, loops, a
     assert whole["length"] == len(steps) == len(whole["reward"])
     assert taken(whole["actions"][0]) == [("left", "right")[action] for action in steps["action"]]
     with open_recording(find_run("pole", loops).recording) as recording:
-        first = [reset["observation"].copy() for reset in recording.resets(phase)][episode]
+        first = [reset["observation"].copy() for reset in recording.phase(phase).reset_values()][episode]
     for k, series in enumerate(whole["series"]):
         assert series["name"] == f"[{k}]"
         expected = np.append(first[k], steps["next_observation"][:, k])

@@ -6,7 +6,6 @@ import html
 import json
 
 import runner
-from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 from runner.service.pages.debugging import WHY_STEPS
@@ -19,8 +18,8 @@ def question(recordings):
     """Return a run, and the state and the learner's action of its last step."""
     run = find_run("first", recordings)
     with open_recording(run.recording) as recording:
-        total = recording.count(schema.TRAIN_STEP)
-        (step,) = next(recording.blocks(schema.TRAIN_STEP, total - 1, total))
+        total = recording.train.steps.count()
+        (step,) = next(recording.train.steps.blocks(total - 1, total))
         agent = recording.agents[0]
         joint = len(recording.agents) < len(recording.mdp.agents)
         action = step["action"] if joint else recording.mdp.own_actions[step["action"], 0]
