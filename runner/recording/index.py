@@ -73,6 +73,7 @@ class ChunkTable:
 
     def __init__(self) -> None:
         self._packed = bytearray()
+        self._end = 0
 
     def __len__(self) -> int:
         return len(self._packed) // _ENTRY.size
@@ -98,11 +99,12 @@ class ChunkTable:
             or entry.uncompressed_size < MESSAGE_HEAD.size
         ):
             raise RecordingError(f"{where} declares fewer bytes than a chunk with a message has")
-        if len(self) and entry.offset < sum(self[len(self) - 1][:2]):
+        if entry.offset < self._end:
             raise RecordingError(f"{where} overlaps the one before it in the index")
-        if len(self) == MAX_CHUNKS:
+        if len(self._packed) == MAX_CHUNKS * _ENTRY.size:
             raise RecordingError(f"has more than {MAX_CHUNKS:,} chunks, the most that a recording may have")
         self._packed += _ENTRY.pack(*entry)
+        self._end = entry.offset + entry.length
 
     def set_channel(self, channel: int) -> None:
         """Set the channel of the last chunk's messages.

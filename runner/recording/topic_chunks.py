@@ -306,10 +306,10 @@ class TopicChunks:
             while at < len(data):
                 if at + HEADER_BYTES > len(data):
                     raise self._damaged(k, f"stray bytes at {at}")
-                opcode, length, channel, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, at)
+                kind, length, channel, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, at)
                 end = at + RECORD_HEAD.size + length
                 whole = at + HEADER_BYTES <= end <= len(data)
-                if opcode != MESSAGE or not whole or channel != self.topic.channel:
+                if kind != MESSAGE or not whole or channel != self.topic.channel:
                     raise self._damaged(k, f"no message of {self.topic.name} at {at}")
                 if times is None or log_time in times:
                     yield log_time, data[at + HEADER_BYTES : end]
