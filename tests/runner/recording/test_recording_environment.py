@@ -5,6 +5,7 @@ import json
 import pytest
 
 from runner.errors import RecordingError
+from runner.recording.maker import parse_shards
 from runner.recording.metadata import environment_description
 
 ENVIRONMENT = {
@@ -45,3 +46,13 @@ def test_an_environment_without_a_part_of_its_description_is_refused(key):
 def test_an_impossible_value_in_the_description_of_an_environment_is_refused(key, value, message):
     with pytest.raises(RecordingError, match=message):
         environment_description(json.dumps(ENVIRONMENT | {key: value}).encode(), "here")
+
+
+@pytest.mark.parametrize(
+    "change", [{"\ud800": 1}, {"name": "\ud800"}, {"environments": 10**300}, {"status": 3}]
+)
+def test_an_impossible_shard_is_refused(change):
+    shard = {"name": "", "environments": 1, "status": "finished", "train_steps": 1, "eval_steps": 0}
+    assert parse_shards(json.dumps([shard]), "here")[0].train_steps == 1
+    with pytest.raises(RecordingError, match="here: its shards are damaged"):
+        parse_shards(json.dumps([shard | change]), "here")
