@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from runner.environments.gym_types import Space
 from runner.errors import CannotRedo, shortened
 from runner.recording.gym_spaces import describe_space, value_of
-from runner.recording.gym_values import Put, filler, filler_by_agent, leaves_by_agent, leaves_of, value_bytes
+from runner.recording.gym_values import Put, filler, filler_by_agent, leaves_by_agent, leaves_of
 from runner.recording.reader import Recording
 from runner.recording.reset_states import ResetState
 from runner.recording.spaces import Value, decode
@@ -259,14 +259,7 @@ class EnvironmentStepper(RowStepper):
                 column[row] = observation - start
 
             return put_state
-        leaves = leaves_of(self.observation_space, "observation")
-        if not self._recording.has_varying_values:
-            return filler(leaves, column)
-
-        def put_bytes(row: int, observation: object) -> None:
-            column[row] = value_bytes(leaves, observation)
-
-        return put_bytes
+        return filler(leaves_of(self.observation_space, "observation"), column)
 
     def actions(self, rows: NDArray[np.void]) -> Sequence[Value]:
         """Return the actions of recorded steps as the environment takes them."""

@@ -84,6 +84,6 @@ def locate_divergence(runs: Sequence[Run]) -> tuple[StepRef | None, str]:
 def _default_time(recording: Recording, request: Request) -> int:
     selected = select(recording, request).by_phase
     for phase in ("eval", "train"):
-        if selected[phase] and not recording.has_varying_values:
+        if selected[phase]:
             return time_of(recording, phase, selected[phase][-1].start)
     return 0

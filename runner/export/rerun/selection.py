@@ -138,7 +138,7 @@ def select(recording: Recording, request: Request) -> Selection:
     evaluations = [
         evaluation_after(available, after, str(recording.path)) for after in sorted(set(request.evaluations))
     ]
-    if not (request.everything or recording.has_varying_values):
+    if not request.everything:
         trials = [asked["eval"]] if request.trials else [one.episodes for one in evaluations]
         shown = {
             "train": train.steps_of(asked["train"]),
@@ -204,7 +204,7 @@ def evaluations_with_steps(recording: Recording, train: Episodes, evals: Episode
 
 def time_of(recording: Recording, phase: str, step: int) -> int:
     """Return where a step of a phase is on the timeline."""
-    record: Any = next(recording.phase(phase).steps.blocks(step, step + 1))[0]
+    record: Any = next(recording.phase(phase).steps.numbered(range(step, step + 1)))[0]
     return int(record["log_time"]) // schema.STEP_NANOSECONDS
 
 
@@ -286,7 +286,7 @@ def _complete_loop(
     """Add all steps of a loop if there are few, its last steps of evaluation, and episodes to draw."""
     total, tested = recording.train.steps.count(), recording.eval.steps.count()
     limit = total if request.everything else DEFAULT_STEPS
-    if request.everything or (request.is_default and (total <= limit or recording.has_varying_values)):
+    if request.everything or (request.is_default and total <= limit):
         selection.train = [range(min(total, limit))] if total else []
     if request.frames:
         _select_drawn(recording, request, selection, asked)
