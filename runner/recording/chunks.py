@@ -60,7 +60,7 @@ class ChunkEntry(NamedTuple):
     messages: int = 0
     """The number of its messages; 0 if they were not read."""
     index_length: int = 0
-    """Bytes of the message index record after it; 0 if it has none."""
+    """Bytes of the message index record after it; 0 if it was not read."""
 
 
 @dataclass(frozen=True)
@@ -97,26 +97,24 @@ def encode_chunk(
     head = CHUNK_HEAD.pack(start, end, size, crc, len(name)) + name.encode()
     head += _DATA_LENGTH.pack(len(data))
     record = b"".join((RECORD_HEAD.pack(Opcode.CHUNK, len(head) + len(data)), head, data))
-    indexed = has_message_index(topic, packing.index == "message")
-    index = message_index(topic.channel, log_times, offsets) if indexed else b""
+    index = message_index(topic, log_times, offsets, packing.index == "message")
     entry = ChunkEntry(0, len(record), size, start, end, topic.channel, name.encode(), len(log_times))
     return Chunk(record, index, entry)
 
 
-def has_message_index(topic: Topic, indexed: bool) -> bool:
-    """Return whether message indexes are written for a topic, in a recording that has them or not.
+def message_index(
+    topic: Topic, log_times: NDArray[np.uint64], offsets: NDArray[np.uint64], indexed: bool
+) -> bytes:
+    """Return the MessageIndex record that follows a chunk, and names its channel.
 
-    Those of extras would be as large as the extras; they are found by their chunks.
+    Args:
+        indexed: whether it has an entry for each message, unless they are extras: it would be as large as
+            they are.
     """
-    return indexed and topic.message is not EXTRA
-
-
-def message_index(channel: int, log_times: NDArray[np.uint64], offsets: NDArray[np.uint64]) -> bytes:
-    """Return the MessageIndex record of one channel."""
-    entries = np.empty((len(log_times), 2), dtype="<u8")
-    entries[:, 0] = log_times
-    entries[:, 1] = offsets
-    head = struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + entries.nbytes, channel, entries.nbytes)
+    count = len(log_times) if indexed and topic.message is not EXTRA else 0
+    entries = np.empty((count, 2), dtype="<u8")
+    entries[:, 0], entries[:, 1] = log_times[:count], offsets[:count]
+    head = struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + entries.nbytes, topic.channel, entries.nbytes)
     return b"".join((head, entries.data))
 
 

@@ -118,11 +118,7 @@ class ChunkTable:
                 f"chunk at {last.offset}: found messages of channel {channel}"
                 f"{f' and {last.channel}' if last.channel else ''}, expected those of one topic"
             )
-        self.replace_last(last._replace(channel=channel))
-
-    def replace_last(self, entry: ChunkEntry) -> None:
-        """Replace what is known of the last chunk."""
-        self._packed[-_ENTRY.size :] = _ENTRY.pack(*entry)
+        self._packed[-_ENTRY.size :] = _ENTRY.pack(*last._replace(channel=channel))
 
     @property
     def columns(self) -> Records:

@@ -20,7 +20,7 @@ from mcap.writer import MCAP0_MAGIC
 from runner.errors import CutOff, RecordingError
 from runner.recording import schema
 from runner.recording.blocks import RECORD_HEAD
-from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry, has_message_index, message_index
+from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry, message_index
 from runner.recording.index import Index, check_beginning, checksum, schemas_and_channels
 from runner.recording.records import (
     MetadataRecord,
@@ -161,37 +161,28 @@ def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: 
     """
     indexed = True
     chunk: ReadChunk | None = None
-    """The record before, if it is a chunk that an index may follow."""
+    """The record before, if it is a chunk."""
     for raw in walk(stream, contents.size):
         if raw.ends_data:
             return
         report(raw.offset, contents.size)
-        is_due = chunk is not None and has_message_index(chunk.topic, indexed)
-        if chunk is not None and (raw.is_message_index or is_due):
-            entry = _with_index(chunk, raw)
-            if is_due:
-                contents.chunks.append(entry)
-            else:
-                contents.chunks.replace_last(entry)
+        if chunk is not None:
+            contents.chunks.append(_with_index(chunk, raw, indexed))
             chunk, contents.end = None, raw.end
             continue
         if not raw.is_data or raw.is_message_index:
             raise RecordingError(f"found a record of kind {raw.kind} at {raw.offset}, expected none there")
-        record, chunk = read_record(raw), None
+        record = read_record(raw)
         if isinstance(record, ReadChunk):
             _check_times(record)
             chunk = record._replace(body=b"")
             del record  # memory that is free for the next record makes a survey a third quicker
-            if has_message_index(chunk.topic, indexed):
-                continue
-            contents.chunks.append(chunk.entry)
-            chunk = chunk if indexed else None  # earlier versions wrote an index of extras too
-        elif isinstance(record, MetadataRecord) and record.name == "result" and not keep_result:
             continue
-        else:
-            contents.add(raw)
-            if isinstance(record, MetadataRecord) and record.name == "config":
-                indexed = asks_for_indexes(record.entries)
+        if isinstance(record, MetadataRecord) and record.name == "result" and not keep_result:
+            continue
+        contents.add(raw)
+        if isinstance(record, MetadataRecord) and record.name == "config":
+            indexed = asks_for_indexes(record.entries)
         contents.end = raw.end
     raise RecordingError(f"the file ends at {contents.size}, in the middle of the data")
 
@@ -207,11 +198,11 @@ def _check_times(chunk: ReadChunk) -> None:
         )
 
 
-def _with_index(chunk: ReadChunk, raw: RawRecord) -> ChunkEntry:
+def _with_index(chunk: ReadChunk, raw: RawRecord, indexed: bool) -> ChunkEntry:
     """Return the entry of a chunk after comparing the message index that follows it."""
     if not raw.is_message_index:
         raise RecordingError(f"chunk at {chunk.offset}: has no message index")
-    expected = message_index(chunk.entry.channel, chunk.times, chunk.offsets)
+    expected = message_index(chunk.topic, chunk.times, chunk.offsets, indexed)
     if expected[RECORD_HEAD.size :] != raw.body:
         raise RecordingError(f"the message index at {raw.offset} does not lead to the chunk's messages")
     return chunk.entry._replace(index_length=len(expected))

@@ -26,7 +26,6 @@ from runner.recording.chunks import (
     MAX_CHUNK_BYTES,
     Chunk,
     ChunkEntry,
-    has_message_index,
     message_index,
     unpack_chunk,
 )
@@ -277,12 +276,11 @@ def copied_chunk(chunk: ReadChunk, indexed: bool) -> Chunk:
     """Return a chunk to be written as it was read, with its times and its message index made again.
 
     Args:
-        indexed: whether the recording has message indexes.
+        indexed: whether the message index has an entry for each message.
     """
     start, end = int(chunk.times[0]), int(chunk.times[-1])
     body = _CHUNK_TIMES.pack(start, end) + chunk.body[_CHUNK_TIMES.size :]  # no checksum covers them
-    indexed = has_message_index(chunk.topic, indexed)
-    index = message_index(chunk.entry.channel, chunk.times, chunk.offsets) if indexed else b""
+    index = message_index(chunk.topic, chunk.times, chunk.offsets, indexed)
     entry = chunk.entry._replace(start_time=start, end_time=end)
     return Chunk(RECORD_HEAD.pack(Opcode.CHUNK, len(body)) + body, index, entry)
 

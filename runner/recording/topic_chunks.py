@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Final, NamedTuple, TypeVar
@@ -18,7 +18,7 @@ from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry
 from runner.recording.index import ChunkTable, Index
 from runner.recording.messages import Message, decode
 from runner.recording.record_store import RecordStore
-from runner.recording.schema import ALL_TOPICS, EXTRA_TOPICS, STEP_NANOSECONDS, Topic
+from runner.recording.schema import ALL_TOPICS, Topic
 
 M = TypeVar("M")
 FOREVER: Final = 2**63 - 1
@@ -27,95 +27,19 @@ _OBJECT: Final = np.dtype(object)
 _ROWS: Final = 1024
 _ROWS_BYTES: Final = 16 << 20
 """The most messages of varying size in a block of `rows`, and the bytes of values with which one ends."""
-_MANY: Final = 32
-"""The least number of chunks of one size whose topic is inferred instead of unpacking them."""
 
 
-def chunks_by_topic(
-    index: Index, store: RecordStore, dtypes: Mapping[Topic, np.dtype[np.void]], path: str
-) -> dict[Topic, NDArray[np.intp]]:
-    """Return which chunks of a file hold each topic's messages, in order.
-
-    Without a message index the topic of a chunk stands only in the chunk itself. Unpacking the beginning of
-    every chunk takes seconds in a long recording, so most topics are inferred if the summary determines them.
-    """
+def chunks_by_topic(index: Index, store: RecordStore, path: str) -> dict[Topic, NDArray[np.intp]]:
+    """Return which chunks of a file hold each topic's messages, in order."""
     table = index.chunks
     channels = table.columns["channel"].copy() if table else np.empty(0, np.uint16)
-    if channels.any():  # only extras are without message indexes
-        counted = [topic.channel for topic in EXTRA_TOPICS if index.message_counts.get(topic.channel)]
-        channels[channels == 0] = counted[0] if len(counted) == 1 else 0
-    elif index.message_counts and np.count_nonzero(channels == 0) >= _MANY:
-        channels = _with_inferred(index, store, dtypes, channels)
-    _probe(np.flatnonzero(channels == 0), table, store, channels)
+    for k in np.flatnonzero(channels == 0).tolist():  # the file was cut off before the chunk's index
+        channels[k] = store.first_channel(table[k])
     for k in np.flatnonzero(~np.isin(channels, list(index.channels))).tolist():
         raise _damaged(
             path, table[k], f"messages of channel {channels[k]}, which the recording does not have"
         )
     return {topic: np.flatnonzero(channels == topic.channel) for topic in ALL_TOPICS}
-
-
-def _probe(
-    places: NDArray[np.intp], table: ChunkTable, store: RecordStore, channels: NDArray[np.uint16]
-) -> None:
-    """Set the channels of chunks by unpacking the beginning of each."""
-    for k in places.tolist():
-        channels[k] = store.first_channel(table[k])
-
-
-def _with_inferred(
-    index: Index, store: RecordStore, dtypes: Mapping[Topic, np.dtype[np.void]], channels: NDArray[np.uint16]
-) -> NDArray[np.uint16]:
-    """Return the channels of all chunks, those of full chunks inferred; as they were if the counts disagree.
-
-    A chunk size that occurs often belongs to the one fixed-width topic whose records divide it and which has
-    enough messages. Where training and evaluation both do, `_infer_phases` tells them apart. A wrong
-    inference would give a topic more messages than the summary counts.
-    """
-    sizes = index.chunks.columns["uncompressed_size"]
-    inferred = channels.copy()
-    candidates: set[Topic] = set()
-    unknown_sizes = np.unique(sizes[channels == 0], return_counts=True)
-    for size, count in zip(*(numbers.tolist() for numbers in unknown_sizes), strict=True):
-        fitting = [
-            topic
-            for topic, dtype in dtypes.items()
-            if size % dtype.itemsize == 0
-            and index.message_counts.get(topic.channel, 0) * dtype.itemsize >= size
-        ]
-        if count < _MANY or not fitting:
-            continue
-        places = np.flatnonzero((channels == 0) & (sizes == size))
-        if len(fitting) == 1:
-            inferred[places] = fitting[0].channel
-            candidates.update(fitting)
-        elif {topic.message for topic in fitting} <= {schema.STEP, schema.TRANSITION}:
-            _infer_phases(places, size // dtypes[fitting[0]].itemsize, index.chunks, store, inferred)
-            candidates.update(fitting)
-    _probe(np.flatnonzero(inferred == 0), index.chunks, store, inferred)
-    for topic in candidates:
-        messages = int(sizes[inferred == topic.channel].sum(dtype=np.uint64)) // dtypes[topic].itemsize
-        if messages != index.message_counts.get(topic.channel, 0):
-            return channels
-    return inferred
-
-
-def _infer_phases(
-    places: NDArray[np.intp], steps: int, table: ChunkTable, store: RecordStore, channels: NDArray[np.uint16]
-) -> None:
-    """Set the channels of chunks of `steps` steps each, which may be of training or of evaluation.
-
-    Chunks that follow each other without a gap in time are of one phase if the first and the last of them
-    are: the first steps of an evaluation go into a chunk of their own.
-    """
-    starts, ends = (table.columns[name] for name in ("start_time", "end_time"))
-    without_gap = ends[places] - starts[places] == np.uint64((steps - 1) * STEP_NANOSECONDS)
-    places = places[without_gap]
-    breaks = starts[places][1:] != ends[places][:-1] + np.uint64(STEP_NANOSECONDS)
-    for chain in np.split(places, np.flatnonzero(breaks) + 1):
-        if len(chain):
-            _probe(chain[[0, -1]], table, store, channels)
-            if channels[chain[0]] == channels[chain[-1]]:
-                channels[chain] = channels[chain[0]]
 
 
 class ChunkSpan(NamedTuple):

@@ -188,7 +188,7 @@ class TopicReader(RunDescription):
     @cached_property
     def _places(self) -> Mapping[Topic, NDArray[np.intp]]:
         """The numbers of the chunks of the file that hold each topic."""
-        return chunks_by_topic(self._index, self._store, self.dtypes, str(self.path))
+        return chunks_by_topic(self._index, self._store, str(self.path))
 
     @cached_property
     def _topics_by_name(self) -> Mapping[str, Topic]:
