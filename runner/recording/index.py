@@ -66,6 +66,7 @@ _ENTRY: Final = struct.Struct("<QIIQQH4sII")
 _ENTRY_COLUMNS: Final = np.dtype(
     list(zip(ChunkEntry._fields, ("<u8", "<u4", "<u4", "<u8", "<u8", "<u2", "S4", "<u4", "<u4"), strict=True))
 )
+_CHANNEL, _CHANNEL_AT = struct.Struct("<H"), _ENTRY_COLUMNS.fields["channel"][1]  # type: ignore[index]
 
 
 class ChunkTable:
@@ -112,13 +113,14 @@ class ChunkTable:
         Raises:
             RecordingError: it was set before, or no recording has such a channel.
         """
-        last = self[len(self) - 1]
-        if last.channel or channel not in TOPIC_OF:
+        at = len(self._packed) - _ENTRY.size + _CHANNEL_AT
+        (known,) = _CHANNEL.unpack_from(self._packed, at)
+        if known or channel not in TOPIC_OF:
             raise RecordingError(
-                f"chunk at {last.offset}: found messages of channel {channel}"
-                f"{f' and {last.channel}' if last.channel else ''}, expected those of one topic"
+                f"chunk at {self[len(self) - 1].offset}: found messages of channel {channel}"
+                f"{f' and {known}' if known else ''}, expected those of one topic"
             )
-        self._packed[-_ENTRY.size :] = _ENTRY.pack(*last._replace(channel=channel))
+        _CHANNEL.pack_into(self._packed, at, channel)
 
     @property
     def columns(self) -> Records:
