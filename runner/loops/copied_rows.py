@@ -16,12 +16,11 @@ from runner.loops.rows import Rows
 from runner.loops.shard_sources import PHASES, Source
 from runner.recording.episode_log import Flags
 from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAME_LENGTH, MAX_NAMES, ExtraLayout
-from runner.recording.recorder import Recorder
+from runner.recording.recorder import BLOCK_BYTES, Recorder
 from runner.util.arrays import Ints
 
 _STEP_FIELDS: Final = ("state", "action", "next_state")
 _TRANSITION_FIELDS: Final = ("action", "next_observation", "acted", "agents_terminated", "agents_truncated")
-_SHARED_FIELDS: Final = ("rewards", "t", "terminated", "truncated")
 
 
 @dataclass(frozen=True)
@@ -36,8 +35,12 @@ class CopiedRows(Rows):
     """Rows that are copied as they are, but for their numbers."""
 
     def __init__(self, recorder: Recorder, copied: Copied, phase: str) -> None:
-        self._fields = _SHARED_FIELDS + (_STEP_FIELDS if copied.kind == "step" else _TRANSITION_FIELDS)
+        self._fields = ("t", *(_STEP_FIELDS if copied.kind == "step" else _TRANSITION_FIELDS))
         super().__init__(recorder, copied, phase, lambda _: None)  # type: ignore[arg-type]
+        steps = recorder.dtype(self._topics.steps)
+        self._scratch_dtype = np.dtype(
+            [(name, steps[name]) for name in ("rewards", "terminated", "truncated")]
+        )
         self.open()
 
     def _set_leaves(self, described: object) -> None:
@@ -60,21 +63,17 @@ class CopiedRows(Rows):
             at, self.filled = self.filled, self.filled + len(part)
             for name in self._fields:
                 self._block[name][at : self.filled] = part[name]
+            for name in self._scratch.dtype.names or ():
+                self._scratch[name][at : self.filled] = part[name]
             self._begun += int(np.count_nonzero(part["t"] == 0))
-            if self.filled == self._room:
+            if self._are_bytes:
+                self._hold(*part["action"], *part["next_observation"])
+            if self.filled == self._room or self._held > BLOCK_BYTES:
                 self.commit()
                 self.open()
 
-    def _open_steps(self) -> tuple[int, int]:
-        self._block = self._recorder.block(self._topics.steps)
-        self._reset_block = self._recorder.block(self._topics.resets)
-        return len(self._block), len(self._reset_block)
-
     def _put_reset(self, observation: object, seed: int | None) -> None:  # noqa: ARG002
         self._reset_block["observation"][len(self._reset_rows)] = observation
-
-    def _outcomes(self, n: int) -> tuple[NDArray[np.void], Flags | bool]:
-        return self._block[:n], False
 
     def _begins(self, n: int) -> Flags:
         """Return where an episode begins, also after a game that ended without the end of any agent."""
@@ -85,12 +84,6 @@ class CopiedRows(Rows):
             return super()._transitions(n)
         state, action, after = (self._block[name][:n].astype(np.int64) for name in _STEP_FIELDS)
         return state, action, after
-
-    def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
-        block = self._block[:n]
-        block["step"] = self._recorder.steps[self._phase] + np.arange(n)
-        block["episode"], block["t"] = episode, t
-        self._recorder.take(self._topics.steps, np.arange(before + 1, before + n + 1, dtype=np.uint64))
 
 
 class CopiedExtras:

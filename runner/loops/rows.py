@@ -18,7 +18,7 @@ from runner.loops.values import warn_user
 from runner.recording import schema
 from runner.recording.episode_log import Columns, EpisodeLog, Flags, Steps
 from runner.recording.gym_values import leaves_of
-from runner.recording.recorder import Recorder
+from runner.recording.recorder import BLOCK_BYTES, Recorder
 from runner.util.arrays import Ints
 
 MAX_SEED: Final = 2**64 - 1
@@ -32,8 +32,9 @@ class Rows:
         first_action: called with the first action of the phase before it is put down; may call `reshape`.
     """
 
-    _scratch: NDArray[np.void]
-    """What steps brought: `rewards`, `terminated` and `truncated` of each row."""
+    _scratch_dtype: np.dtype[np.void]
+    """What a step brings that waits until its block is completed: `rewards`, `terminated`, `truncated`."""
+    _scratch: NDArray[np.void] = np.zeros(0, "V1")
 
     def __init__(
         self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[object], None]
@@ -117,6 +118,12 @@ class Rows:
         self._set_leaves(described)
         self.open()
 
+    def _hold(self, *values: bytes) -> None:
+        """Count the bytes of values of varying size; with many of them, the block is full."""
+        self._held += sum(map(len, values))
+        if self._held > BLOCK_BYTES:
+            self._room, self._reset_room = self.filled + 1, len(self._reset_rows) + 1
+
     # --- blocks ---------------------------------------------------------------------------------------
 
     def open(self) -> None:
@@ -180,7 +187,14 @@ class Rows:
 
     def _open_steps(self) -> tuple[int, int]:
         """Take blocks of steps and resets; return the room in each."""
-        raise NotImplementedError
+        self._block = self._recorder.block(self._topics.steps)
+        self._reset_block = self._recorder.block(self._topics.resets)
+        self._are_bytes, self._held = self._block.dtype.hasobject, 0
+        room = len(self._block)
+        if len(self._scratch) < room:
+            self._scratch = np.zeros(room, self._scratch_dtype)
+            self._bytes = self._scratch.view(np.uint8).data
+        return room, len(self._reset_block)
 
     def _put_reset(self, observation: object, seed: int | None) -> None:
         raise NotImplementedError
@@ -200,4 +214,10 @@ class Rows:
 
     def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
         """Complete the records of the first n rows and hand them to the recorder."""
-        raise NotImplementedError
+        block, rows = self._block[:n], self._scratch[:n]
+        block["rewards"] = rows["rewards"].reshape(n, -1)
+        block["terminated"], block["truncated"] = rows["terminated"], rows["truncated"]
+        block["step"] = self._recorder.steps[self._phase] + np.arange(n)
+        block["episode"] = episode
+        block["t"] = t
+        self._recorder.take(self._topics.steps, np.arange(before + 1, before + n + 1, dtype=np.uint64))

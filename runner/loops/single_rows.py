@@ -15,7 +15,6 @@ from runner.loops.rows import Rows
 from runner.loops.values import lone_number, require_reset, warn_user, whole_number
 from runner.recording.episode_log import Flags
 from runner.recording.gym_values import filler, filler_by_agent, leaves_by_agent
-from runner.recording.recorder import BLOCK_BYTES
 from runner.util.arrays import Ints
 
 _DISCRETE: Final = struct.Struct("<qqd??")
@@ -27,40 +26,7 @@ _ENDING_DTYPE: Final = np.dtype([("rewards", "<f8"), ("terminated", "?"), ("trun
 _MAX_STATE: Final = 2**32 - 1
 
 
-class BlockRows(Rows):
-    """Rows that are put down in the recorder's blocks."""
-
-    _scratch_dtype: np.dtype[np.void]
-    """What a step brings that waits until its block is completed."""
-    _scratch: NDArray[np.void] = np.zeros(0, "V1")
-
-    def _open_steps(self) -> tuple[int, int]:
-        self._block = self._recorder.block(self._topics.steps)
-        self._reset_block = self._recorder.block(self._topics.resets)
-        room = len(self._block)
-        self._are_bytes, self._held = self._block.dtype.hasobject, 0
-        if len(self._scratch) < room:
-            self._scratch = np.zeros(room, self._scratch_dtype)
-            self._bytes = self._scratch.view(np.uint8).data
-        return room, len(self._reset_block)
-
-    def _hold(self, *values: bytes) -> None:
-        """Count the bytes of values of varying size; with many of them, the block is full."""
-        self._held += sum(map(len, values))
-        if self._held > BLOCK_BYTES:
-            self._room, self._reset_room = self.filled + 1, len(self._reset_rows) + 1
-
-    def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
-        block, rows = self._block[:n], self._scratch[:n]
-        block["rewards"] = rows["rewards"].reshape(n, -1)
-        block["terminated"], block["truncated"] = rows["terminated"], rows["truncated"]
-        block["step"] = self._recorder.steps[self._phase] + np.arange(n)
-        block["episode"] = episode
-        block["t"] = t
-        self._recorder.take(self._topics.steps, np.arange(before + 1, before + n + 1, dtype=np.uint64))
-
-
-class DiscreteRows(BlockRows):
+class DiscreteRows(Rows):
     """Rows of `dualtaxi.Step`: both spaces are `Discrete`."""
 
     _scratch_dtype = _DISCRETE_DTYPE
@@ -128,7 +94,7 @@ class DiscreteRows(BlockRows):
         super()._finish_steps(n, episode, t, before)
 
 
-class ArrayRows(BlockRows):
+class ArrayRows(Rows):
     """Rows of `dualtaxi.Transition`, in spaces of fixed width or not."""
 
     _scratch_dtype = _ENDING_DTYPE
@@ -185,7 +151,7 @@ class ArrayRows(BlockRows):
         super()._finish_steps(n, episode, t, before)
 
 
-class AgentRows(BlockRows):
+class AgentRows(Rows):
     """Rows of `dualtaxi.Transition` of all agents of a PettingZoo parallel environment."""
 
     _is_settled = False
