@@ -11,10 +11,14 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+from runner.service.processes import PRELOADED
+from runner.util.processes import process_context
+
 hypothesis.settings.register_profile("untimed", deadline=None)  # a loaded machine is no reason to fail
 hypothesis.settings.load_profile("untimed")
 if sys.platform == "linux":
     os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported
+process_context(PRELOADED)  # as the service does it; else each of its children would import them itself
 os.environ["DUALTAXI_CODE"] = "off"  # thousands of runs need not ask git; tests of the user's code turn it on
 
 
