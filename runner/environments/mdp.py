@@ -7,15 +7,15 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypedDict
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from runner.environments.scene import SceneDescription, scene_mistake
 from runner.errors import EnvironmentNotUsable
 from runner.util.arrays import Array
-from runner.util.stored import Count
 from runner.util.values import JsonView, is_text, is_whole
 
 Indices = NDArray[np.integer[Any]]
@@ -47,14 +47,17 @@ class Transitions(TypedDict):
     events: NDArray[np.uint32]
 
 
+Amount = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+
+
 class EnvironmentDescription(TypedDict):
     """The fields of an `Mdp` that are not arrays, as JSON can hold them."""
 
     env_id: str
     kwargs: JsonView
-    step_limit: Count
+    step_limit: Amount
     agents: Sequence[str]
-    action_counts: Sequence[Count]
+    action_counts: Sequence[Amount]
     event_names: Sequence[str]
     success_events: Sequence[str]
     penalty_below: float | None

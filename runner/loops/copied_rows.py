@@ -74,6 +74,8 @@ class CopiedRows(Rows):
 
     def _put_reset(self, observation: object, seed: int | None) -> None:  # noqa: ARG002
         self._reset_block["observation"][len(self._reset_rows)] = observation
+        if self._are_bytes:
+            self._hold(observation)  # type: ignore[arg-type]
 
     def _begins(self, n: int) -> Flags:
         """Return where an episode begins, also after a game that ended without the end of any agent."""

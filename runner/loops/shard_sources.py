@@ -156,9 +156,7 @@ class Source:
 
     def reset(self, phase: str, unit: np.void) -> np.void:
         """Return the reset of a unit."""
-        table, number = self.recording.phase(phase).resets, int(unit["reset"])
-        record: np.void = next(table.numbered(range(number, number + 1)))[0]
-        return record
+        return self.recording.phase(phase).resets.one(int(unit["reset"]))
 
     def steps(self, phase: str, unit: np.void) -> Iterator[tuple[Records, Ints]]:
         """Yield the steps of a unit in pieces, with their numbers in the phase of its process."""

@@ -17,7 +17,7 @@ from msgspec import Meta
 from runner.errors import RecordingError
 from runner.recording.metadata import json_object
 from runner.recording.records import MAX_METADATA_BYTES
-from runner.util.stored import stored_as
+from runner.util.stored import require_keys, stored_as
 from runner.util.values import is_utf8
 
 CODE_RECORD: Final = "provenance/code"
@@ -64,6 +64,7 @@ def parse_code(data: bytes, where: str) -> Code:
     except zstandard.ZstdError as error:
         raise RecordingError(f"{where}: {CODE_ATTACHMENT} is damaged ({error}).") from error
     values = json_object(text, f"{where}: {CODE_ATTACHMENT}")
+    require_keys(values, ("files", "new", "patch"), f"{where}: {CODE_ATTACHMENT} is damaged")
     code = stored_as(Code, values, f"{where}: {CODE_ATTACHMENT} is damaged")
     if not all(map(_is_path, code.files)):
         raise RecordingError(f"{where}: {CODE_ATTACHMENT} is damaged: found a path that is not relative.")

@@ -163,13 +163,16 @@ def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: 
     chunk: ReadChunk | None = None
     """The record before, if it is a chunk."""
     for raw in walk(stream, contents.size):
-        if raw.ends_data:
-            return
         report(raw.offset, contents.size)
-        if chunk is not None:
+        if chunk is not None and (raw.is_message_index or (indexed and chunk.topic.message != schema.EXTRA)):
             contents.chunks.append(_with_index(chunk, raw, indexed))
             chunk, contents.end = None, raw.end
             continue
+        if chunk is not None:  # earlier versions wrote no index without entries
+            contents.chunks.append(chunk.entry)
+            chunk, contents.end = None, raw.offset
+        if raw.ends_data:
+            return
         if not raw.is_data or raw.is_message_index:
             raise RecordingError(f"found a record of kind {raw.kind} at {raw.offset}, expected none there")
         record = read_record(raw)

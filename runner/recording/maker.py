@@ -15,7 +15,7 @@ from typing import Annotated, Any, Final, Literal, TypedDict
 from msgspec import Meta
 
 from runner.errors import RecordingError
-from runner.util.stored import Count, Text, stored_as
+from runner.util.stored import Count, Text, require_keys, stored_as
 from runner.util.values import MAX_TEXT, is_text, is_too_deep
 
 MAKER_RECORD: Final = "environment_maker"
@@ -120,6 +120,20 @@ class EnvironmentMaker:
         return {"json": json.dumps(vars(self) | {"vector": vector}, sort_keys=True)}
 
 
+_KEYS: Final = (
+    "spec",
+    "registered_by",
+    "make",
+    "reason",
+    "wrappers",
+    "assumed",
+    "packages",
+    "platform",
+    "machine",
+)
+"""What every maker's record states, be it empty."""
+
+
 def parse_maker(values: Mapping[str, object], where: str) -> EnvironmentMaker:
     """Return the maker in a metadata record.
 
@@ -127,7 +141,10 @@ def parse_maker(values: Mapping[str, object], where: str) -> EnvironmentMaker:
         RecordingError: it is damaged.
     """
     where = f"{where}: its {MAKER_RECORD} is damaged"
+    require_keys(values, _KEYS, where)
     maker = stored_as(EnvironmentMaker, values, where)
+    if maker.vector is not None and isinstance(vector := values["vector"], Mapping):
+        require_keys(vector, ("wrappers", "wrapper_specs"), f"{where}, its vector")
     for text, kind in ((maker.spec, dict), (maker.vector.wrapper_specs if maker.vector else "", list)):
         try:
             specification = json.loads(text) if text else kind()
@@ -176,6 +193,8 @@ def parse_shards(text: str | None, where: str) -> tuple[Shard, ...]:
     except (ValueError, RecursionError) as error:
         raise RecordingError(f"{where} ({error}).") from error
     shards = stored_as(_Shards, values, where)
+    if unknown := [key for shard in values for key in shard if key not in Shard.__dataclass_fields__]:
+        raise RecordingError(f"{where}: found the unknown key {unknown[0][:_MAX_NAME]!r}.")
     for shard in shards:
         if not (is_text(shard.status) and is_text(shard.name or "-")):
             raise RecordingError(f"{where}: found {str(shard)[:200]}.")

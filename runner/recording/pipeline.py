@@ -295,20 +295,19 @@ class MessageBatches:
         self.add(topic, log_times, records)
 
     def add(self, topic: Topic, log_times: Sequence[int], records: Sequence[bytes]) -> None:
-        """Add whole message records to their topic's batch."""
-        size = sum(map(len, records))
-        batch = self._batches.get(topic)
-        if batch is not None and (
-            batch.size + size > MAX_BATCH_BYTES or len(batch.times) + len(records) > MAX_BATCH_MESSAGES
-        ):
-            self.flush_topic(topic)
-            batch = None
-        if batch is None:
-            batch = _Batch()
-            self._batches[topic] = batch
-        batch.records += records
-        batch.times += log_times
-        batch.size += size
+        """Add whole message records to their topic's batch, or to as many as they fill."""
+        for log_time, record in zip(log_times, records, strict=True):
+            batch = self._batches.get(topic)
+            if batch is not None and (
+                batch.size + len(record) > MAX_BATCH_BYTES or len(batch.times) == MAX_BATCH_MESSAGES
+            ):
+                self.flush_topic(topic)
+                batch = None
+            if batch is None:
+                batch = self._batches[topic] = _Batch()
+            batch.records.append(record)
+            batch.times.append(log_time)
+            batch.size += len(record)
 
     def flush(self) -> None:
         """Send every batch."""

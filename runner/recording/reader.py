@@ -38,8 +38,6 @@ from runner.recording.run_file import RecentTraining, run_title
 from runner.recording.topic_chunks import FOREVER, TopicChunks
 from runner.recording.topic_reader import TopicReader
 
-MAX_EPISODE_BYTES: Final = 128 << 20
-"""The most that `episode_steps` returns as one array: some 1.5 million steps."""
 MAX_METRICS: Final = 1 << 17
 """The most that `metrics` returns as one list."""
 _METRICS_BYTES: Final = 1 << 20

@@ -22,7 +22,7 @@ from runner.recording.clock import Stopwatch
 from runner.recording.digest import combined_digest
 from runner.recording.messages import encode_rows
 from runner.recording.observer import Observer
-from runner.recording.pipeline import MessageBatches, Pipeline
+from runner.recording.pipeline import MAX_BATCH_MESSAGES, MessageBatches, Pipeline
 from runner.recording.reference import Reference
 from runner.recording.reuse import PackedChunks
 from runner.recording.schema import STEP_NANOSECONDS, Topic
@@ -381,7 +381,7 @@ class Recorder:
 
     def _take_block(self, lane: _Lane) -> _Block:
         """Return a block to fill: one that was used before, or a new one while there may be more."""
-        if self._first_records is not None and not lane.has_started:
+        if self._first_records is not None and not lane.has_started and not lane.dtype.hasobject:
             lane.has_started = True
             return _Block(blank_records(lane.topic, lane.dtype, min(self._first_records, lane.capacity)))
         if lane.made < MAX_BLOCKS and lane.free.empty():
@@ -423,4 +423,6 @@ def _offsets(count: int, size: int) -> NDArray[np.uint64]:
 def capacity_of(topic: Topic, dtype: np.dtype[np.void], chunk_steps: int) -> int:
     """Return how many records a block of a topic has."""
     limit = EPISODES_A_BLOCK if topic.message in (schema.EPISODE, schema.RESET) else chunk_steps
+    if dtype.hasobject:  # messages of varying size, which share chunks of fewer
+        limit = min(limit, MAX_BATCH_MESSAGES)
     return max(1, min(limit, BLOCK_BYTES // dtype.itemsize))

@@ -6,7 +6,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +80,8 @@ class TopicChunks:
     """Ranges (first, stop) of the numbers of messages that a repair could not save."""
     _last: tuple[bytes, NDArray[np.void]] | None = field(default=None, init=False)
     """The records of a chunk that was checked last, and the array of them."""
+    _last_rows: tuple[int, NDArray[np.void]] | None = field(default=None, init=False)
+    """The number of a chunk of messages of varying size that was decoded last, and its messages."""
 
     def __len__(self) -> int:
         return len(self.places)
@@ -144,18 +146,37 @@ class TopicChunks:
             if len(rows):
                 yield rows
 
+    def one(self, number: int) -> np.void:
+        """Return a message by its number, as `rows` does.
+
+        Raises:
+            RecordingError: it was lost.
+        """
+        for rows in self.numbered(range(number, number + 1)):
+            row: np.void = rows[0]
+            return row
+        raise RecordingError(f"{self.file.path}: {self.topic.name}: number {number:,} was lost.")
+
     def _blocks_from(self, start: int, stop: int) -> Iterator[NDArray[np.void]]:
         """Yield blocks as `rows` does, the first of which begins with message number `start` or before it."""
         if self.dtype is not None:
             return self.blocks(start, stop)
-        k = bisect_right(range(len(self)), start, key=lambda k: self._rows_of(k)[self._number][0])
-        return self._decoded_rows(chunks=range(max(k - 1, 0), len(self)))
+        k = bisect_right(range(len(self)), start, key=lambda k: self._first_of(k)[self._number])
+        return map(self._rows_of, range(max(k - 1, 0), len(self)))  # within a chunk no message is missing
+
+    def _first_of(self, k: int) -> Any:
+        """Return the first message of chunk number k."""
+        if self.dtype is None:
+            return next(self.decoded(chunks=range(k, k + 1)))
+        return self._rows_of(k)[0]
 
     def _rows_of(self, k: int) -> NDArray[np.void]:
         """Return the messages of chunk number k as records."""
         if self.dtype is not None:
             return self._block(k, self.file.store.chunk(self.entry(k)))
-        return np.concatenate(list(self._decoded_rows(chunks=range(k, k + 1))))
+        if self._last_rows is None or self._last_rows[0] != k:
+            self._last_rows = k, np.concatenate(list(self._decoded_rows(chunks=range(k, k + 1))))
+        return self._last_rows[1]
 
     @property
     def _number(self) -> str:
@@ -204,12 +225,13 @@ class TopicChunks:
 
     def first_from(self, field: str, value: int) -> int:
         """Return the number of the first message of that value or more in a field that never decreases."""
-        k = bisect_left(range(len(self)), value, key=lambda k: self._rows_of(k)[field][-1])
-        if k == len(self):
-            return self.count()
-        rows = self._rows_of(k)
-        at = int(np.searchsorted(rows[field], value))
-        return int(rows[self._number][at] if self.dtype is None else self._numbers[0][k] + at)
+        k = bisect_left(range(len(self)), value, key=lambda k: self._first_of(k)[field])
+        for place in range(max(k - 1, 0), min(k + 1, len(self))):
+            rows = self._rows_of(place)
+            at = int(np.searchsorted(rows[field], value))
+            if at < len(rows):
+                return int(rows[self._number][at] if self.dtype is None else self._numbers[0][place] + at)
+        return self.count()
 
     def messages(
         self, times: range | None = None, chunks: range | None = None

@@ -137,10 +137,7 @@ def _target(recording: Recording, phase: str, number: int) -> _Target:
 
 
 def _step_time(recording: Recording, phase: str, step: int) -> int:
-    steps = recording.phase(phase).steps
-    for block in steps.numbered(range(step, step + 1)):
-        return int(block["log_time"][0])
-    raise RecordingError(f"{recording.path}: {steps.topic.name}: step {step:,} was lost.")
+    return int(recording.phase(phase).steps.one(step)["log_time"])
 
 
 def _resets_back(recording: Recording, phase: str, time: int) -> Iterator[RecordedReset]:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording.actions import after_step
 from runner.recording.blocks import blank_records
-from runner.recording.reader import MAX_EPISODE_BYTES, Recording, open_recording
+from runner.recording.phases import MAX_EPISODE_BYTES
+from runner.recording.reader import Recording, open_recording
 from runner.recording.schema import PHASE_NAMES
 from runner.recording.spaces import least_number
 from runner.replay.redone import RedoneSteps

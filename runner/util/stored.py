@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Final, TypeVar
 
 import msgspec
@@ -29,6 +29,16 @@ Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 Text = Annotated[str, msgspec.Meta(max_length=MAX_TEXT)]
 
 
+def require_keys(values: Mapping[str, object], keys: Iterable[str], where: str) -> None:
+    """Refuse a JSON object that lacks a key which a type has a default for.
+
+    Raises:
+        RecordingError: it does; the message begins with `where`.
+    """
+    if missing := [key for key in keys if key not in values]:
+        raise RecordingError(f"{where}: found no {missing[0]}, expected {', '.join(keys)}.")
+
+
 def stored_as(kind: type[_T], value: object, where: str) -> _T:
     """Return a JSON value, which anyone may have written, as a dataclass, TypedDict or other annotated type.
 
@@ -49,6 +59,7 @@ def stored_as(kind: type[_T], value: object, where: str) -> _T:
             value = value[key]
         elif isinstance(value, list) and key.isdecimal():
             value = value[int(key)]
+    problem = problem.replace("Object missing required field", "found none, expected the key")
     words = " ".join(
         _WORDS.get(word, word) for word in problem.partition(", got ")[0].replace("`", "").split()
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -204,8 +204,7 @@ def evaluations_with_steps(recording: Recording, train: Episodes, evals: Episode
 
 def time_of(recording: Recording, phase: str, step: int) -> int:
     """Return where a step of a phase is on the timeline."""
-    record: Any = next(recording.phase(phase).steps.numbered(range(step, step + 1)))[0]
-    return int(record["log_time"]) // schema.STEP_NANOSECONDS
+    return int(recording.phase(phase).steps.one(step)["log_time"]) // schema.STEP_NANOSECONDS
 
 
 def _focus(recording: Recording, shown: Mapping[str, Sequence[range]]) -> tuple[int, int] | None:

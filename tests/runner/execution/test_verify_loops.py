@@ -233,7 +233,7 @@ def test_messages_of_varying_size_have_their_number_and_their_rewards(
         wrong = "rewards" in fields and fields["step"] == 3
         return encode(message, fields | ({field: value} if wrong else {}))
 
-    monkeypatch.setattr("runner.loops.single_rows.encode", encoded)
+    monkeypatch.setattr("runner.recording.messages.encode", encoded)
     with runner.record(Rooms(with_text=True), tmp_path) as rec:
         rec.reset(seed=1)
         for _ in range(5):

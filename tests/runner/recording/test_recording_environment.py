@@ -27,7 +27,7 @@ def test_an_environment_that_names_nothing_is_refused(key, names):
 def test_an_environment_without_a_part_of_its_description_is_refused(key):
     assert environment_description(json.dumps(ENVIRONMENT).encode(), "here")["env_id"] == "A-v1"
     entries = {name: value for name, value in ENVIRONMENT.items() if name != key}
-    with pytest.raises(RecordingError, match=f"here: environment.json: Object missing required field {key}"):
+    with pytest.raises(RecordingError, match=f"here: environment.json: found none, expected the key {key}"):
         environment_description(json.dumps(entries).encode(), "here")
 
 
@@ -40,7 +40,7 @@ def test_an_environment_without_a_part_of_its_description_is_refused(key):
         ("action_counts", [-1], r"found -1 as action_counts\[0\], expected a whole number >= 0"),
         ("step_limit", True, "found True as step_limit, expected a whole number"),
         ("scene", "x", "found 'x' as scene, expected an object or null"),
-        ("scene", {}, "environment.json: found {} as scene, Object missing required field"),
+        ("scene", {}, "environment.json: found {} as scene, found none, expected the key"),
     ],
 )
 def test_an_impossible_value_in_the_description_of_an_environment_is_refused(key, value, message):
