@@ -37,7 +37,7 @@ def test_a_job_on_ray_gives_the_same_runs_and_can_be_cancelled(cluster, tmp_path
     here = runner.run_all(ICY, recordings=tmp_path / "here")
     with JobQueue(tmp_path / "far", 1, ray=cluster) as jobs:
         number = submit(jobs, ICY).number
-        over = until(lambda job: job.is_over, lambda: jobs.store.job(number))
+        over = until(lambda job: job.is_over, lambda: jobs.store.job(number), seconds=240)
         assert over.state == "finished", over.error
         far = sorted(list_runs(tmp_path / "far"), key=lambda run: run.seed)
         digests = [[run.summary["content_digest"] for run in runs] for runs in (far, here)]
