@@ -51,7 +51,7 @@ def path(tmp_path_factory):
 
 
 @given(seed=st.integers(0, 2**32), name=st.integers(0, 15), data=st.data())
-@settings(max_examples=400, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=150, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
 def test_a_hostile_file_is_read_or_refused(seed, name, data, recordings, path):
     rng = random.Random(seed)
     path.write_bytes(mutate(recordings[sorted(recordings)[name]], rng, lambda part: _noise(part, rng)))
@@ -59,7 +59,7 @@ def test_a_hostile_file_is_read_or_refused(seed, name, data, recordings, path):
 
 
 @given(seed=st.integers(0, 2**32), name=st.integers(0, 15))
-@settings(max_examples=100, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=50, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
 def test_a_hostile_file_is_repaired_or_refused(seed, name, recordings, path):
     rng = random.Random(seed)
     path.write_bytes(mutate(recordings[sorted(recordings)[name]], rng, lambda part: _noise(part, rng)))

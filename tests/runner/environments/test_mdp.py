@@ -275,7 +275,7 @@ anything = st.recursive(
 DESCRIBED = sorted(load_mdp("FrozenLake-v1", {}).description())
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=60)
 @given(name=st.sampled_from(DESCRIBED), value=anything, left_out=st.booleans())
 def test_any_environment_metadata_is_accepted_or_refused(name, value, left_out, lake):
     description = json.loads(json.dumps(lake.description()))

@@ -64,7 +64,7 @@ def flushed_all_the_time(monkeypatch):
         monkeypatch.setattr(f"runner.loops.{module}.FLUSH_SECONDS", 0.002)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32), st.sampled_from(MAKERS), st.sampled_from((10, 200)))
 def test_a_loop_is_recorded_as_it_was_seen(seed, make, length):
     draw = random.Random(seed)
@@ -130,7 +130,7 @@ def test_a_loop_is_recorded_as_it_was_seen(seed, make, length):
         assert verify(rec.run.recording).sound
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     st.integers(0, 2**32),
     st.sampled_from(("NextStep", "SameStep", "Disabled")),

@@ -30,7 +30,7 @@ def whole(recording):
     return {topic: recording.table(topic).array() for topic in schema.BLOCK_TOPICS}
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=60)
 @given(topic=topics, start=places, stop=places | st.none())
 def test_a_piece_is_that_piece_of_the_whole(topic, start, stop, recording, whole):
     blocks = list(recording.table(topic).blocks(start, stop))

@@ -267,7 +267,7 @@ filters = st.recursive(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(filters)
 def test_a_filter_lets_through_what_plain_python_does(folder, question):
     text, test = question
@@ -323,7 +323,7 @@ PIECES = r"""
 """
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.lists(st.sampled_from(PIECES.split()), max_size=12).map(" ".join) | st.text(max_size=30))
 def test_any_text_is_a_filter_or_refused_with_its_place(folder, text):
     assert outcome(folder, text) == "filter" or found(folder, text) <= {run["run_id"] for run in RUNS}

@@ -25,7 +25,7 @@ CHECKS = [
     content_type_conformance,
     response_schema_conformance,
 ]
-EXAMPLES = 4
+EXAMPLES = 2
 """Requests to each route: a number, not a time, so that a failure is found again when it is repeated."""
 TIMEOUT = 300
 """Seconds that a request may take on a loaded machine."""
