@@ -14,7 +14,9 @@ import pytest
 from runner.service.processes import PRELOADED
 from runner.util.processes import process_context
 
-hypothesis.settings.register_profile("untimed", deadline=None, max_examples=40)  # a loaded machine is no reason to fail
+hypothesis.settings.register_profile(
+    "untimed", deadline=None, max_examples=40
+)  # a loaded machine is no reason to fail
 hypothesis.settings.load_profile("untimed")
 if sys.platform == "linux":
     os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported
