@@ -153,7 +153,7 @@ def _unusual(recording: Recording, phase: str, findings: Findings) -> Iterator[s
     Raises:
         Inconsistent: the environment cannot have done it.
     """
-    topic = schema.PHASES[phase][0]  # whose name is that of every kind's steps
+    topic = recording.phase(phase).steps.topic
     if findings.rewards_off_table:
         where = f"{topic.name}, step {findings.first_off_table}: rewards"
         if recording.result.rewards_off_table == 0:

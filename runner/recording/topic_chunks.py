@@ -173,7 +173,8 @@ class TopicChunks:
     def _rows_of(self, k: int) -> NDArray[np.void]:
         """Return the messages of chunk number k as records."""
         if self.dtype is not None:
-            return self._block(k, self.file.store.chunk(self.entry(k)))
+            firsts, ends = self._numbers  # which refuses a chunk that is no multiple of the records' size
+            return next(self.blocks(int(firsts[k]), int(ends[k])))
         if self._last_rows is None or self._last_rows[0] != k:
             self._last_rows = k, np.concatenate(list(self._decoded_rows(chunks=range(k, k + 1))))
         return self._last_rows[1]

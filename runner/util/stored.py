@@ -49,10 +49,7 @@ def stored_as(kind: type[_T], value: object, where: str) -> _T:
     """
     try:
         return msgspec.convert(value, kind)
-    except (
-        msgspec.ValidationError,
-        UnicodeEncodeError,
-    ) as error:  # the latter of a key with half a character
+    except (msgspec.ValidationError, UnicodeEncodeError) as error:  # a key may have half a character
         problem, _, place = str(error).partition(" - at ")
     for key in re.findall(r"\w+", place):  # of `$.vector.wrappers[3]`
         if isinstance(value, Mapping) and key in value:

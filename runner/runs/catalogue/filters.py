@@ -133,12 +133,12 @@ class FilterParser(Parser[Part]):
             if max(accumulate((sign == "(") - (sign == ")") for sign in condition.sql.text)) > MAX_DEPTH:
                 raise RunnerError("filter: is nested too deeply.")
         else:
-            words = self.text.split()
-            for word in words:
-                if word[0] in "+-" and len(word) > 1:
-                    wanted = f'"{word[1:]}"' if word[0] == "+" else f'not "{word[1:]}"'
-                    raise self.marked(self.text.index(word), len(word), f"found {word}, expected {wanted}")
-            condition = self.joined(CONDITION, ast.And, list(map(self._anywhere, words)))
+            for word in re.finditer(
+                r"(?<!\S)[+-]\S+", self.text
+            ):  # as Lucene's syntax demands or excludes it
+                wanted = f'{"" if word[0][0] == "+" else "not "}"{word[0][1:]}"'
+                raise self.marked(word.start(), len(word[0]), f"found {word[0]}, expected {wanted}")
+            condition = self.joined(CONDITION, ast.And, list(map(self._anywhere, self.text.split())))
         return Filter(condition.sql, frozenset(self._settings))
 
     def syntax_error(self, error: SyntaxError) -> RunnerError:

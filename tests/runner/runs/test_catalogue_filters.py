@@ -294,6 +294,12 @@ def test_all_of_several_words_are_searched_for(folder):
     assert found(folder, " quick\tkeep ") == found(folder, '"quick" and "keep"') < found(folder, "keep")
 
 
+@pytest.mark.parametrize(("text", "wanted"), [("quick -red", 'not "red"'), ("+keep", '"keep"')])
+def test_words_with_the_signs_of_lucene_are_refused_with_the_new_form(folder, text, wanted):
+    with pytest.raises(RunnerError, match=f"expected {wanted}\n"):
+        found(folder, text)
+
+
 @pytest.mark.parametrize(
     "text",
     [
