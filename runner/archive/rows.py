@@ -31,6 +31,7 @@ def message_row(topic: Topic, payload: bytes, shape: Shape) -> Message:
             values |= shape.spaces[field].row(values.pop(field))
         if topic.message is schema.TRANSITION:
             rewards = values.pop("rewards")
+            values["t"] -= values["t"] >> 31 << 32  # -1 for a reset alone, as in tables of fixed width
             values |= {"reward": sum(rewards[1:], rewards[0])}
             values |= zip(shape.per_learner("reward"), rewards, strict=False)
         elif not values.pop("seeded"):
@@ -52,6 +53,7 @@ def message_payload(topic: Topic, position: int, row: JsonView, shape: Shape) ->
         names = {field.name for field in of_message} & shape.spaces.keys()
         fields |= {name: shape.spaces[name].value(row) for name in names}
         if topic.message is schema.TRANSITION:
+            fields["t"] %= 1 << 32
             fields["rewards"] = [row[name] for name in shape.per_learner("reward") or ["reward"]]
         elif row["seed"] is None:
             del fields["seed"]

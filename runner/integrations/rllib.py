@@ -34,7 +34,6 @@ from runner.loops.vector import (
     described_vector,
     first_of,
     record_vector,
-    require_fixed,
 )
 from runner.recording.maker import EnvironmentMaker
 from runner.replay.games import MultiAgent
@@ -292,7 +291,6 @@ def _described(make: str, env_runner: Any) -> tuple[Described, EnvironmentMaker]
     mode = autoreset_mode_of(envs, None)
     with first_of(envs) as first:
         described = described_vector(envs, first)
-        require_fixed(described)
         return replace(described, environments=1), vector_maker_of(envs, first, mode, make)
 
 

@@ -13,7 +13,7 @@ from runner.loops.description import Described
 from runner.loops.values import require_reset
 from runner.loops.vector_rows import ResetsBetween, VectorRows
 from runner.recording.episode_log import Flags
-from runner.recording.gym_values import fitted, put_fitted, put_unknown
+from runner.recording.gym_values import fitted, put_unknown
 from runner.recording.recorder import Recorder
 
 
@@ -65,9 +65,9 @@ class BatchRows(VectorRows):
             self._first_action(actions)
             self._make_room()
         steps, n = rewards.shape
-        own = fitted(self._action_leaves, actions, (steps, n))
-        seen = fitted(self._observation_leaves, observations, (steps, n))
-        last = None if finals is None else fitted(self._observation_leaves, finals, (steps, n))
+        own = fitted(self._action_leaves, actions, (steps, n), self._action_dtype)
+        seen = self._fitted(observations, steps, n)
+        last = None if finals is None else self._fitted(finals, steps, n)
         if self._mode == AutoresetMode.DISABLED:
             over = np.vstack([self.over, (terminated | truncated)[:-1]])
             if over.any():
@@ -83,17 +83,16 @@ class BatchRows(VectorRows):
                 self._abandon(np.flatnonzero(self._over))
             count = min(self._room - row, steps - done)
             rows, part = slice(row, row + count), slice(done, done + count)
-            put_fitted(self._action_leaves, own, part, self._actions[rows])
-            put_fitted(self._observation_leaves, seen, part, self._observations[rows])
+            self._actions[rows], self._observations[rows] = own[part], seen[part]
             self._rewards[rows] = rewards[part]
             self._terminated[rows], self._truncated[rows] = terminated[part], truncated[part]
             if self._mode == AutoresetMode.SAME_STEP:
                 at, which = np.nonzero(self._terminated[rows] | self._truncated[rows])
-                final = np.empty(len(which), self._observation_dtype)
                 if last is None:
+                    final = np.empty(len(which), self._observation_dtype)
                     put_unknown(self._observation_leaves, final)
                 else:
-                    put_fitted(self._observation_leaves, last, (done + at, which), final)
+                    final = last[done + at, which]
                 self._finals.append((row + at, which, final))
                 none, after = [None] * len(which), self._observations[row + at, which]
                 self._block_resets.append(ResetsBetween(row + at + 1, which, after, none, none))
@@ -105,8 +104,5 @@ class BatchRows(VectorRows):
 
     def continues_with(self, observations: object) -> bool:
         """Return whether these are the observations [N, ...] after the last step or reset of the phase."""
-        now = np.zeros(self._n, self._observation_dtype)
-        put_fitted(
-            self._observation_leaves, fitted(self._observation_leaves, observations, (self._n,)), ..., now
-        )
-        return now.tobytes() == self._now().tobytes()
+        given, now = self._fitted(observations, self._n), self._now()
+        return bool((given == now).all()) if now.dtype.hasobject else given.tobytes() == now.tobytes()

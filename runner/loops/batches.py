@@ -21,7 +21,7 @@ from runner.loops.makers import NAME_MAKE, checked_make, vector_maker_of
 from runner.loops.options import Options, RunOptions, options_of
 from runner.loops.recorded import Recorded
 from runner.loops.values import as_array, check_phase
-from runner.loops.vector import autoreset_mode_of, described_vector, first_of, require_fixed
+from runner.loops.vector import autoreset_mode_of, described_vector, first_of
 from runner.recording.episode_log import Flags
 from runner.recording.gym_values import element_of
 from runner.util.arrays import Array
@@ -74,7 +74,6 @@ class RecordedBatches(Recorded[BatchRows]):
         """Begin the run, now that the environments and their spaces are known."""
         with first_of(envs) as first:
             described = described_vector(envs, first)
-            require_fixed(described)
             maker = vector_maker_of(envs, first, self._mode, self._make)
         if isinstance(envs, NamedEnvironments):
             maker = replace(maker, reason=self.why_not_made)
@@ -217,7 +216,7 @@ class RecordedBatches(Recorded[BatchRows]):
             if any(part.dtype.kind != "f" for part in _arrays(observations)):
                 raise ConfigError(
                     "final_observations: found none, expected the last observations of episodes, "
-                    "[T, N, ...]: those of whole numbers cannot be recorded as unknown"
+                    "[T, N, ...]: those of whole numbers or text cannot be recorded as unknown"
                 )
             self._loop.warn_once(
                 "The last observations of episodes are recorded as NaN, because the environments were reset "
@@ -267,7 +266,7 @@ def record_batches(
         options: the arguments that `record` has too, except those of infos and frames.
 
     Raises:
-        EnvironmentNotUsable: a space cannot be recorded, or has values of varying size.
+        EnvironmentNotUsable: a space cannot be recorded.
         ConfigError: an argument cannot be used.
         StorageError: the recordings folder cannot be written.
     """
@@ -287,7 +286,9 @@ def _numpy(values: object) -> object:
         return {key: _numpy(part) for key, part in values.items()}
     if isinstance(values, tuple):
         return tuple(map(_numpy, values))
-    return as_array(values)
+    array = as_array(values)
+    # NumPy's own texts have no zeros at the end.
+    return np.array(values, object) if array.dtype.kind in "US" and array is not values else array
 
 
 def _arrays(values: object) -> Iterator[Array]:
@@ -321,6 +322,10 @@ def _derived(batch: object) -> Space:
         return spaces.Tuple([_derived(part) for part in batch])
     array = np.asarray(batch)
     kind, shape = array.dtype, array.shape[2:]
+    if kind.kind not in "biuf":
+        raise ConfigError(
+            f"found a batch of {kind}, whose space is unknown: pass observation_space and action_space"
+        )
     if kind.kind == "b":
         return spaces.Box(0, 1, shape, np.uint8)
     if kind.kind in "iu":

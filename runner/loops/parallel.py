@@ -18,7 +18,7 @@ from runner.loops.options import RecordOptions, options_of
 from runner.loops.recorded import RecordedAlone, require_pictures
 from runner.loops.single_rows import AgentRows
 from runner.loops.values import as_given, check_phase
-from runner.loops.vector import by_field, require_fixed
+from runner.loops.vector import by_field
 from runner.recording.spaces import Value
 from runner.replay.games import ByAgent, GameStepResult, Turns, is_in_turns
 from runner.replay.stepping import game_spaces
@@ -206,12 +206,10 @@ def described_game(env: Any) -> Described:
             raise EnvironmentNotUsable(f"found the agent {agent!r}, expected a name or a number for each.")
     observation, action = game_spaces(env)
     name = env.metadata.get("name") if isinstance(getattr(env, "metadata", None), Mapping) else None
-    described = Described(
+    return Described(
         kind=kind_of(observation, action),
         observation=observation,
         action=action,
         env_id=str(name or type(env).__name__),
         agents=agents,
     )
-    require_fixed(described)
-    return described

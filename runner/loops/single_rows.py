@@ -202,6 +202,8 @@ class AgentRows(Rows):
         paid = np.array([float(rewards.get(agent, 0.0)) for agent in self._agents])
         endings = [over and any(flags.values()) for flags in (terminated, truncated)]
         self._scratch[row] = (paid, *endings, over)
+        if self._are_bytes:
+            self._hold(self._block["action"][row], self._block["next_observation"][row])
         self._count(over)
 
     def _outcomes(self, n: int) -> tuple[NDArray[np.void], Flags | bool]:
@@ -209,6 +211,8 @@ class AgentRows(Rows):
 
     def _put_reset(self, observation: Any, seed: int | None) -> None:  # noqa: ARG002
         self._first(len(self._reset_rows), observation)
+        if self._are_bytes:
+            self._hold(self._reset_block["observation"][len(self._reset_rows)])
 
     def _mask(self, flags: Mapping[str, bool]) -> int:
         return sum(bool(flags.get(agent)) << i for i, agent in enumerate(self._agents))

@@ -221,7 +221,7 @@ def record_vector(
             show the next episode at the ends of episodes.
 
     Raises:
-        EnvironmentNotUsable: a space cannot be recorded, or has values of varying size.
+        EnvironmentNotUsable: a space cannot be recorded.
         ConfigError: an argument cannot be used.
         StorageError: the recordings folder cannot be written.
     """
@@ -233,7 +233,6 @@ def record_vector(
     mode = autoreset_mode_of(envs, autoreset_mode)
     with first_of(envs) as first:
         described = described_vector(envs, first)
-        require_fixed(described)
         maker = vector_maker_of(envs, first, mode, checked_make(make))
         watch = VectorWatch(envs, first, mode, sparse=options.get("steps") == "actions")
     frames_every = options.get("frames_every", 0)
@@ -307,15 +306,6 @@ def _by_environment(infos: Info | Sequence[Info]) -> Mapping[str, Value]:
     if isinstance(infos, Mapping):
         return infos
     return by_field({str(i): info for i, info in enumerate(infos)})
-
-
-def require_fixed(described: Described) -> None:
-    """Refuse spaces whose values vary in size, before a run is created."""
-    if described.kind == "variable":
-        raise EnvironmentNotUsable(
-            "found a space whose values vary in size, such as Text or Sequence; of several environments or "
-            "agents at once only spaces of fixed size can be recorded."
-        )
 
 
 def by_field(infos: Mapping[str, Info]) -> dict[str, Info]:

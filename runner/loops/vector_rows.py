@@ -19,8 +19,8 @@ from runner.loops.rows import MAX_SEED, Rows
 from runner.loops.values import require_reset, warn_user
 from runner.recording import schema
 from runner.recording.episode_log import Columns, EpisodeLog, Episodes, Flags, Steps
-from runner.recording.gym_values import element_of, filler, leaves_of
-from runner.recording.recorder import Recorder
+from runner.recording.gym_values import element_of, filler, fitted, leaves_of
+from runner.recording.recorder import BLOCK_BYTES, Recorder
 from runner.recording.reset_states import ResetState
 from runner.recording.schema import Topic
 from runner.replay.stepping_vector import final_observations
@@ -81,6 +81,8 @@ class VectorRows:
         self._room = 0
         self._filled = 0
         """Rows of the block that are in use, of `_room`."""
+        self._held = 0
+        """The bytes of the block's values of varying size."""
         self._over = np.zeros(n, np.bool_)
         self._state = np.full(n, -self._state_start)
         """The states before the first row, where both spaces are discrete."""
@@ -109,8 +111,8 @@ class VectorRows:
         rows = max(1, min(_MAX_STEPS, self._recorder.capacity(self._topics.steps) // n))
         self._room = rows
         records = self._recorder.dtype(self._topics.steps)
-        action = self._action_leaves[0].base if self._discrete else records["action"]
-        self._actions = np.empty((rows, n), action)
+        self._action_dtype = self._action_leaves[0].base if self._discrete else records["action"]
+        self._actions = np.empty((rows, n), self._action_dtype)
         self._observations = np.empty((rows, n), self._observation_dtype)
         self._rewards = np.empty((rows, n))
         self._ends = np.empty((rows, 2, n), np.bool_)
@@ -201,6 +203,9 @@ class VectorRows:
         if states:
             self._autoreset_states[row] = states
         self._filled = row + 1
+        if self._observations.dtype.hasobject:
+            self._held += sum(map(len, [*self._actions[row], *self._observations[row]]))
+            is_full |= self._held > BLOCK_BYTES
         if is_full:
             self.commit()
             self._recorder.write_if_full()
@@ -213,6 +218,10 @@ class VectorRows:
             self._finals.append((row, which, self._last[: len(row)].copy()))
             self._block_resets.append(ResetsBetween(row + 1, which, after, none, none))
             self._ended = []
+
+    def _fitted(self, observations: object, *batch: int) -> Array:
+        """Return a batch of observations as they are recorded."""
+        return fitted(self._observation_leaves, observations, batch, self._observation_dtype)
 
     def _now(self) -> Array:
         """Return the observations [N] after the last step or reset of each environment."""
@@ -235,8 +244,7 @@ class VectorRows:
         chosen = np.flatnonzero(which)
         own_seeds = [seeds[i] if len(seeds) else None for i in chosen.tolist()]
         own_states = [states.get(i) for i in chosen.tolist()]
-        now = np.zeros(self._n, self._observation_dtype)
-        filler(self._observation_leaves, now[np.newaxis], (self._n,))(0, observation)
+        now = self._fitted(observation, self._n)
         over = self.over
         if self._filled and over[chosen].all():
             after = np.full(len(chosen), self._filled)
@@ -279,9 +287,7 @@ class VectorRows:
         self._put_ends(episodes.ended)
         self._put_block_resets(np.vstack([episodes.number, self._log.episode]), only_reset, first)
         self._over = over_after
-        self._filled = 0
-        self._counted = 0
-        self._ended_here = 0
+        self._filled = self._held = self._counted = self._ended_here = 0
         self._block_resets, self._finals, self._autoreset_states = [], [], {}
 
     def _put_records(self, episodes: Episodes, first: int) -> None:

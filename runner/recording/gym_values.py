@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from functools import cache
 from typing import Any, Final
 
@@ -39,6 +39,8 @@ class Leaf:
         self._on_rounded = on_rounded
         self.name = what + "".join(f"[{key!r}]" for key in part.keys)
         self._what = what
+        self.blank = encode_text("") if part.dtype is None else bytes(part.dtype.itemsize)
+        """The bytes of the value of an agent that has none."""
         if part.dtype is None:
             return
         self.base = np.dtype(part.dtype.base.str)
@@ -82,6 +84,20 @@ class Leaf:
                     "space. This warning is given once."
                 )
         return rounded
+
+    def pieces(self, values: Value, batch: tuple[int, ...] = ()) -> list[bytes]:
+        """Return the bytes of a value, or of each of a batch of them.
+
+        Raises:
+            TypeError, ValueError: it is no such value, or no batch of this shape.
+        """
+        if batch:
+            if isinstance(values, str | bytes | Mapping) or len(values) != batch[0]:
+                raise ValueError(f"found {type(values).__name__}, expected a batch of {batch[0]}")
+            return [piece for value in values for piece in self.pieces(value, batch[1:])]
+        if self.part.text is not None:
+            return [encode_text(self.part.text(values))]
+        return [np.asarray(self.fit(values), self.base, order="C").tobytes()]
 
     def refused(self, reason: object) -> RecordingError:
         """Return the error for a value that is not of the space."""
@@ -129,11 +145,10 @@ def filler(leaves: Sequence[Leaf], column: Array, batch: tuple[int, ...] = ()) -
 
 
 def _bytes_filler(leaves: Sequence[Leaf], column: Array, batch: tuple[int, ...]) -> Put:
-    places = list(np.ndindex(*batch))
+    places = column.reshape(len(column), -1)
 
     def put(row: int, value: Value) -> None:
-        for place in places:
-            column[row, *place] = value_bytes(leaves, value, place)
+        places[row] = bytes_of(leaves, value, batch)
 
     return put
 
@@ -163,21 +178,13 @@ def _column_of(leaf: Leaf, column: NDArray[Any]) -> NDArray[Any]:
     return column
 
 
-def fitted(leaves: Sequence[Leaf], value: object, batch: tuple[int, ...]) -> list[Array]:
-    """Return a batch of values of a space as an array for each leaf, [*batch, ...]."""
-    arrays = []
-    for leaf in leaves:
-        try:
-            arrays.append(leaf.fit(leaf.part.of(value), batch))
-        except (TypeError, ValueError, LookupError, OverflowError) as error:
-            raise leaf.refused(error) from error
-    return arrays
-
-
-def put_fitted(leaves: Sequence[Leaf], arrays: Sequence[Array], at: Any, column: Array) -> None:
-    """Put the part of `fitted` arrays that an index chooses into a column of values of the space."""
-    for leaf, array in zip(leaves, arrays, strict=True):
-        _column_of(leaf, column)[...] = array[at]
+def fitted(
+    leaves: Sequence[Leaf], value: object, batch: tuple[int, ...], dtype: np.dtype[np.generic]
+) -> Array:
+    """Return a batch of values of a space as they stand in a column of this dtype, [*batch, ...]."""
+    column = np.empty((1, *batch), dtype)
+    filler(leaves, column, batch)(0, value)
+    return np.asarray(column[0])
 
 
 def put_unknown(leaves: Sequence[Leaf], column: Array) -> None:
@@ -196,37 +203,45 @@ def filler_by_agent(
     leaves: Mapping[str, Sequence[Leaf]], column: Array
 ) -> Callable[[int, Mapping[str, Value]], None]:
     """Return a function that puts the values of some agents into a row, and zeros for the others."""
-    fillers = {agent: filler(own, column) for agent, own in leaves.items()}
-    zeros = np.zeros((), column.dtype)
+    fillers = {} if column.dtype.hasobject else {agent: filler(own, column) for agent, own in leaves.items()}
+    every, zeros = [leaf for own in leaves.values() for leaf in own], np.zeros((), column.dtype)
 
     def put(row: int, values: Mapping[str, object]) -> None:
-        column[row] = zeros
-        for agent, value in values.items():
-            if agent not in fillers:
-                names = ", ".join(map(str, fillers))
+        for agent in values:
+            if agent not in leaves:
+                names = ", ".join(map(str, leaves))
                 raise RecordingError(f"found the agent {agent!r}, expected one of possible_agents: {names}")
-            fillers[agent](row, {agent: value})
+        column[row] = zeros if fillers else bytes_of(every, values, agents=values)[0]
+        for agent in values if fillers else ():
+            fillers[agent](row, {agent: values[agent]})
 
     return put
 
 
-def value_bytes(leaves: Sequence[Leaf], value: object, place: tuple[int, ...] = ()) -> bytes:
-    """Return a value of a space, or the one at a place of a batch, as its bytes in a recording."""
-    pieces = []
+def bytes_of(
+    leaves: Sequence[Leaf],
+    value: object,
+    batch: tuple[int, ...] = (),
+    agents: Container[object] | None = None,
+) -> list[bytes]:
+    """Return the values of a batch, nested as their space, each as its bytes in a recording.
+
+    Args:
+        agents: of a game, those that have a value; None for other spaces.
+    """
+    columns = []
     for leaf in leaves:
         try:
-            inside = leaf.part.of(value)
-            for i in place:
-                inside = inside[i]
-            if leaf.part.text is not None:
-                pieces.append(encode_text(leaf.part.text(inside)))
+            if agents is None or leaf.part.keys[0] in agents:
+                columns.append(leaf.pieces(leaf.part.of(value), batch))
             else:
-                pieces.append(np.asarray(leaf.fit(inside), leaf.base, order="C").tobytes())
+                columns.append([leaf.blank])
         except (TypeError, ValueError, LookupError, AttributeError, OverflowError, RecursionError) as error:
             raise leaf.refused(error) from error
-    if (size := sum(map(len, pieces))) > MAX_VALUE_BYTES:
+    whole = [b"".join(pieces[k] for pieces in columns) for k in range(math.prod(batch))]
+    if (size := max(map(len, whole), default=0)) > MAX_VALUE_BYTES:
         raise leaves[0].refused(f"it takes {size:,} bytes, expected at most {MAX_VALUE_BYTES:,}")
-    return b"".join(pieces)
+    return whole
 
 
 def put_chosen(leaves: Sequence[Leaf], values: object, into: Array, which: NDArray[np.intp]) -> None:

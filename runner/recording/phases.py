@@ -62,7 +62,7 @@ class Phase:
         elif episode == ended and stride == 1:
             last = self.episodes.array(ended - 1, ended)
             start, stop = int(last[0]["last_step"]) + 1 if len(last) else 0, total
-            for first in self.steps.blocks(start, start + 1) if self.steps.dtype is not None else ():
+            for first in self.steps.numbered(range(start, start + 1)):
                 # A vector of one environment may have only reset it at first.
                 start += int(np.count_nonzero(first["t"] == schema.RESET_ONLY))
         if not 0 <= start < stop <= total:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from runner.environments.gym_types import Space
 from runner.errors import CannotRedo, shortened
-from runner.recording.gym_spaces import describe_space, value_of
+from runner.recording.gym_spaces import describe_space, parts_of, value_of
 from runner.recording.gym_values import Put, filler, filler_by_agent, leaves_by_agent, leaves_of
 from runner.recording.reader import Recording
 from runner.recording.reset_states import ResetState
@@ -138,6 +138,11 @@ class Stepper(ABC):
                     f"The environment has another {name} space than recorded: found {texts[1]}, expected "
                     f"{texts[0]}. It is another environment, or another version."
                 )
+
+    def _decoded_actions(self, rows: NDArray[np.void]) -> Iterator[Value]:
+        """Yield the actions of recorded steps whose size varies."""
+        description, where = self._recording.spaces["action"], f"{self._recording.path}: an action"
+        return (decode(description, data, where) for data in rows["action"])
 
     def _restore(self, state: ResetState, base: Any) -> int | None:
         """Bring random generators to a recorded state; return the seed that `reset` needs instead, if any."""
@@ -268,9 +273,7 @@ class EnvironmentStepper(RowStepper):
             return (rows["action"].astype(np.int64) + start).tolist()  # type: ignore[no-any-return]
         if not self._recording.has_varying_values:
             return values_in(self.action_space, np.array(rows["action"]))
-        description = self._recording.spaces["action"]
-        where = f"{self._recording.path}: an action"
-        return [keyed(self.action_space, decode(description, data, where)) for data in rows["action"]]
+        return [keyed(self.action_space, action) for action in self._decoded_actions(rows)]
 
     def take(self, actions: Sequence[Value], first: int, stop: int, results: Results, put: Put) -> None:
         """Take the steps of these rows, and fill them in."""
@@ -312,6 +315,15 @@ class GameStepper(RowStepper):
         """Return the actions of recorded steps as the environment takes them."""
         agents = self.env.possible_agents
         own: Any = self.action_space
+        if self._recording.has_varying_values:
+            return [
+                {
+                    agent: keyed(own[agent], action[str(agent)])
+                    for i, agent in enumerate(agents)
+                    if acted >> i & 1
+                }
+                for action, acted in zip(self._decoded_actions(rows), rows["acted"].tolist(), strict=True)
+            ]
         columns = {agent: values_in(own[agent], np.array(rows["action"][str(agent)])) for agent in agents}
         return [
             {agent: columns[agent][row] for i, agent in enumerate(agents) if acted >> i & 1}
@@ -360,6 +372,16 @@ def values_in(space: Space, column: NDArray[Any]) -> Sequence[Value]:
         columns = [values_in(part, np.array(column[str(i)])) for i, part in enumerate(space.spaces)]
         return list(zip(*columns, strict=True))
     return list(column)  # whole numbers as NumPy's, for which `Discrete.contains` takes a third of the time
+
+
+def batched(space: Space, values: Sequence[Value]) -> Value:
+    """Return the values of many environments as a vector with this single action space takes them."""
+    if isinstance(space, spaces.Dict):
+        return {key: batched(part, [own[key] for own in values]) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(batched(part, [own[i] for own in values]) for i, part in enumerate(space.spaces))
+    (part,) = parts_of(space, "the action space")
+    return tuple(values) if part.dtype is None else np.array(values)
 
 
 def keyed(space: Space, value: Value) -> Value:

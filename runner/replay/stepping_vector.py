@@ -16,8 +16,7 @@ from runner.recording.reader import Recording
 from runner.recording.spaces import Value
 from runner.replay.recorded import RecordedReset, calls
 from runner.replay.redone import Frame
-from runner.replay.stepping import Results, Stepper, values_in
-from runner.util.arrays import Array
+from runner.replay.stepping import Results, Stepper, batched, keyed, values_in
 from runner.util.processes import raise_if_out_of_memory
 
 _Numbered = tuple[int, RecordedReset]
@@ -61,8 +60,7 @@ class VectorStepper(Stepper):
         by_time: dict[int, list[_Numbered]] = {}
         for number, (time, reset) in enumerate(resets):
             by_time.setdefault(time, []).append((number, reset))
-        column = self._raw_actions(rows)
-        actions = values_in(self.action_space, column.reshape(times, n, *column.shape[1:]))
+        actions = self._actions(rows, times)
         only_reset = (rows["t"] == schema.RESET_ONLY).reshape(times, n)
         try:
             for time in range(times):
@@ -101,11 +99,16 @@ class VectorStepper(Stepper):
             raise CannotRedo("The vector environment draws no pictures of its environments.")
         return pictures[self._drawn]
 
-    def _raw_actions(self, rows: NDArray[np.void]) -> Array:
-        if not self._recording.has_states:
-            return np.array(rows["action"])
-        start = int(self.action_space.start)  # type: ignore[attr-defined]
-        return np.asarray(rows["action"].astype(np.int64) + start)
+    def _actions(self, rows: NDArray[np.void], times: int) -> Sequence[Value]:
+        """Return the actions of all environments as the vector takes them, for each of its steps."""
+        space, n = self.action_space, self._n
+        if self._recording.has_varying_values:
+            values = [keyed(space, action) for action in self._decoded_actions(rows)]
+            return [batched(space, values[time * n : time * n + n]) for time in range(times)]
+        column = np.array(rows["action"])
+        if self._recording.has_states:
+            column = column.astype(np.int64) + int(space.start)  # type: ignore[attr-defined]
+        return values_in(space, column.reshape(times, n, *column.shape[1:]))
 
     def _reset_before(
         self, resets: Sequence[_Numbered], automatic: NDArray[np.bool_], results: Results

@@ -47,7 +47,7 @@ def transitions_of(recording: Recording, phase: str, episode: int) -> Iterator[A
             yield from block
         return
     numbers = own.episode_span(episode)
-    yield from islice(own.transitions(), numbers.start, numbers.stop)
+    yield from islice(own.transitions(), numbers.start, numbers.stop, numbers.step)
 
 
 def episode_blocks(recording: Recording, phase: str, episode: int) -> Iterator[NDArray[np.void]]:
@@ -93,7 +93,8 @@ def reset_of(recording: Recording, phase: str, episode: int) -> Any | None:
         for reset in own.reset_values():
             if reset["step"] > numbers.start:
                 break
-            last = reset
+            if reset["environment"] % numbers.step == numbers.start % numbers.step:
+                last = reset
         return last
     first, stop = (
         resets.first_from("step", number) for number in (numbers.start - 2 * numbers.step, numbers.start + 1)

@@ -92,7 +92,7 @@ def games(folder):
 
 def vectors(name):
     def make_them(folder):
-        with runner.record_vector(SyncVectorEnv([lambda: gymnasium.make(name)] * 3), folder) as rec:
+        with runner.record_vector(SyncVectorEnv([lambda: make(name)] * 3), folder) as rec:
             rec.action_space.seed(1)
             rec.reset(seed=1)
             for _ in range(120):
@@ -111,6 +111,7 @@ LOOPS = {
     "texts": lambda folder: with_everything(make("RoomsText"), folder, frames_every=9, compression="lz4"),
     "odd": lambda folder: with_everything(Odd(), folder, compression="none"),
     "vector": vectors("CartPole-v1"),
+    "vector of texts": vectors("RoomsText"),
     "vector of steps": vectors("FrozenLake-v1"),
     "game": games,
 }

@@ -31,10 +31,6 @@ def poles() -> SyncVectorEnv:
     return SyncVectorEnv([pole] * 2)
 
 
-def texts() -> SyncVectorEnv:
-    return SyncVectorEnv([lambda: Rooms(with_text=True)] * 2)
-
-
 def game() -> Any:
     from dualtaxi.parallel import DualTaxiParallelEnv
 
@@ -61,7 +57,6 @@ class Named(Rooms):
         (lambda there: runner.record(pole(), there, name=3), "name: found 3, expected text"),
         (lambda there: runner.record(pole(), into=pole(), phase="eval"), "found TimeLimit, expected what"),
         (lambda there: runner.record(pole(), there, into=pole()), "found more arguments than phase"),
-        (lambda there: runner.record_vector(texts(), there), "found a space whose values vary in size"),
         (lambda there: runner.record(Named(), there), r"found a part called 'a\\nb'"),
     ],
 )
