@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Iterator
 from typing import Final
 
@@ -10,16 +9,15 @@ import numpy as np
 import pyarrow as pa
 from blake3 import blake3
 
-from runner.archive.columns import Shape, checked_batch, record_bytes, shape_of
-from runner.archive.layout import Records, Table
+from runner.archive.columns import Shape, Table, shape_of
 from runner.archive.manifest import Entry
-from runner.archive.rows import message_payload, message_row
+from runner.archive.rows import WHOLE, batch_of, bytes_of, differing, records_of
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.reader import Recording
-from runner.recording.schema import STEP_NANOSECONDS, Topic
-from runner.util.values import Json
+from runner.recording.schema import Topic
+from runner.util.arrays import Records
 
 _ROWS_AT_ONCE: Final = 1024
 _BYTES_AT_ONCE: Final = 4 << 20
@@ -30,10 +28,7 @@ class Batches:
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self._where = str(recording.path)
-        mdp = recording.mdp if recording.tabular else None
-        extras = tuple(recording.extra_layouts)
-        self.shape: Shape = shape_of(recording.run, mdp, self._where, extras)
+        self.shape: Shape = shape_of(recording, tuple(recording.extra_layouts))
         self._hashes = {topic.name: blake3() for topic in recording.topics}
         self._counts = dict.fromkeys(self._hashes, 0)
 
@@ -53,81 +48,76 @@ class Batches:
 
     def of(self, table: Table) -> Iterator[pa.RecordBatch]:
         """Yield the rows of a table in the order in which they were recorded."""
-        if table.topics[0] in self.shape.dtypes:
-            yield from (batch for _, _, batch in self.blocks(table))
-            return
-        rows: list[Json] = []
-        size = 0
-        merged_rows = heapq.merge(*map(self._rows, table.topics), key=lambda pair: pair[0]["position"])
-        for row, message_size in merged_rows:
-            rows.append(row)
-            size += message_size
-            if len(rows) == _ROWS_AT_ONCE or size > _BYTES_AT_ONCE:
-                yield pa.RecordBatch.from_pylist(rows, table.columns)
-                rows, size = [], 0
-        if rows:
-            yield pa.RecordBatch.from_pylist(rows, table.columns)
+        return (batch for _, _, batch in self.blocks(table))
 
     def blocks(self, table: Table) -> Iterator[tuple[Topic, Records, pa.RecordBatch]]:
-        """Yield the messages of a fixed-width table: their topic, as records and as columns."""
-        train, evaluation = table.topics
-        for topic, records in _merged(self._recording, (train, evaluation)):
-            batch = checked_batch(topic, records, self.shape, self._where)
-            self._count(topic, record_bytes(records), len(records))
-            yield topic, records, batch
+        """Yield the messages of a table by time: their topic, as records and as columns."""
+        sources = {topic: self.records(topic) for topic in table.topics}
+        heads = {
+            topic: block for topic, blocks in sources.items() if (block := next(blocks, None)) is not None
+        }
+        while heads:
+            topic = min(heads, key=lambda topic: int(heads[topic]["log_time"][0]))
+            block = heads.pop(topic)
+            others = [other["log_time"][0] for other in heads.values()]
+            n = int(np.searchsorted(block["log_time"], min(others), "right")) if others else len(block)
+            batch = self._checked(table, topic, block[:n], self._counts[topic.name])
+            self.count(topic, bytes_of(block[:n]), n)
+            yield topic, block[:n], batch
+            rest = block[n:] if n < len(block) else next(sources[topic], None)
+            if rest is not None:
+                heads[topic] = rest
 
-    def messages(self, topic: Topic) -> Iterator[tuple[int, bytes]]:
-        """Yield position and payload of a topic's messages."""
-        for time, payload in self._recording.table(topic).messages():
-            position, rest = divmod(time, STEP_NANOSECONDS)
-            if rest:
-                raise self._unarchivable(topic, f"at {time} ns")
-            self._count(topic, message_record(topic, time, payload), 1)
-            yield position, payload
+    def records(self, topic: Topic) -> Iterator[Records]:
+        """Yield the messages of a topic as records, `WHOLE` ones if they vary in size."""
+        if topic.message is schema.EXTRA:
+            yield from self._recording.phase(topic.phase).extras.blocks()
+        elif topic in self.shape.dtypes:
+            yield from self._recording.table(topic).blocks()
+        else:
+            messages, size = [], 0
+            for time, payload in self._recording.table(topic).messages():
+                messages.append((time, message_record(topic, time, payload)))
+                size += len(payload)
+                if len(messages) == _ROWS_AT_ONCE or size > _BYTES_AT_ONCE:
+                    yield np.array(messages, WHOLE)
+                    messages, size = [], 0
+            if messages:
+                yield np.array(messages, WHOLE)
 
-    def compare(self, topic: Topic, position: int, restored: bytes, payload: bytes) -> None:
-        """Compare a payload with the one restored from its columns."""
-        if restored != payload:
-            raise self._unarchivable(topic, f"after {position} steps")
-
-    def _unarchivable(self, topic: Topic, place: str, why: str = "") -> RecordingError:
-        """Return the error for a message that columns cannot represent."""
-        return RecordingError(
-            f"{self._where}: {topic.name} {place}: found a message that no recorder writes, so that it "
-            f"cannot be archived{why}; `dualtaxi verify` names the damage."
-        )
-
-    def _rows(self, topic: Topic) -> Iterator[tuple[Json, int]]:
-        """Yield a row for each message, and the message's size in bytes."""
-        for position, payload in self.messages(topic):
-            try:
-                row = message_row(topic, payload, self.shape)
-                restored = message_payload(topic, position, row, self.shape)
-            except (RecordingError, ValueError, LookupError) as error:
-                raise self._unarchivable(topic, f"after {position} steps", f" ({error})") from error
-            self.compare(topic, position, restored, payload)
-            yield row | {"run_id": self.shape.run_id, "position": position}, len(payload)
-
-    def _count(self, topic: Topic, records: bytes | memoryview, count: int) -> None:
+    def count(self, topic: Topic, records: bytes | memoryview, count: int) -> None:
+        """Count and hash messages, given as whole message records."""
         self._hashes[topic.name].update(records)
         self._counts[topic.name] += count
 
+    def _checked(self, table: Table, topic: Topic, records: Records, number: int) -> pa.RecordBatch:
+        """Return the columns of message records, which turn back into exactly these records.
 
-def _merged(recording: Recording, topics: tuple[Topic, Topic]) -> Iterator[tuple[Topic, Records]]:
-    """Yield the messages of two topics of one size, of training and evaluation, as they were recorded."""
-    heads = []
-    for topic in topics:
-        is_extra = topic.message is schema.EXTRA
-        blocks = recording.phase(topic.phase).extras.blocks() if is_extra else recording.table(topic).blocks()
-        if (block := next(blocks, None)) is not None:
-            heads.append((topic, block, blocks))
-    while len(heads) == 2:
-        heads.sort(key=lambda head: int(head[1]["log_time"][0]))
-        (topic, block, blocks), (_, other, _) = heads
-        n = max(int(np.searchsorted(block["log_time"], other["log_time"][0])), 1)
-        yield topic, block[:n]
-        rest = block[n:] if n < len(block) else next(blocks, None)
-        heads[:1] = [] if rest is None else [(topic, rest, blocks)]
-    for topic, block, blocks in heads:
-        yield topic, block
-        yield from ((topic, further) for further in blocks)
+        Args:
+            number: that of the first message.
+
+        Raises:
+            RecordingError: they do not: a message has what no recorder writes.
+        """
+        why = ""
+        try:
+            batch = batch_of(table, topic, records, self.shape)
+            restored = list(records_of(table, topic, batch, self.shape))
+            if [part.dtype for part in restored] == [records.dtype]:
+                differs = differing(records, restored[0])
+                if not differs.any():
+                    return batch
+                number += int(differs.argmax())
+        except (RecordingError, ValueError, LookupError) as error:
+            if len(records) > 1:  # one by one, to name the message
+                for k in range(len(records)):
+                    self._checked(table, topic, records[k : k + 1], number + k)
+            why = f" ({error})"
+        raise self.unarchivable(topic, number, why)
+
+    def unarchivable(self, topic: Topic, number: int, why: str = "") -> RecordingError:
+        """Return the error for a message that columns cannot represent."""
+        return RecordingError(
+            f"{self._recording.path}: message {number} of {topic.name} has what no recorder writes, so "
+            f"that it cannot be archived{why}; `dualtaxi verify` names the damage."
+        )

@@ -9,19 +9,13 @@ table, so that tables of many runs can be read as one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Final
 
-import numpy as np
 import pyarrow as pa
-from google.protobuf.descriptor_pb2 import FieldDescriptorProto
-from numpy.typing import NDArray
 
 from runner.recording import schema
-from runner.recording.schema import Topic
-
-Records = NDArray[np.void]
+from runner.recording.schema import MessageType
 
 FORMAT: Final = "dualtaxi archive"
 VERSION: Final = 1
@@ -61,80 +55,83 @@ TEXT: Final = pa.dictionary(pa.int8(), pa.string())
 """Repeated text: a category in pandas and Polars, plain text in DuckDB."""
 
 
-def _numbers(topic: Topic) -> pa.Schema:
-    kinds = {"d": pa.float64(), "q": pa.int64()}
-    fields = [("run_id", TEXT), ("position", pa.int64())]
-    for one in topic.message.fields:
-        kind = kinds["d" if one.kind == FieldDescriptorProto.TYPE_DOUBLE else "q"]
-        fields.append((one.stored_name, pa.list_(kind) if one.repeated else kind))
-    return pa.schema(fields)
-
-
-_PLACED: Final = (("run_id", TEXT), ("position", pa.int64()))
-PLACED_IN_PHASE: Final = (("run_id", TEXT), ("phase", TEXT), ("position", pa.int64()))
-_LOGGED: Final = (("name", pa.string()), ("step", pa.int64()), ("episode", pa.int64()))
-SCHEMAS: Final = {
-    TRAIN_METRICS: _numbers(schema.TRAIN_METRICS_TOPIC),
-    EVAL_METRICS: _numbers(schema.EVAL_METRICS_TOPIC),
-    OPTIMALITY: _numbers(schema.OPTIMALITY_TOPIC),
-    LOG: pa.schema([*_PLACED, *((name, pa.string()) for name in ("name", "level", "message"))]),
-    CLOCK: _numbers(schema.CLOCK_TOPIC),
-    HOST: _numbers(schema.HOST_TOPIC),
-    CONSOLE: pa.schema(
-        [
-            *_PLACED,
-            ("started", pa.float64()),
-            ("seconds", pa.float64()),
-            ("stream", pa.int64()),
-            ("line", pa.int64()),
-            ("text", pa.string()),
-        ]
-    ),
-    Q_TABLES: pa.schema(
-        [
-            *_PLACED,
-            ("step", pa.int64()),
-            ("episode", pa.int64()),
-            ("agent", pa.string()),
-            *((name, pa.int32()) for name in ("table", "states", "actions")),
-            ("blake3", pa.string()),
-            ("data", pa.binary()),
-        ]
-    ),
-    INFOS: pa.schema([*PLACED_IN_PHASE, ("step", pa.int64()), ("reset", pa.bool_()), ("json", pa.string())]),
-    SCALARS: pa.schema([*PLACED_IN_PHASE, *_LOGGED, ("value", pa.float64())]),
-    ARRAYS: pa.schema(
-        [
-            *PLACED_IN_PHASE,
-            *_LOGGED,
-            ("shape", pa.list_(pa.int64())),
-            ("dtype", pa.string()),
-            ("data", pa.binary()),
-        ]
-    ),
-    CHECKPOINTS: pa.schema(
-        [
-            *PLACED_IN_PHASE,
-            *_LOGGED,
-            ("digest", pa.string()),
-            ("size", pa.int64()),
-            ("format", pa.string()),
-        ]
-    ),
-    EXTRA_COLUMNS: pa.schema([*_PLACED, ("json", pa.string())]),
-    RESET_STATES: pa.schema(
-        [
-            *PLACED_IN_PHASE,
-            ("reset", pa.int64()),
-            ("environment", pa.int32()),
-            *((name, pa.binary()) for name in ("np_random_seed", "bit_generator", "ale_state")),
-        ]
-    ),
-    FRAMES: pa.schema(
-        [*PLACED_IN_PHASE, ("format", pa.string()), ("data", pa.binary()), (FRAME_ID, pa.string())]
-    ),
+TOPICS: Final = {
+    STEPS: ("/train/step", "/eval/step"),
+    EPISODES: ("/train/episode", "/eval/episode"),
+    TRAIN_METRICS: ("/train/metrics",),
+    EVAL_METRICS: ("/eval/metrics",),
+    OPTIMALITY: ("/eval/optimality",),
+    RESETS: ("/train/reset", "/eval/reset"),
+    INFOS: ("/train/info", "/eval/info"),
+    SCALARS: ("/scalar",),
+    ARRAYS: ("/array",),
+    FRAMES: ("/train/frame", "/eval/frame", "/image"),
+    LOG: ("/log",),
+    CLOCK: ("/clock",),
+    HOST: ("/host",),
+    CONSOLE: ("/console",),
+    CHECKPOINTS: ("/checkpoint",),
+    EXTRA_COLUMNS: ("/extra",),
+    EXTRAS: ("/train/extra", "/eval/extra"),
+    RESET_STATES: ("/train/reset_state", "/eval/reset_state"),
 }
-"""The columns of the tables that are the same in every archive."""
+"""The tables of messages in the order in which they are written, without Q-tables, and their topics."""
+FIELDS: Final[Mapping[MessageType, tuple[str, ...]]] = {
+    schema.STEP: (
+        "step",
+        "episode",
+        "t",
+        "state",
+        "action",
+        "next_state",
+        "rewards",
+        "explored",
+        "terminated",
+        "truncated",
+    ),
+    schema.TRANSITION: (
+        "step",
+        "episode",
+        "t",
+        "action",
+        "next_observation",
+        "rewards",
+        "terminated",
+        "truncated",
+        "acted",
+        "agents_terminated",
+        "agents_truncated",
+    ),
+    schema.EPISODE: (
+        "episode",
+        "last_step",
+        "length",
+        "penalties",
+        "returns",
+        "success",
+        "terminated",
+        "truncated",
+        "events",
+    ),
+    schema.RESET: ("reset", "episode", "step", "environment", "seed", "observation"),
+    schema.EXTRA: ("step", "values"),
+    schema.LOG: ("name", "level", "message"),
+    schema.SCALAR: ("phase", "name", "step", "episode", "value"),
+    schema.IMAGE: ("format", "data", FRAME_ID),
+}
+"""The fields of messages in the order of their columns; those of other messages stand in their own."""
+Q_TABLE_COLUMNS: Final = pa.schema(
+    [
+        ("run_id", TEXT),
+        ("position", pa.int64()),
+        ("step", pa.int64()),
+        ("episode", pa.int64()),
+        ("agent", pa.string()),
+        *((name, pa.int32()) for name in ("table", "states", "actions")),
+        ("blake3", pa.string()),
+        ("data", pa.binary()),
+    ]
+)
 
 LEFT_OUT_IF_EMPTY: Final = frozenset({EXTRA_COLUMNS, EXTRAS, RESET_STATES, CHECKPOINTS, CLOCK, HOST, CONSOLE})
 """The tables that an archive need not have."""
@@ -160,29 +157,6 @@ ENCODINGS: Final = {
 """The encodings of columns of steps and episodes; all others have a dictionary."""
 VALUES: Final = ("action_", "observation", "next_observation", EXTRA_PREFIX)
 """The prefixes of columns with values of spaces; floats are split by byte."""
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of messages."""
-
-    name: str
-    """Its file."""
-    topics: tuple[Topic, ...]
-    """The topics of its messages: one, or one of training and one of evaluation."""
-    columns: pa.Schema
-
-
-@dataclass(frozen=True)
-class Column:
-    """A column of fixed-width messages: how it is read from message records, and written back."""
-
-    name: str
-    type: pa.DataType
-    read: Callable[[Records], object]
-    """Returns the column, [n], of records."""
-    write: Callable[[Records, pa.Array], None] | None = None
-    """Sets the records' field; None if other columns determine it."""
 
 
 def encodings_of(columns: pa.Schema) -> dict[str, str]:

@@ -123,21 +123,19 @@ class Archive(RunDescription):
     @cached_property
     def shape(self) -> Shape:
         """The shape of the run, which determines its tables."""
-        mdp = self.mdp if self.tabular else None
-        return shape_of(self.run, mdp, str(self.folder), tuple(self._extra_layouts()))
+        return shape_of(self, tuple(self._extra_layouts()))
 
     def _extra_layouts(self) -> list[ExtraLayout]:
         count = self.count(schema.EXTRA_COLUMNS_TOPIC)
         if not count or self.can_train_again:
             return []
-        name = layout.EXTRA_COLUMNS
-        rows = [
-            row
-            for batch in self.batches(name, layout.SCHEMAS[name], count, MAX_NAMES)
+        table = shape_of(self).tables[layout.EXTRA_COLUMNS]
+        columns = [
+            (row["position"] * STEP_NANOSECONDS, row["json"])
+            for batch in self.batches(table.name, table.columns, count, MAX_NAMES)
             for row in batch.to_pylist()
         ]
-        columns = [(row["position"] * STEP_NANOSECONDS, row["json"]) for row in rows]
-        return read_layouts(columns, str(self.folder / name))
+        return read_layouts(columns, str(self.folder / table.name))
 
     def attachment(self, name: str) -> bytes:
         """Return the data of an attachment.
@@ -182,7 +180,10 @@ class Archive(RunDescription):
                             raise RecordingError(
                                 f"{path}: found {values.null_count} rows without {column}, expected none."
                             )
-                    yield batch
+                    if batch.schema.names == columns.names:
+                        yield batch
+                    else:
+                        yield batch.append_column(layout.FRAME_ID, batch["phase"].cast(pa.string()))
         except (pa.ArrowException, OSError, OverflowError, MemoryError) as error:
             raise RecordingError(f"{path}: cannot be read as a table ({error}).") from error
 

@@ -9,19 +9,19 @@ from typing import Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from blake3 import blake3
 from numpy.typing import NDArray
 
 from runner.archive import layout
-from runner.archive.columns import in_layouts, of_phase, record_bytes, records_of
-from runner.archive.layout import Records, Table
+from runner.archive.columns import Table
 from runner.archive.manifest import Entry, Manifest
 from runner.archive.reading import Archive
-from runner.archive.rows import message_payload
+from runner.archive.rows import WHOLE, bytes_of, records_of
 from runner.config.loading import recorded_packing
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES, message_record
+from runner.recording.blocks import message_record
 from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.messages import QTable, encode_q_table
 from runner.recording.pipeline import MessageBatches, Pipeline
@@ -31,11 +31,11 @@ from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
 from runner.replay.snapshots import DerivedTables
 from runner.replay.step_replay import StepReplay
+from runner.util.arrays import Records
 from runner.util.files import storage_errors
 from runner.util.values import Json
 
 _ROWS_AT_ONCE: Final = 1024
-_MAX_STEPS: Final = 2**63 // STEP_NANOSECONDS
 _MAX_PENDING: Final = 8
 """Blocks in the pipeline: as many as the recorder has of a topic."""
 
@@ -77,7 +77,7 @@ class _Restorer:
         packing = recorded_packing(archive.config)
         self._chunk_steps = packing.chunk_steps
         self._pipeline = Pipeline(file, packing, lambda: None)
-        self._batches = MessageBatches(self._send)
+        self._batches = MessageBatches(self._send_chunk)
         self._pending = threading.Semaphore(_MAX_PENDING)
         topics = archive.topics
         self._undigested = {topic: blake3() for topic in topics if not topic.digested}
@@ -92,7 +92,7 @@ class _Restorer:
                         self._file.add_metadata(name, self._archive.metadata(name))
                 for name, media_type in self._archive.attachments:
                     self._file.add_attachment(name, media_type, self._archive.attachment(name))
-            for table in self._shape.tables:
+            for table in self._shape.tables.values():
                 self._restore_table(table)
                 self._batches.flush()
         finally:
@@ -107,13 +107,11 @@ class _Restorer:
     def _restore_table(self, table: Table) -> None:
         if table.name in layout.LEFT_OUT_IF_EMPTY and not self._archive.count(*table.topics):
             return
-        if table.topics[0] not in self._shape.dtypes:
-            self._restore_messages(table)
-        elif self._archive.can_train_again and table.name == layout.STEPS:
+        if self._archive.can_train_again and table.name == layout.STEPS:
             self._restore_learning(table)
         else:
             for topic, records in self._records(table):
-                self._send_block(topic, records)
+                self._send(topic, records)
 
     def _restore_learning(self, table: Table) -> None:
         """Restore the steps of a job, and the snapshots that they make."""
@@ -123,55 +121,63 @@ class _Restorer:
         for topic, records in self._records(table):
             if topic is schema.TRAIN_STEP:
                 tables.take(records)
-            self._send_block(topic, records)
+            self._send(topic, records)
         tables.finish()
 
     def _records(self, table: Table) -> Iterator[tuple[Topic, Records]]:
         """Yield the rows of a table as records, at most as many as a chunk has."""
-        archive, topic = self._archive, table.topics[0]
-        rows = capacity_of(topic, self._shape.dtypes[topic], self._chunk_steps)
-        for batch in archive.batches(table.name, table.columns, archive.count(*table.topics), rows):
-            for topic in table.topics:
-                mine = of_phase(batch, topic.phase, f"{self._where}: {table.name}")
-                if mine.num_rows:
-                    records = records_of(topic, mine, self._shape)
-                    is_extra = topic.message is schema.EXTRA
-                    parts = in_layouts(topic, records, self._shape) if is_extra else [records]
-                    yield from ((topic, part) for part in parts)
+        archive, topics = self._archive, table.topics
+        dtype = self._shape.dtypes.get(topics[0])
+        if dtype is not None:
+            rows = capacity_of(topics[0], dtype, self._chunk_steps)
+        elif any(map(pa.types.is_binary, table.columns.types)):
+            rows = 1
+        else:
+            rows = max(1, min(BLOCK_BYTES // layout.row_bytes(table.columns), _ROWS_AT_ONCE))
+        for batch in archive.batches(table.name, table.columns, archive.count(*topics), rows):
+            for topic, mine in self._by_topic(table, batch):
+                try:
+                    yield from ((topic, records) for records in records_of(table, topic, mine, self._shape))
+                except (TypeError, ValueError, OverflowError) as error:
+                    raise RecordingError(
+                        f"{self._where}: {table.name}: {topic.name}: is invalid ({error})."
+                    ) from error
 
-    def _restore_messages(self, table: Table) -> None:
-        """Restore a table of messages that vary in size, a row each."""
-        phases = {topic.phase: topic for topic in table.topics}
-        for row in self._rows(table):
-            topic = table.topics[0] if len(phases) == 1 else phases.get(row["phase"])
-            if topic is None:
-                raise RecordingError(f"{self._where}: {table.name}: found the phase {row['phase']!r}.")
-            try:
-                payload = message_payload(topic, row["position"], row, self._shape)
-            except (TypeError, ValueError, OverflowError) as error:
-                raise RecordingError(
-                    f"{self._where}: {topic.name} after {row['position']} steps: is invalid ({error})."
-                ) from error
-            self._send_message(topic, row["position"], payload)
+    def _by_topic(self, table: Table, batch: pa.RecordBatch) -> list[tuple[Topic, pa.RecordBatch]]:
+        """Return the rows of each topic.
 
-    def _send_block(self, topic: Topic, records: Records) -> None:
-        """Send records to the file as a chunk."""
-        offsets = np.arange(len(records), dtype=np.uint64) * np.uint64(records.itemsize)
-        self._send(topic, record_bytes(records), records["log_time"], offsets)
-
-    def _send_message(self, topic: Topic, position: int, payload: bytes) -> None:
-        time = position * STEP_NANOSECONDS
-        if not 0 <= position < _MAX_STEPS or len(payload) > MAX_CHUNK_BYTES - HEADER_BYTES:
+        Raises:
+            RecordingError: there is a phase other than those of the topics.
+        """
+        if len(table.topics) == 1:
+            return [(table.topics[0], batch)]
+        phases = batch.column("phase")
+        parts = [(topic, batch.filter(pc.equal(phases, topic.phase))) for topic in table.topics]
+        if sum(part.num_rows for _, part in parts) != batch.num_rows:
             raise RecordingError(
-                f"{self._where}: {topic.name}: found {len(payload):,} bytes after {position} steps."
+                f"{self._where}: {table.name}: found phases {pc.unique(phases).to_pylist()}, "
+                f"expected {[topic.phase for topic in table.topics]}."
             )
-        if not topic.digested:
-            self._undigested[topic].update(message_record(topic, time, payload))
-        self._batches.extend(topic, [time], [payload])
-        if topic.message is schema.IMAGE or self._archive.can_train_again:
-            self._batches.flush()
+        return [(topic, part) for topic, part in parts if part.num_rows]
 
-    def _send(
+    def _send(self, topic: Topic, records: Records) -> None:
+        """Send records to the file: as a chunk, or as messages that share chunks."""
+        times = records["log_time"]
+        if records.dtype != WHOLE:
+            offsets = np.arange(len(records), dtype=np.uint64) * np.uint64(records.itemsize)
+            self._send_chunk(topic, bytes_of(records), times, offsets)
+            return
+        messages = records["message"].tolist()
+        if (longest := max(map(len, messages))) > MAX_CHUNK_BYTES:
+            raise RecordingError(f"{self._where}: {topic.name}: found a message of {longest:,} bytes.")
+        if not topic.digested:
+            self._undigested[topic].update(bytes_of(records))
+        for time, message in zip(times.tolist(), messages, strict=True):
+            self._batches.add(topic, [time], [message])
+            if topic.message is schema.IMAGE or self._archive.can_train_again:
+                self._batches.flush()
+
+    def _send_chunk(
         self, topic: Topic, records: memoryview, times: NDArray[np.uint64], offsets: NDArray[np.uint64]
     ) -> None:
         self._pipeline.raise_failure()
@@ -181,16 +187,10 @@ class _Restorer:
         self._pending.acquire()
         self._pipeline.send(topic, records, times, offsets, done=self._pending.release)
 
-    def _rows(self, table: Table) -> Iterator[Json]:
-        limit = BLOCK_BYTES // layout.row_bytes(table.columns)
-        has_bytes = any(map(pa.types.is_binary, table.columns.types))
-        n = 1 if has_bytes else max(1, min(limit, _ROWS_AT_ONCE))
-        for batch in self._archive.batches(table.name, table.columns, self._archive.count(*table.topics), n):
-            yield from batch.to_pylist()
-
     def _snapshots(self) -> Iterator[tuple[int, Json]]:
-        table = Table(layout.Q_TABLES, (schema.Q_TABLE_TOPIC,), layout.SCHEMAS[layout.Q_TABLES])
-        return ((row["step"], row) for row in self._rows(table))
+        count = self._archive.count(schema.Q_TABLE_TOPIC)
+        for batch in self._archive.batches(layout.Q_TABLES, layout.Q_TABLE_COLUMNS, count, 1):
+            yield from ((row["step"], row) for row in batch.to_pylist())
 
     def _restore_snapshot(self, tables: DerivedTables[Json], row: Json) -> None:
         """Send a snapshot: its values, or those that the steps before it give."""
@@ -211,7 +211,9 @@ class _Restorer:
             values = np.frombuffer(row["data"], "<f8").reshape(shape)
             tables.give(row["step"], row["table"], values)
         table = QTable(row["step"], row["episode"], row["agent"], row["table"], values)
-        self._send_message(schema.Q_TABLE_TOPIC, row["position"], encode_q_table(table))
+        topic, time = schema.Q_TABLE_TOPIC, row["position"] * STEP_NANOSECONDS
+        message = message_record(topic, time, encode_q_table(table))
+        self._send(topic, np.array([(time, message)], WHOLE))
 
     def _compare(self) -> None:
         """Compare what was restored with what was archived."""

@@ -1,4 +1,6 @@
-"""Values of a space as columns: one for each number if there are few, else one with the bytes of the array.
+"""Columns: how each is read from message records and written back, and the columns of a space's values.
+
+The values of a space have one column for each number if there are few, else one with the bytes of the array:
 
     Box(4,) float32              action_0, action_1, action_2, action_3
     Dict(at=Box(2,), image=Box(84, 84, 3))
@@ -10,85 +12,90 @@ Names are the path to the number: keys of `Dict`s, positions in `Tuple`s and arr
 
 from __future__ import annotations
 
-import itertools
 import math
-import struct
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Final
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
 
-from runner.archive.layout import Column, Records
-from runner.recording.spaces import Leaf, encode_text, leaves_of
-from runner.util.arrays import Array
-from runner.util.values import Json, JsonView
+from runner.recording.spaces import Leaf, Value, decode, encode_text, leaves_of, row_dtype
+from runner.util.arrays import Array, Records
 
 MAX_NUMBERS: Final = 64
 """An array with more numbers is one column of bytes."""
 MAX_COLUMNS: Final = 1024
 """In a space with more columns than this, every array is one column of bytes."""
-_LENGTH: Final = struct.Struct("<I")
 
 
 @dataclass(frozen=True)
-class _LeafColumns:
-    """The columns of a leaf: one for each number, or one for all of it."""
+class Column:
+    """A column of messages: how it is read from message records, and written back."""
 
-    leaf: Leaf
-    names: tuple[str, ...]
-    is_spread: bool
+    name: str
+    type: pa.DataType
+    read: Callable[[Records], pa.Array]
+    write: Callable[[Records, pa.Array], None] | None = None
+    """Sets the records' field; None if other columns determine it."""
 
-    @property
-    def dtype(self) -> np.dtype[np.generic]:
-        """The dtype of a value."""
-        assert self.leaf.dtype is not None
-        return self.leaf.dtype
 
-    def columns(self, field: str) -> Iterator[Column]:
-        """Yield the columns; they are read from a field of records."""
-        if self.leaf.dtype is None:
-            yield from (Column(name, pa.string(), _not_fixed) for name in self.names)
-        elif self.is_spread:
-            places = np.ndindex(self.dtype.shape)
-            yield from (self._number(field, name, at) for name, at in zip(self.names, places, strict=True))
+def stored(name: str, kind: pa.DataType, values_in: Callable[[Records], Array]) -> Column:
+    """Return the column of values that stand in records; `values_in` returns a view of them, [n, ...].
+
+    Unsigned 32-bit numbers become signed, which readers can subtract.
+    """
+    is_bytes = pa.types.is_fixed_size_binary(kind)
+
+    def read(records: Records) -> pa.Array:
+        values = values_in(records)
+        if values.dtype.hasobject:
+            return pa.array(values.tolist(), kind)
+        if is_bytes:
+            raw = np.ascontiguousarray(values).view(np.uint8)
+            return pa.FixedSizeBinaryArray.from_buffers(kind, len(records), [None, pa.py_buffer(raw.data)])
+        return pa.array(np.ascontiguousarray(values).astype(kind.to_pandas_dtype(), copy=False), kind)
+
+    def write(records: Records, column: pa.Array) -> None:
+        values = values_in(records)
+        if is_bytes:
+            start, size = column.offset * kind.byte_width, len(records) * kind.byte_width
+            raw = np.frombuffer(column.buffers()[1], np.uint8)[start : start + size]
+            values[...] = raw.view(values.dtype).reshape(values.shape)
         else:
-            yield from (self._bytes(field, name) for name in self.names)
+            values[...] = numbers(column)
 
-    def _number(self, field: str, name: str, at: tuple[int, ...]) -> Column:
-        base = self.dtype.base
-        index: tuple[slice | int, ...] = (slice(None), *at)
-        # 16-bit floats are widened for programs that read tables
-        held = np.dtype("<f4") if base == np.dtype("<f2") else base.newbyteorder("=")
+    return Column(name, kind, read, write)
 
-        def read(records: Records) -> Array:
-            return np.ascontiguousarray(self._inside(records[field])[index].astype(held, copy=False))
 
-        def write(records: Records, column: pa.Array) -> None:
-            self._inside(records[field])[index] = numbers(column)
+def nullable(column: Column, given_in: Callable[[Records], Array | None]) -> Column:
+    """Return the column with null where a value was not given.
 
-        return Column(name, pa.from_numpy_dtype(held), read, write)
+    Args:
+        given_in: returns a view of the flags in records, [n]; None if the records do not have the field.
+    """
+    write_values = column.write
+    assert write_values is not None
+    is_bytes = pa.types.is_fixed_size_binary(column.type)
+    zero = pa.scalar(bytes(column.type.byte_width) if is_bytes else 0).cast(column.type)
 
-    def _bytes(self, field: str, name: str) -> Column:
-        size = self.dtype.itemsize
-        kind = pa.binary(size)
+    def read(records: Records) -> pa.Array:
+        given = given_in(records)
+        if given is None:
+            return pa.nulls(len(records), column.type)
+        values = column.read(records)
+        null = pa.scalar(None, column.type)
+        return values if given.all() else pc.if_else(pa.array(np.ascontiguousarray(given)), values, null)
 
-        def read(records: Records) -> pa.Array:
-            own = np.ascontiguousarray(self._inside(records[field]))
-            buffers = [None, pa.py_buffer(own.view(np.uint8).data)]
-            return pa.FixedSizeBinaryArray.from_buffers(kind, len(records), buffers)
+    def write(records: Records, values: pa.Array) -> None:
+        given = given_in(records)
+        if given is not None:
+            given[...] = numbers(values.is_valid())
+            write_values(records, values.fill_null(zero))
 
-        def write(records: Records, column: pa.Array) -> None:
-            raw = np.frombuffer(column.buffers()[1], np.uint8)[column.offset * size :][: len(records) * size]
-            self._inside(records[field])[...] = raw.view(self.dtype.base).reshape(-1, *self.dtype.shape)
-
-        return Column(name, kind, read, write)
-
-    def _inside(self, values: Records) -> Array:
-        for name in self.leaf.path:
-            values = values[name]
-        return values
+    return Column(column.name, column.type, read, write)
 
 
 class SpaceColumns:
@@ -101,69 +108,53 @@ class SpaceColumns:
     def __init__(
         self, description: Mapping[str, object], field: str, where: str, prefix: str | None = None
     ) -> None:
-        self._leaves = _named(leaves_of(description, where), prefix or field)
-        self.columns_by_leaf: list[tuple[Leaf, list[Column]]] = [
-            (part.leaf, list(part.columns(field))) for part in self._leaves
+        self._description, self._where = description, where
+        self._leaves = leaves_of(description, where)
+        self.dtype: np.dtype[np.generic] = row_dtype(description)
+        """The dtype of a value in records; a text is an object."""
+        prefix, parts = prefix or field, _parts(self._leaves)
+        names = [
+            "_".join([prefix, *(key.replace(".", "_") for key in leaf.path), *map(str, at or ())])
+            for leaf, at in parts
         ]
-        self.columns: list[Column] = [column for _, own in self.columns_by_leaf for column in own]
+        if len(set(names)) < len(names):
+            names = [f"{prefix}_{number}" for number in range(1, len(names) + 1)]
+        self.columns_by_leaf: list[tuple[Leaf, Column]] = [
+            (leaf, _column(name, field, leaf, at)) for name, (leaf, at) in zip(names, parts, strict=True)
+        ]
 
-    def row(self, value: bytes) -> Json:
-        """Return the columns of one encoded value.
+    @property
+    def columns(self) -> list[Column]:
+        """The columns, in order."""
+        return [column for _, column in self.columns_by_leaf]
+
+    def unpack(self, values: Sequence[bytes]) -> list[Value]:
+        """Return encoded values as they are assigned to records.
 
         Raises:
-            ValueError: it is not a value of the space.
+            RecordingError: one is not a value of the space.
         """
-        row: Json = {}
-        at = 0
-        for part in self._leaves:
-            if part.leaf.dtype is None:
-                start = at + _LENGTH.size
-                at = start + int.from_bytes(value[at:start], "little")
-                row[part.names[0]] = value[start:at].decode()
-                continue
-            own, at = value[at : at + part.dtype.itemsize], at + part.dtype.itemsize
-            if part.is_spread:
-                row |= zip(part.names, np.frombuffer(own, part.dtype.base).tolist(), strict=True)
-            elif part.names:
-                row[part.names[0]] = own
-        if at != len(value):
-            raise ValueError(f"{len(value):,} bytes, expected {at:,}")
-        return row
+        return [_as_record(decode(self._description, value, self._where)) for value in values]
 
-    def value(self, row: JsonView) -> bytes:
-        """Return the encoded value of a row of columns."""
-        pieces = []
-        for part in self._leaves:
-            if part.leaf.dtype is None:
-                pieces.append(encode_text(row[part.names[0]]))
-            elif part.is_spread:
-                pieces.append(np.array([row[name] for name in part.names], part.dtype.base).tobytes())
-            elif part.names:
-                pieces.append(row[part.names[0]])
-        return b"".join(pieces)
+    def pack(self, values: Array) -> list[bytes]:
+        """Return the encoded values of records."""
+        parts: list[list[bytes]] = [[b""] * len(values)]
+        for leaf in self._leaves:
+            own = _inside(values, leaf)
+            parts.append([encode_text(v) if leaf.dtype is None else v.tobytes() for v in own])
+        return [b"".join(pieces) for pieces in zip(*parts, strict=True)]
 
 
-def _named(leaves: Sequence[Leaf], prefix: str) -> list[_LeafColumns]:
-    """Return the columns of the leaves, numbered if their names would not be unique."""
+def _parts(leaves: Sequence[Leaf]) -> list[tuple[Leaf, tuple[int, ...] | None]]:
+    """Return the leaf of each column, and its number's place in the leaf; None for all of the leaf."""
     few = sum(map(_spreadable, leaves)) <= MAX_COLUMNS
-    made = []
+    parts: list[tuple[Leaf, tuple[int, ...] | None]] = []
     for leaf in leaves:
-        spread = leaf.dtype is not None and (not leaf.dtype.shape or (few and bool(_spreadable(leaf))))
-        made.append(_LeafColumns(leaf, tuple(_names(leaf, prefix, spread)), spread))
-    names = [name for part in made for name in part.names]
-    if len(set(names)) == len(names):
-        return made
-    numbered = (f"{prefix}_{number}" for number in itertools.count(1))
-    return [replace(part, names=tuple(itertools.islice(numbered, len(part.names)))) for part in made]
-
-
-def _names(leaf: Leaf, prefix: str, spread: bool) -> Iterator[str]:
-    name = "_".join([prefix, *(key.replace(".", "_") for key in leaf.path)])
-    if spread:
-        assert leaf.dtype is not None
-        yield from ("_".join([name, *map(str, at)]) for at in np.ndindex(leaf.dtype.shape))
-    elif leaf.dtype is None or leaf.dtype.itemsize:
-        yield name
+        if leaf.dtype is not None and (not leaf.dtype.shape or (few and _spreadable(leaf))):
+            parts += [(leaf, at) for at in np.ndindex(leaf.dtype.shape)]
+        elif leaf.dtype is None or leaf.dtype.itemsize:
+            parts.append((leaf, None))
+    return parts
 
 
 def _spreadable(leaf: Leaf) -> int:
@@ -172,8 +163,31 @@ def _spreadable(leaf: Leaf) -> int:
     return count if count <= MAX_NUMBERS else 0
 
 
-def _not_fixed(records: Records) -> object:
-    raise TypeError(f"a text is not of fixed width: {records.dtype}")
+def _column(name: str, field: str, leaf: Leaf, at: tuple[int, ...] | None) -> Column:
+    """Return the column of one number of a leaf, or of all of it."""
+    if leaf.dtype is None:
+        kind = pa.string()
+    elif at is None:
+        kind = pa.binary(leaf.dtype.itemsize)
+    elif leaf.dtype.base == np.float16:
+        kind = pa.float32()  # for programs that read tables
+    else:
+        kind = pa.from_numpy_dtype(leaf.dtype.base.newbyteorder("="))
+    place: Any = (..., *(at or ()))
+    return stored(name, kind, lambda records: _inside(records[field], leaf)[place])
+
+
+def _inside(values: NDArray[Any], leaf: Leaf) -> NDArray[Any]:
+    """Return the values of a leaf, a view."""
+    for key in leaf.path:
+        values = values[key]
+    return values
+
+
+def _as_record(value: Value) -> Value:
+    """Return a value with tuples in place of dictionaries, as it is assigned to a record."""
+    parts = value.values() if isinstance(value, Mapping) else value
+    return tuple(map(_as_record, parts)) if isinstance(value, Mapping | tuple) else value
 
 
 def numbers(column: pa.Array) -> Array:

@@ -19,11 +19,12 @@ from blake3 import blake3
 
 from runner.archive import layout
 from runner.archive.batches import Batches
+from runner.archive.columns import Table
 from runner.archive.descriptions import description_tables, run_table
-from runner.archive.layout import Table
 from runner.archive.manifest import Entry, Manifest, entries_of, is_inside
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.blocks import message_record
 from runner.recording.messages import QTable, decode_q_table, encode_q_table
 from runner.recording.reader import Recording
 from runner.replay.snapshots import DerivedTables
@@ -121,7 +122,7 @@ class _ArchiveWriter:
     def write(self) -> Manifest:
         """Write all but the manifest."""
         self._write_descriptions()
-        for table in self._batches.shape.tables:
+        for table in self._batches.shape.tables.values():
             if table.name in layout.LEFT_OUT_IF_EMPTY and not any(map(self._recording.table, table.topics)):
                 continue
             with TableWriter(self._folder / table.name, table.columns) as writer:
@@ -188,8 +189,7 @@ class _ArchiveWriter:
         recording = self._recording
         seed = recording.seed or 0
         replay = StepReplay(recording.config, recording.mdp, seed, self._where)
-        columns = layout.SCHEMAS[layout.Q_TABLES]
-        with TableWriter(self._folder / layout.Q_TABLES, columns) as snapshots:
+        with TableWriter(self._folder / layout.Q_TABLES, layout.Q_TABLE_COLUMNS) as snapshots:
             tables = DerivedTables(
                 replay,
                 self._snapshots(),
@@ -205,9 +205,12 @@ class _ArchiveWriter:
     def _snapshots(self) -> Iterator[tuple[int, tuple[int, QTable]]]:
         """Yield the step of each snapshot, and the snapshot with its position."""
         topic = schema.Q_TABLE_TOPIC
-        for position, payload in self._batches.messages(topic):
+        for number, (time, payload) in enumerate(self._recording.table(topic).messages()):
             table = decode_q_table(payload)
-            self._batches.compare(topic, position, encode_q_table(table), payload)
+            position, rest = divmod(time, schema.STEP_NANOSECONDS)
+            if rest or encode_q_table(table) != payload:
+                raise self._batches.unarchivable(topic, number)
+            self._batches.count(topic, message_record(topic, time, payload), 1)
             yield table.step, (position, table)
 
     def _snapshot_row(
@@ -231,4 +234,4 @@ class _ArchiveWriter:
             "blake3": blake3(data).hexdigest(),
             "data": None if is_derived else data,
         }
-        return pa.RecordBatch.from_pylist([row], layout.SCHEMAS[layout.Q_TABLES])
+        return pa.RecordBatch.from_pylist([row], layout.Q_TABLE_COLUMNS)

@@ -68,7 +68,7 @@ def write_tables(
         phase = phase or "train"
         whole_ranges(episodes, _episode_count(recording, phase), phase, str(recording.path))
     source = Batches(recording)
-    own = {table.name: table for table in source.shape.tables}
+    own = source.shape.tables
     tables = {
         name: _selected(source.of(own[table]), phase, episodes)
         for name, table in _TABLES.items()
@@ -85,8 +85,8 @@ def left_out(recording: Recording) -> list[str]:
     """Return the columns of a recording that CSV cannot hold: arrays of many numbers."""
     names = [
         column.name
-        for table in Batches(recording).shape.tables
-        if table.name in _TABLES.values()
+        for name, table in Batches(recording).shape.tables.items()
+        if name in _TABLES.values()
         for column in table.columns
         if pa.types.is_fixed_size_binary(column.type)
     ]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from runner.recording.schema import EPISODE, RESET, STEP, TRANSITION, Field, MessageType, Topic
 
-_FIXED: Final[dict[int, tuple[str, int]]] = {
+FIXED: Final[dict[int, tuple[str, int]]] = {
     Pb.TYPE_DOUBLE: ("<f8", 1),
     Pb.TYPE_SFIXED64: ("<i8", 1),
     Pb.TYPE_FIXED64: ("<u8", 1),
@@ -73,9 +73,9 @@ def record_dtype(message: MessageType, *sizes: int | np.dtype[np.generic]) -> np
         if field.kind == Pb.TYPE_BYTES:
             value = np.dtype(next(remaining))  # type: ignore[arg-type]
         elif field.repeated:
-            value = np.dtype((_FIXED[field.kind][0], (next(remaining),)))
+            value = np.dtype((FIXED[field.kind][0], (next(remaining),)))
         else:
-            value = np.dtype(_FIXED[field.kind][0])
+            value = np.dtype(FIXED[field.kind][0])
         layout += [(f"tag_{field.name}", "u1", (len(_tag(field, value)),)), (field.name, value)]
     return np.dtype(layout)
 
@@ -83,7 +83,7 @@ def record_dtype(message: MessageType, *sizes: int | np.dtype[np.generic]) -> np
 def _tag(field: Field, value: np.dtype[np.generic]) -> bytes:
     """Return the constant bytes before a field's value: tag, and its length if it is bytes or packed."""
     if not field.repeated and field.kind != Pb.TYPE_BYTES:
-        return bytes([field.number << 3 | _FIXED[field.kind][1]])
+        return bytes([field.number << 3 | FIXED[field.kind][1]])
     return bytes([field.number << 3 | _DELIMITED]) + varint(value.itemsize)
 
 
@@ -103,20 +103,18 @@ def blank_records(topic: Topic, dtype: np.dtype[np.void], n: int) -> NDArray[np.
     """
     if dtype.hasobject:
         return np.zeros(n, dtype)
-    records = np.empty(n, dtype)
-    records.view(np.uint8).reshape(n, records.itemsize)[:] = _blank_record(topic, dtype)  # not field by field
-    return records
+    return np.frombuffer(bytearray(_blank_record(topic, dtype)) * n, dtype)
 
 
 @lru_cache(64)
-def _blank_record(topic: Topic, dtype: np.dtype[np.void]) -> NDArray[np.uint8]:
+def _blank_record(topic: Topic, dtype: np.dtype[np.void]) -> bytes:
     one = np.zeros((), dtype=dtype)
     one["opcode"] = MESSAGE
     one["record_length"] = dtype.itemsize - RECORD_HEAD.size
     one["channel_id"] = topic.channel
     for field in topic.message.fields:
         one[f"tag_{field.name}"] = list(_tag(field, dtype[field.name]))
-    return np.frombuffer(one.tobytes(), np.uint8)
+    return one.tobytes()
 
 
 def message_record(topic: Topic, log_time: int, payload: bytes) -> bytes:

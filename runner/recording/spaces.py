@@ -71,7 +71,16 @@ def dtype_of(description: Any, where: str) -> np.dtype[np.generic] | None:
     """Return the dtype of a space's values, `Dict` and `Tuple` as fields; None if their size varies."""
     if any(leaf.dtype is None for leaf in leaves_of(description, where)):
         return None
-    return _dtype(description)
+    return row_dtype(description)
+
+
+def row_dtype(description: Description) -> np.dtype[np.generic]:
+    """Return the dtype of a space's values in records, `Dict` and `Tuple` as fields; a text is an object."""
+    parts = _parts(description)
+    if parts is None:
+        leaf = _leaf_dtype(description)
+        return np.dtype(object) if leaf is None else leaf
+    return np.dtype([(name, row_dtype(part)) for name, part in parts])
 
 
 def least_number(description: Mapping[str, object]) -> int:
@@ -137,15 +146,6 @@ def _leaf_dtype(description: Mapping[str, object]) -> np.dtype[np.generic] | Non
     if len(shape) > 32 or math.prod(shape) > MAX_VALUE_BYTES:
         raise ValueError(f"shape {shape}")
     return np.dtype((dtype, tuple(shape)))
-
-
-def _dtype(description: Description) -> np.dtype[np.generic]:
-    parts = _parts(description)
-    if parts is None:
-        leaf = _leaf_dtype(description)
-        assert leaf is not None
-        return leaf
-    return np.dtype([(name, _dtype(part)) for name, part in parts])
 
 
 def _value(description: Description, data: bytes, at: int) -> tuple[Value, int]:

@@ -49,7 +49,7 @@ def test_learners_of_their_own_have_columns_of_their_own(tmp_path):
     with open_recording(run.recording) as recording:
         steps = recording.train.steps.array()
         batches = Batches(recording)
-        table = pa.Table.from_batches(batches.of(batches.shape.tables[0]))
+        table = pa.Table.from_batches(batches.of(batches.shape.tables[layout.STEPS]))
     table = table.filter(pa.compute.equal(table["phase"], "train"))
     for i in range(2):
         np.testing.assert_array_equal(table[f"reward_taxi_{i + 1}"].to_numpy(), steps["rewards"][:, i])

@@ -7,7 +7,7 @@ import io
 
 import gymnasium
 import numpy as np
-import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from mpe2 import simple_spread_v3
@@ -15,6 +15,7 @@ from PIL import Image
 
 import runner
 from runner.archive import layout
+from runner.archive.manifest import Manifest, entries_of, read_manifest
 from runner.archive.restoring import restore
 from runner.errors import CannotRedo, ConfigError
 from runner.export.encoded import encoded_pictures
@@ -137,16 +138,18 @@ def test_frames_that_cannot_be_rendered_are_refused(tmp_path):
 
 def test_frames_of_earlier_versions_have_their_places_too(tmp_path, monkeypatch):
     """They do not mark resets, and archives of them have no column for it."""
-    earlier = pa.schema([column for column in layout.SCHEMAS[layout.FRAMES] if column.name != "frame_id"])
     with monkeypatch.context() as patched:
         patched.setattr("runner.loops.messages.frame_id", lambda phase, *_: phase)
-        patched.setitem(layout.SCHEMAS, layout.FRAMES, earlier)
         with runner.record(Counting(0), tmp_path, frames_every=1) as rec:
             for seed in range(4):
                 rec.reset(seed=seed)
                 for _ in range(3):  # an episode that is left before its end
                     rec.step(0)
-        folder = archived(rec.run.recording, tmp_path / "archive")
+    folder = archived(rec.run.recording, tmp_path / "archive")
+    pq.write_table(pq.read_table(folder / layout.FRAMES).drop("frame_id"), folder / layout.FRAMES)
+    manifest = read_manifest((folder / layout.MANIFEST).read_bytes(), "")
+    earlier = Manifest(manifest.run, manifest.topics, entries_of(folder))
+    (folder / layout.MANIFEST).write_bytes(earlier.to_json())
     restore(folder, tmp_path / "back.mcap")
     assert contents(tmp_path / "back.mcap") == contents(rec.run.recording)
     with open_recording(tmp_path / "back.mcap") as recording:

@@ -6,7 +6,9 @@ import pytest
 
 from runner.analysis import frames
 from runner.analysis.diff import divergence
-from runner.archive.columns import Shape, checked_batch
+from runner.archive import layout
+from runner.archive.columns import Shape
+from runner.archive.rows import batch_of, records_of
 from runner.recording import schema
 from runner.recording.blocks import blank_records, record_dtype
 
@@ -29,4 +31,7 @@ def test_an_archive_keeps_it(name):
     shape = Shape("k3v9m2xq", "job", ("agency",), ("a", "b"), (6, 6), (), {schema.TRAIN_STEP: dtype})
     records = blank_records(schema.TRAIN_STEP, dtype, 1)
     records[name] = 1
-    assert checked_batch(schema.TRAIN_STEP, records, shape, "a recording").num_rows == 1
+    table = shape.tables[layout.STEPS]
+    batch = batch_of(table, schema.TRAIN_STEP, records, shape)
+    (restored,) = records_of(table, schema.TRAIN_STEP, batch, shape)
+    assert restored.tobytes() == records.tobytes()
