@@ -117,7 +117,7 @@ def _describe_snapshots(
 ) -> tuple[TablesDescription, NDArray[np.float64]]:
     """Return the latest tables that a loop recorded, or those at a step."""
     arrays = list(recorded_tables(recording))
-    last = max([recording.train.steps.count(), *(array.step for array in arrays)])
+    last = max([recording.train.steps.total(), *(array.step for array in arrays)])
     latest = {array.name: array for array in arrays if step is None or array.step <= step <= last}
     if not latest:
         raise NotInRecording(
@@ -137,7 +137,7 @@ def _describe_snapshots(
         number = numbered(str(state), list(map(str, states)), "a state", 1)
         stop = max(array.step for array in latest.values())
         taken = None
-        if recording.train.steps.count() >= stop:  # else steps are missing
+        if recording.train.steps and recording.train.steps.count() >= stop:  # else steps are missing
             counts = np.zeros(shape[1], np.int64)
             for block in recording.train.steps.blocks(0, stop):
                 counts += np.bincount(block["action"][block["state"] == number], minlength=shape[1])

@@ -379,7 +379,7 @@ def _mean_episodes(
 
 def _unfinished_episodes(recording: Recording) -> Readings:
     """Return mean length and return of training episodes of which none ended; nothing without rewards."""
-    if not recording.train.steps.count() or recording.train.steps.are_actions:
+    if not recording.train.steps:
         return {}
     agents, steps, total = recording.agents, 0, 0.0
     for block in recording.train.steps.rows():

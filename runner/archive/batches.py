@@ -73,7 +73,8 @@ class Batches:
         if topic.message is schema.EXTRA:
             yield from self._recording.phase(topic.phase).extras.blocks()
         elif topic in self.shape.dtypes:
-            yield from self._recording.table(topic).blocks()
+            table = self._recording.table(topic)
+            yield from table.blocks() if table else ()  # of steps there may be the actions alone
         else:
             messages, size = [], 0
             for time, payload in self._recording.table(topic).messages():

@@ -153,7 +153,7 @@ def _first_unreadable(recording: Recording) -> str:
         name = schema.NUMBERED_BY[topic.message]
         number = 0
         try:
-            for block in recording.table(topic).blocks():
+            for block in recording.table(topic).rows():
                 number = int(block[name][-1]) + 1
         except RecordingError:
             return f" {topic.name}: {name} {number} is the first that cannot be read."

@@ -5,9 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from runner.errors import Diverged, RecordingError
 from runner.execution.verification import (
     LOOP_NOT_COMPARED,
@@ -17,11 +14,10 @@ from runner.execution.verification import (
     with_difference,
 )
 from runner.recording import schema
-from runner.recording.blocks import message_record
-from runner.recording.consistency import Findings, check_extras, check_phase
-from runner.recording.digest import ContentHash, combined_digest
-from runner.recording.loop_blocks import Inconsistent, check_without_steps
+from runner.recording.consistency import Findings, Inconsistent, check_extras, check_phase
+from runner.recording.digest import combined_digest
 from runner.recording.reader import Recording
+from runner.recording.rewriting import content_hash
 from runner.runs.checkpoints import read_checkpoints
 
 
@@ -46,14 +42,12 @@ def verify_loop(recording: Recording) -> Verification:
     )
     try:
         compare_names(recording)
-        content = _Content(recording)
-        phases = {phase: _check_phase(recording, phase, finished, content) for phase in schema.PHASES}
+        phases = {phase: check_phase(recording, phase, finished) for phase in schema.PHASES}
         for phase in phases:
-            check_extras(recording, phase, finished, content.add)
-        content.add_other_topics()
+            check_extras(recording, phase, finished)
         notes += _check_checkpoints(recording)
-        if content.off_table:
-            strange = f"{content.off_table:,} steps"
+        if not_outcomes := sum(findings.not_outcomes for findings in phases.values()):
+            strange = f"{not_outcomes:,} steps"
             notes.append(f"{strange} are no outcome of the environment's table: it has other rules too")
         for phase, findings in phases.items():
             notes += _unusual(recording, phase, findings)
@@ -72,7 +66,12 @@ def verify_loop(recording: Recording) -> Verification:
     verification = replace(verification, notes=tuple(notes))
     if not finished:
         return verification
-    digests, counts = content.digest.topics(), content.counts
+    digests = content_hash(recording).topics()
+    counts = {
+        topic.name: recording.table(topic).count() if recording.table(topic) else 0
+        for topic in recording.topics
+        if topic not in schema.MACHINE_TOPICS
+    }
     if recording.leaves_out_steps:
         stated = recording.result.topic_digests
         for name in ("/train/step", "/eval/step"):
@@ -89,42 +88,6 @@ def verify_loop(recording: Recording) -> Verification:
     if recording.result.rewards_off_table is not None and not recording.leaves_out_steps:
         expected["rewards_off_table"] = sum(findings.rewards_off_table for findings in phases.values())
     return compare_result(verification, recording, expected)
-
-
-def _check_phase(recording: Recording, phase: str, finished: bool, content: _Content) -> Findings:
-    """Compare the messages of a phase with one another, and add them to the content."""
-    if recording.leaves_out_steps:
-        return Findings(last_time=check_without_steps(recording, phase, content.add))
-    return check_phase(recording, phase, finished, content.add)
-
-
-class _Content:
-    """Digest and number of the messages of a loop's recording, and its steps outside the outcome table."""
-
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-        self.digest = ContentHash()
-        self.counts = {topic.name: 0 for topic in recording.topics}
-        self.off_table = 0
-
-    def add(self, topic: schema.Topic, block: NDArray[np.void]) -> None:
-        """Add messages of a fixed-width topic."""
-        self.digest.update(topic, np.ascontiguousarray(block).view(np.uint8).data)
-        self.counts[topic.name] += len(block)
-        if topic.message is schema.STEP and self._recording.tabular:
-            outcomes = self._recording.mdp.outcomes_to(block["state"], block["action"], block["next_state"])
-            self.off_table += int(np.count_nonzero(~outcomes.any(axis=1)))
-
-    def add_other_topics(self) -> None:
-        """Add all messages of the topics of varying size whose number a result states."""
-        for topic in self._recording.topics:
-            is_added = topic in self._recording.dtypes or topic.message is schema.EXTRA
-            if is_added or topic in schema.MACHINE_TOPICS:
-                continue
-            for time, payload in self._recording.table(topic).messages():
-                if topic.digested:
-                    self.digest.update(topic, message_record(topic, time, payload))
-                self.counts[topic.name] += 1
 
 
 def _check_checkpoints(recording: Recording) -> list[str]:

@@ -97,7 +97,7 @@ def _episode_count(recording: Recording, phase: str) -> int:
     """Return the number of episodes with steps, including one that did not end."""
     ended = recording.phase(phase).episodes.count()
     steps = int(recording.phase(phase).episodes.array(ended - 1, ended)[0]["last_step"]) + 1 if ended else 0
-    return ended + (recording.phase(phase).steps.count() > steps)
+    return ended + (recording.phase(phase).steps.total() > steps)
 
 
 def _metrics(recording: Recording) -> Iterator[pa.RecordBatch]:

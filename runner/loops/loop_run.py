@@ -201,15 +201,9 @@ class LoopRun:
     def _compact(self) -> None:
         """Write a recording of actions alone again, in fewer chunks, if there are several."""
         counts = self.recorder.counts
-        steps = {
-            ACTION_TOPICS[topic.name]: dtype
-            for topic, dtype in self.described.dtypes.items()
-            if topic.name in ACTION_TOPICS
-        }
-        if sum(counts[topic.name] for topic in steps) > len(steps):
-            environments, packing = self.described.environments, self._options.packing.packing
+        if any(counts.get(topic.name, 0) > 1 for topic in ACTION_TOPICS.values()):
             with contextlib.suppress(OSError):  # without the space for both, the recording stays as it is
-                self._file, messages = compacted(self._file, packing, steps, environments)
+                self._file, messages = compacted(self._file, self._options.packing.packing)
                 counts |= messages
 
     def close_file(self) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.integrity import check_integrity, is_merely_cut_off
+from runner.recording.integrity import check_up_to_cut
 from runner.recording.reader import Recording, open_recording
 from runner.recording.repair import can_be_repaired
 from runner.recording.schema import STEP_NANOSECONDS
@@ -233,11 +233,7 @@ def _open_whole(path: Path) -> Recording:
     Raises:
         RecordingError: it is damaged.
     """
-    try:
-        check_integrity(path)
-    except RecordingError:
-        if not is_merely_cut_off(path):
-            raise
+    check_up_to_cut(path)
     return open_recording(path)
 
 

@@ -7,8 +7,9 @@ a block at a time, and compared.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,20 +17,28 @@ from numpy.typing import NDArray
 from runner.environments.mdp import step_counts
 from runner.recording import schema
 from runner.recording.episode_log import Columns, EpisodeLog, Flags, Steps
-from runner.recording.loop_blocks import Block, Blocks, Inconsistent, OnBlock
 from runner.recording.reader import Recording
 from runner.recording.schema import RESET_ONLY
 from runner.recording.spaces import least_number
+from runner.recording.steps import Steps as WholeSteps
+from runner.recording.steps import aligned
+from runner.recording.topic_chunks import TopicChunks
 from runner.util.arrays import Array, Ints
 
 _MAX_STEPS: Final = 2**62
 """More steps than a recording has."""
 
 
+class Inconsistent(Exception):
+    """Something that does not follow from the rest: the message says what, and where."""
+
+
 @dataclass
 class Findings:
     """Facts about a consistent phase."""
 
+    not_outcomes: int = 0
+    """Steps that are no outcome of the environment's table."""
     rewards_off_table: int = 0
     """Steps whose reward the environment's table excludes."""
     first_off_table: int = 0
@@ -43,21 +52,42 @@ class Findings:
     """Logical time of the last step, in nanoseconds; 0 without steps."""
 
 
-def check_phase(recording: Recording, phase: str, complete: bool, on_block: OnBlock) -> Findings:
-    """Compare the steps, resets and episodes of a phase with one another; each block is read once.
+def check_phase(recording: Recording, phase: str, complete: bool) -> Findings:
+    """Compare the steps, resets and episodes of a phase with one another; of actions alone, their numbers.
 
     Args:
         complete: whether the recording was completed; else it is checked up to its last reset, as later ones
             may not have been written.
-        on_block: called with each block of a fixed-width topic, also of what is not compared.
 
     Raises:
         Inconsistent: something does not follow from the rest.
     """
-    return _Phase(recording, phase, complete, on_block).check()
+    own = recording.phase(phase)
+    last_reset = max((int(block["step"][-1]) for block in _numbered(own.resets)), default=0)
+    for _ in _numbered(own.episodes):
+        pass
+    if recording.leaves_out_steps:
+        return Findings(last_time=_check_actions(own.steps))
+    if own.steps.are_actions:
+        raise Inconsistent(
+            f"{own.steps.topic.name}: found actions alone, expected whole steps as in the configuration"
+        )
+    return _PhaseCheck(recording, phase, None if complete else last_reset).check()
 
 
-def check_extras(recording: Recording, phase: str, complete: bool, on_block: OnBlock) -> None:
+def _check_actions(steps: WholeSteps) -> int:
+    """Check the numbers of steps of which only the actions were recorded; return the time of the last."""
+    expected = last = 0
+    for rows in steps.rows():
+        if rows["step"][0] != expected or (np.diff(rows["log_time"].astype(np.int64)) <= 0).any():
+            raise Inconsistent(
+                f"{steps.actions.topic.name}: found step {rows['step'][0]:,}, expected {expected:,}"
+            )
+        expected, last = expected + len(rows), int(rows["log_time"][-1])
+    return last
+
+
+def check_extras(recording: Recording, phase: str, complete: bool) -> None:
     """Compare the extras of a phase with its steps: each belongs to a step, at its time, in their order.
 
     Args:
@@ -73,7 +103,6 @@ def check_extras(recording: Recording, phase: str, complete: bool, on_block: OnB
     if recording.leaves_out_steps and not recording.phase(phase).steps.are_known:
         total = recording.result.get(f"{phase}_steps", _MAX_STEPS)
     for block in extras.blocks(stop=None if complete else total):
-        on_block(topic, block)
         numbers, where = block["step"], f"{topic.name}, step {block['step'][0]} and later"
         if numbers[0] <= last or (np.diff(numbers) <= 0).any() or numbers[-1] >= total:
             raise Inconsistent(f"{where}: found steps out of order, or after the last of {total:,}")
@@ -89,37 +118,83 @@ def check_extras(recording: Recording, phase: str, complete: bool, on_block: OnB
                 raise Inconsistent(f"{where}: found other times than those of the steps")
 
 
-class _Phase:
-    """The check of one phase."""
+class _Block(NamedTuple):
+    """Steps of all environments, and the resets before them."""
 
-    def __init__(self, recording: Recording, phase: str, complete: bool, on_block: OnBlock) -> None:
-        self._recording, self._phase, self._complete = recording, phase, complete
-        n = recording.environments
-        self._n = n
+    first: int
+    """The number of the first step."""
+    rows: NDArray[np.void]
+    """[steps of each environment, environments]."""
+    resets: NDArray[np.void]
+    reset_at: tuple[Ints, Ints]
+    """The place in `rows` that each reset comes before."""
+    was_reset: Flags
+    """[like `rows`]: whether a reset came before a step."""
+    only_reset: Flags
+    """[like `rows`]: whether the environment was reset instead of taking the step."""
+
+
+class _PhaseCheck:
+    """The check of one phase.
+
+    Args:
+        stop: the number of the step before which the check ends; None to check all.
+    """
+
+    def __init__(self, recording: Recording, phase: str, stop: int | None) -> None:
+        self._recording, self._phase, self._stop = recording, phase, stop
+        self._own = recording.phase(phase)
+        self._n = recording.environments
         self._learners = len(recording.agents)
         self._mdp = recording.mdp if recording.tabular else None
-        self._episodes = EpisodeLog(n, self._learners, self._mdp)
-        self._over = np.zeros(n, np.bool_)
+        self._episodes = EpisodeLog(self._n, self._learners, self._mdp)
+        self._over = np.zeros(self._n, np.bool_)
         """Whether the last step of each environment terminated or truncated its episode."""
-        self._observed = np.full(n, -1, np.int64)
+        self._observed = np.full(self._n, -1, np.int64)
         """The state after that step, -1 before any."""
         self._findings = Findings()
         self._has_states = recording.has_states
         self._start = least_number(recording.spaces["observation"]) if self._has_states else 0
-        self._blocks = Blocks(recording, phase, complete, on_block)
+        self._resets = self._own.resets.rows()
+        self._waiting = np.empty(0, self._own.resets.row_dtype)
+        """The resets that were read, and come after the steps so far."""
 
     def check(self) -> Findings:
         """Check all steps, and what comes after the last."""
-        for block in self._blocks:
-            self._check_times(block)
-            self._check_block(block)
-        if self._complete:
-            self._finish(self._blocks.steps)
-        self._blocks.resets.drain()
-        self._blocks.episodes.drain()
+        steps = left = 0
+        for rows, waiting in aligned(_numbered(self._own.steps), self._n, self._stop):
+            left = waiting
+            if len(rows):
+                self._check_block(self._block(steps, rows.reshape(-1, self._n)))
+                steps += len(rows)
+        if self._stop is None:
+            if left:
+                raise Inconsistent(
+                    f"{self._own.steps.topic.name}: found {steps + left} steps, expected as many of each of "
+                    f"the {self._n} environments"
+                )
+            self._finish(steps)
         return self._findings
 
-    def _check_times(self, b: Block) -> None:
+    def _block(self, first: int, rows: NDArray[np.void]) -> _Block:
+        resets, n = self._resets_before(first + rows.size), self._n
+        step, environment = resets["step"], resets["environment"].astype(np.int64)
+        if ((environment >= self._recording.own_environments) | (step % n != 0) | (step < first)).any():
+            raise Inconsistent(f"/{self._phase}/reset: found resets out of order, or of no environment")
+        at, was_reset = ((step - first) // n, environment % n), np.zeros(rows.shape, np.bool_)
+        was_reset[at] = True
+        return _Block(first, rows, resets, at, was_reset, rows["t"] == RESET_ONLY)
+
+    def _resets_before(self, step: int) -> NDArray[np.void]:
+        """Return the next resets, up to the first at this step or a later one."""
+        while not (later := self._waiting["step"] >= step).any():
+            if (block := next(self._resets, None)) is None:
+                break
+            self._waiting = np.concatenate([self._waiting, block])
+        resets, self._waiting = np.split(self._waiting, [np.argmax(np.append(later, True))])
+        return resets
+
+    def _check_times(self, b: _Block) -> None:
         """Compare the times of steps: each step of either phase takes one tick, so they increase."""
         times = b.rows["log_time"].astype(np.int64).ravel()
         before = np.concatenate([[self._findings.last_time], times[:-1]])
@@ -129,10 +204,11 @@ class _Phase:
             raise self._wrong(b.first + k, "log_time", times[k], f"a later tick than {before[k]}")
         self._findings.last_time = int(times[-1])
 
-    def _check_block(self, b: Block) -> None:
+    def _check_block(self, b: _Block) -> None:
         """Check some steps of all environments, and the resets before each of them."""
-        rows, was_reset, only_reset = b.rows, b.was_reset, b.rows["t"] == RESET_ONLY
-        if (wrong := np.flatnonzero(only_reset & ~was_reset)).size:
+        self._check_times(b)
+        rows = b.rows
+        if (wrong := np.flatnonzero(b.only_reset & ~b.was_reset)).size:
             raise self._wrong(b.first + wrong[0], "t", "that of a reset alone", "a reset before it")
         over = rows["terminated"] | rows["truncated"]
         episodes = self._episodes.take(
@@ -141,22 +217,32 @@ class _Phase:
                 rows["rewards"],
                 rows["terminated"],
                 rows["truncated"],
-                was_reset,
-                only_reset,
-                b.is_over,
+                b.was_reset,
+                b.only_reset,
+                self._is_over(b),
                 self._counts(b),
             )
         )
         self._compare(b.first, "t", rows["t"], episodes.t)
         self._compare(b.first, "episode", rows["episode"], episodes.number)
-        if b.resets is not None:
-            self._check_reset_episodes(b.resets, episodes.number[b.reset_at])
-        self._check_observations(b, was_reset, only_reset)
-        self._count_beginnings(b, was_reset, only_reset, np.vstack([self._over, over[:-1]]))
+        self._check_reset_episodes(b.resets, episodes.number[b.reset_at])
+        self._check_observations(b)
+        self._count_beginnings(b, np.vstack([self._over, over[:-1]]))
         self._compare_episodes(episodes.ended)
         self._over = over[-1]
         if self._has_states:
             self._observed = rows["next_state"][-1].astype(np.int64)
+
+    def _is_over(self, b: _Block) -> Flags:
+        """Return where a game of several agents ended without the end of any: its episode record says so."""
+        is_over, stop = np.zeros(b.rows.shape, np.bool_), b.first + b.rows.size
+        if self._learners > 1 and self._n == 1:
+            for block in self._own.episodes.blocks(self._episodes.ended):
+                silent = block["last_step"][~(block["terminated"] | block["truncated"])]
+                is_over[silent[(silent >= b.first) & (silent < stop)] - b.first] = True
+                if block["last_step"][-1] >= stop:
+                    break
+        return is_over
 
     def _check_reset_episodes(self, resets: NDArray[np.void], expected: Ints) -> None:
         if (wrong := np.flatnonzero(resets["episode"] != expected)).size:
@@ -166,53 +252,52 @@ class _Phase:
                 f"expected {expected[k]}"
             )
 
-    def _check_observations(self, b: Block, was_reset: Flags, only_reset: Flags) -> None:
+    def _check_observations(self, b: _Block) -> None:
         """Compare the states before steps with those after the steps, or resets, before them."""
         rows, names = b.rows, b.rows.dtype.names or ()
-        observed: Array | None = None
-        if b.resets is not None:
-            observed = np.zeros(rows.shape, b.resets.dtype["observation"])
-            observed[b.reset_at] = b.resets["observation"]  # of several at one place the last counts
         if self._has_states:
             after, given = rows["next_state"].astype(np.int64), np.zeros(rows.shape, np.int64)
-            if observed is not None:
-                given = observed.astype(np.int64).reshape(rows.shape) - self._start
+            # Of several resets at one place the last counts.
+            given[b.reset_at] = b.resets["observation"].reshape(len(b.resets)).astype(np.int64) - self._start
             before = np.vstack([self._observed, after[:-1]])
-            expected = np.where(was_reset & ~only_reset, given, before)
-            is_known = expected >= 0 if only_reset.any() else np.ones(rows.shape, np.bool_)
-            self._compare(b.first, "state", np.where(is_known, rows["state"], expected), expected)
-            self._compare(
-                b.first, "next_state", np.where(only_reset, after, 0), np.where(only_reset, given, 0)
-            )
-        elif observed is not None and only_reset.any() and "next_observation" in names:
-            same = _equal(rows["next_observation"][only_reset], observed[only_reset])
+            expected = np.where(b.was_reset & ~b.only_reset, given, before)
+            if b.only_reset.any():
+                expected = np.where(expected < 0, rows["state"], expected)  # unknown
+            self._compare(b.first, "state", rows["state"], expected)
+            self._compare(b.first, "next_state", after, np.where(b.only_reset, given, after))
+        elif b.only_reset.any() and "next_observation" in names:
+            observed = np.zeros(rows.shape, b.resets.dtype["observation"])
+            observed[b.reset_at] = b.resets["observation"]
+            same = _equal(rows["next_observation"][b.only_reset], observed[b.only_reset])
             if not same.all():
-                number = b.first + np.flatnonzero(only_reset)[np.flatnonzero(~same)[0]]
+                number = b.first + np.flatnonzero(b.only_reset)[np.flatnonzero(~same)[0]]
                 expected_value = "that of the reset before it"
                 raise self._wrong(number, "next_observation", "another value", expected_value)
         if self._learners == 1 and "agents_terminated" in names:
             for name in ("terminated", "truncated"):
                 self._compare(b.first, f"agents_{name}", rows[f"agents_{name}"], rows[name].astype(np.uint32))
 
-    def _count_beginnings(self, b: Block, was_reset: Flags, only_reset: Flags, after_end: Flags) -> None:
+    def _count_beginnings(self, b: _Block, after_end: Flags) -> None:
         """Count the episodes after one that ended by itself, with a reset before them and without."""
-        explained = was_reset | (b.rows["t"] > 0)
+        explained = b.was_reset | (b.rows["t"] > 0)
         if b.first == 0 and (missing := np.flatnonzero(~explained[0])).size:
             raise self._wrong(missing[0], "reset", "none", "one before the first step")
-        began = ~only_reset & after_end
+        began = ~b.only_reset & after_end
         without = np.flatnonzero(began & ~explained)
         if without.size and not self._findings.begun_without:
             self._findings.first_without = b.first + int(without[0])
         self._findings.begun_without += len(without)
         self._findings.begun_by_reset += int(np.count_nonzero(began & explained))
 
-    def _counts(self, b: Block) -> Ints | None:
+    def _counts(self, b: _Block) -> Ints | None:
         """Return events and penalties of each step, if the environment's table determines them."""
         if self._mdp is None:
             return None
         rows = b.rows.ravel()
         paid = rows["rewards"][:, 0]
         counts, excluded = step_counts(self._mdp, paid, rows["state"], rows["action"], rows["next_state"])
+        outcomes = self._mdp.outcomes_to(rows["state"], rows["action"], rows["next_state"])
+        self._findings.not_outcomes += int(np.count_nonzero(~outcomes.any(axis=1)))
         if excluded.any():
             if not self._findings.rewards_off_table:
                 self._findings.first_off_table = b.first + int(np.argmax(excluded))
@@ -221,17 +306,17 @@ class _Phase:
 
     def _compare_episodes(self, expected: Columns) -> None:
         """Compare the next records of episodes with their expected fields."""
-        count = len(expected["length"])
-        found = self._blocks.episodes.take(count)
-        have = 0 if found is None else len(found)
-        if have < count and self._complete:
+        if not (count := len(expected["episode"])):
+            return
+        first = int(expected["episode"][0])
+        found = self._own.episodes.array(first, first + count)
+        have = len(found)
+        if have < count and self._stop is None:
             raise Inconsistent(
-                f"/{self._phase}/episode: found {expected['episode'][have]} episodes, expected one that "
-                f"ended at step {expected['last_step'][have]}"
+                f"/{self._phase}/episode: found {first + have} episodes, expected one that ended at step "
+                f"{expected['last_step'][have]}"
             )
-        for name, values in expected.items():
-            if found is None or not have:
-                break
+        for name, values in expected.items() if have else ():
             same = _equal(found[name], values[:have].astype(found[name].dtype))
             if not same.all():
                 k = int(np.flatnonzero(~same)[0])
@@ -242,19 +327,20 @@ class _Phase:
 
     def _finish(self, steps: int) -> None:
         """Check the resets after the last step, and that there is nothing else."""
-        rest = self._blocks.resets.take_while("step", steps + 1)
-        if rest is not None and len(rest):
-            environment = rest["environment"].astype(np.int64)
-            is_known = environment < self._recording.own_environments
-            if not is_known.all() or (rest["step"] != steps).any():
-                raise Inconsistent(f"/{self._phase}/reset: found resets out of order, or of no environment")
-            environment %= self._n
-            own = np.array(list(dict.fromkeys(environment.tolist())), np.int64)
-            self._compare_episodes(self._episodes.interrupt(steps, own))
-            self._check_reset_episodes(rest, self._episodes.episode[environment])
-        for name, records in (("reset", self._blocks.resets), ("episode", self._blocks.episodes)):
-            more = records.take(1)
-            if more is not None and len(more):
+        rest = self._resets_before(steps + 1)
+        environment = rest["environment"].astype(np.int64)
+        if (environment >= self._recording.own_environments).any() or (rest["step"] != steps).any():
+            raise Inconsistent(f"/{self._phase}/reset: found resets out of order, or of no environment")
+        environment %= self._n
+        own = np.array(list(dict.fromkeys(environment.tolist())), np.int64)
+        self._compare_episodes(self._episodes.interrupt(steps, own))
+        self._check_reset_episodes(rest, self._episodes.episode[environment])
+        has_more = {
+            "reset": len(self._waiting) > 0,
+            "episode": self._own.episodes.count() > self._episodes.ended,
+        }
+        for name, found in has_more.items():
+            if found:
                 raise Inconsistent(f"/{self._phase}/{name}: found more records than the steps account for")
 
     def _compare(self, first: int, name: str, found: Array, expected: Array) -> None:
@@ -264,6 +350,21 @@ class _Phase:
 
     def _wrong(self, step: int, name: str, found: object, expected: object) -> Inconsistent:
         return Inconsistent(f"/{self._phase}/step, step {step}: {name}: found {found}, expected {expected}")
+
+
+def _numbered(table: TopicChunks) -> Iterator[NDArray[np.void]]:
+    """Yield the records of a topic in blocks, as `TopicChunks.rows` does.
+
+    Raises:
+        Inconsistent: messages are not numbered consecutively.
+    """
+    first, number = 0, schema.NUMBERED_BY[table.topic.message]
+    for block in table.rows():
+        if (wrong := np.flatnonzero(block[number] != first + np.arange(len(block)))).size:
+            found, expected = block[number][wrong[0]], first + wrong[0]
+            raise Inconsistent(f"{table.topic.name}: found {number} {found}, expected {expected}")
+        yield block
+        first += len(block)
 
 
 def _equal(found: Array, expected: Array) -> Flags:

@@ -42,7 +42,6 @@ from runner.recording.records import (
     RawRecord,
     bytes_of,
     check_unpacked_size,
-    prefixed,
     raw_records,
 )
 from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, TOPIC_OF, Topic
@@ -60,7 +59,8 @@ _SUMMARY_OFFSET: Final = struct.Struct("<BQBQQ")
 _FOOTER_HEAD: Final = struct.Struct("<BQQQ")
 """The part of the footer that its checksum covers: opcode, length, starts of summary and summary offsets."""
 _FOOTER_BODY_BYTES: Final = 20
-_TAIL_BYTES: Final = RECORD_HEAD.size + _FOOTER_BODY_BYTES + len(MCAP0_MAGIC)
+_TAIL: Final = struct.Struct("<BQQQI8s")
+"""The footer, and the magic after it."""
 
 _ENTRY: Final = struct.Struct("<QIIQQH4sII")
 _ENTRY_COLUMNS: Final = np.dtype(
@@ -162,7 +162,7 @@ class Index:
         Raises:
             RecordingError: they do.
         """
-        unpacked = int(self.chunks.columns["uncompressed_size"].sum(dtype=np.uint64)) if self.chunks else 0
+        unpacked = int(self.chunks.columns["uncompressed_size"].sum(dtype=np.uint64))
         check_unpacked_size(self.size, unpacked, path)
 
     def add(self, raw: RawRecord) -> None:
@@ -242,7 +242,7 @@ class Index:
 
     def _take_summary(self, stream: BinaryIO, footer: Footer) -> None:
         """Add the records of the summary section, after comparing its checksum."""
-        start, end = footer.summary_start, self.size - _TAIL_BYTES
+        start, end = footer.summary_start, self.size - _TAIL.size
         if not len(MCAP0_MAGIC) < start <= footer.summary_offset_start <= end:
             raise RecordingError(f"the footer points to a summary at {start}, outside the file; try `repair`")
         fields = _FOOTER_HEAD.pack(Opcode.FOOTER, _FOOTER_BODY_BYTES, start, footer.summary_offset_start)
@@ -265,6 +265,7 @@ class Index:
         data_end = bytes_of(DataEnd(crc))
         start = self.end + len(data_end)
         schemas, channels = schemas_and_channels(tuple(topics))
+        metadata = (MetadataIndex(*place, name) for name, place in self.metadata.items())
         attachments = (
             _attachment_index(name, *place, self.media_types[name])
             for name, place in self.attachments.items()
@@ -274,11 +275,8 @@ class Index:
             (Opcode.CHANNEL, channels),
             (Opcode.STATISTICS, bytes_of(self._statistics(topics))),
             (Opcode.CHUNK_INDEX, b"".join(map(_chunk_index, self.chunks))),
-            (Opcode.ATTACHMENT_INDEX, b"".join(attachments)),
-            (
-                Opcode.METADATA_INDEX,
-                b"".join(_metadata_index(name, *place) for name, place in self.metadata.items()),
-            ),
+            (Opcode.ATTACHMENT_INDEX, bytes_of(*attachments)),
+            (Opcode.METADATA_INDEX, bytes_of(*metadata)),
         ]
         summary, offsets = bytearray(), bytearray()
         for opcode, data in groups:
@@ -392,14 +390,12 @@ def schemas_and_channels(topics: tuple[Topic, ...]) -> tuple[bytes, bytes]:
 
 def _footer(stream: BinaryIO, size: int) -> Footer | None:
     """Return the footer if the file ends as a finished one does."""
-    if size < _TAIL_BYTES + len(MCAP0_MAGIC):
+    if size < _TAIL.size + len(MCAP0_MAGIC):
         return None
-    stream.seek(size - _TAIL_BYTES)
-    tail = stream.read(_TAIL_BYTES)
-    head, body = tail[: RECORD_HEAD.size], tail[RECORD_HEAD.size :]
-    if not tail.endswith(MCAP0_MAGIC) or RECORD_HEAD.unpack(head) != (Opcode.FOOTER, _FOOTER_BODY_BYTES):
-        return None
-    return Footer.read(ReadDataStream(BytesIO(body)))
+    stream.seek(size - _TAIL.size)
+    opcode, length, start, offsets, crc, magic = _TAIL.unpack(stream.read(_TAIL.size))
+    is_footer = (opcode, length, magic) == (Opcode.FOOTER, _FOOTER_BODY_BYTES, MCAP0_MAGIC)
+    return Footer(start, offsets, crc) if is_footer else None
 
 
 def _chunk_entry(raw: RawRecord) -> ChunkEntry:
@@ -428,28 +424,20 @@ def _chunk_index(entry: ChunkEntry) -> bytes:
     indexed = _OFFSET_ENTRY.pack(entry.channel, after) if entry.index_length else b""
     place = entry.start_time, entry.end_time, entry.offset, entry.length
     packed = entry.length - RECORD_HEAD.size - CHUNK_HEAD.size - len(name) - 8
-    return _record(
-        Opcode.CHUNK_INDEX,
+    body = (
         _CHUNK_INDEX_HEAD.pack(*place, len(indexed)),
         indexed,
         struct.pack("<QI", entry.index_length, len(name)),
         name,
         struct.pack("<QQ", packed, entry.uncompressed_size),
     )
+    return b"".join((RECORD_HEAD.pack(Opcode.CHUNK_INDEX, sum(map(len, body))), *body))
 
 
-def _metadata_index(name: str, offset: int, length: int) -> bytes:
-    return _record(Opcode.METADATA_INDEX, struct.pack("<QQ", offset, length), prefixed(name))
-
-
-def _attachment_index(name: str, offset: int, length: int, media_type: str) -> bytes:
-    texts = prefixed(name) + prefixed(media_type)
-    size = length - RECORD_HEAD.size - 2 * 8 - len(texts) - 8 - 4  # its times, data length and checksum
-    return _record(Opcode.ATTACHMENT_INDEX, struct.pack("<QQQQQ", offset, length, 0, 0, size), texts)
-
-
-def _record(opcode: Opcode, *parts: bytes) -> bytes:
-    return b"".join((RECORD_HEAD.pack(opcode, sum(map(len, parts))), *parts))
+def _attachment_index(name: str, offset: int, length: int, media_type: str) -> AttachmentIndex:
+    # All but its times, the lengths of its texts and data, and its checksum.
+    size = length - RECORD_HEAD.size - 2 * 8 - 2 * 4 - len(f"{name}{media_type}".encode()) - 8 - 4
+    return AttachmentIndex(offset, length, 0, 0, size, name, media_type)
 
 
 def _parse(kind: type[T], raw: RawRecord) -> T:

@@ -74,19 +74,14 @@ def check_integrity(path: Path, report: Report = lambda *_: None) -> None:
         raise RecordingError(f"{path}: found damage at {contents.end + at} in {what}.")
 
 
-def is_merely_cut_off(path: Path) -> bool:
-    """Return whether an unfinished recording is, as far as it goes, what its recorder wrote.
+def check_up_to_cut(path: Path) -> None:
+    """Check every byte of a recording up to its end, or to where it was cut off.
 
     Raises:
-        RecordingError: the file cannot be read, or begins as no recording does.
+        RecordingError: something is wrong, or missing before the end.
     """
-    contents = survey(path, keep_result=True)
-    if contents.reason:
-        if not contents.end:
-            raise RecordingError(f"{path}: {contents.reason}.")
-        return may_be_cut(path, contents)
-    found, expected = _tails(path, contents)
-    return expected.startswith(found)
+    with contextlib.suppress(CutOff):
+        check_integrity(path)
 
 
 def survey(path: Path, keep_result: bool = False, report: Report = lambda *_: None) -> Index:

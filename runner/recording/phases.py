@@ -157,7 +157,7 @@ class Phase:
         layouts = self._file.extra_layouts if table else []
         # As Python's numbers: a forged chunk may begin at any time
         starts = [layout.start_time for layout in layouts]
-        times = table.file.chunks.columns["start_time"][table.places].tolist() if table else []
+        times = table.file.chunks.columns["start_time"][table.places].tolist()
         chosen = np.array([bisect_right(starts, time) - 1 for time in times], np.intp)
         if (chosen < 0).any():
             raise RecordingError(f"{where}: {table.topic.name} has values before their names.")

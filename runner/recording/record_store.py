@@ -52,22 +52,25 @@ class RecordStore:
             self._threads.shutdown(cancel_futures=True)
         self._stream.close()
 
-    def metadata(self, name: str, offset: int, length: int) -> dict[str, str]:
-        """Return the entries of a metadata record.
-
-        Raises:
-            RecordingError: it cannot be read, or has another name.
-        """
-        return self._named(MetadataRecord, "metadata", name, offset, length, MAX_METADATA_BYTES).entries
-
-    def attachment(self, name: str, offset: int, length: int) -> tuple[str, bytes]:
-        """Return an attachment's media type and data, after comparing its checksum.
+    def named(self, kind: type[N], name: str, offset: int, length: int) -> N:
+        """Return a metadata record or an attachment, whose checksum is compared.
 
         Raises:
             RecordingError: it cannot be read, is damaged, or has another name.
         """
-        record = self._named(AttachmentRecord, "attachment", name, offset, length)
-        return record.media_type, record.data
+        raw = self._raw(offset, length, MAX_METADATA_BYTES if kind is MetadataRecord else MAX_CHUNK_BYTES)
+        try:
+            record = read_record(raw)
+        except RecordingError as error:
+            raise RecordingError(f"{self._path}: {error}.") from error
+        if not isinstance(record, kind):
+            raise self._another(raw)
+        if record.name != name:
+            what = "metadata" if kind is MetadataRecord else "attachment"
+            raise RecordingError(
+                f"{self._path}: found {what} {record.name!r} at {offset}, expected {name!r}."
+            )
+        return record
 
     def chunk_body(self, entry: ChunkEntry) -> memoryview:
         """Return the body of a chunk's record, still packed.
@@ -133,22 +136,6 @@ class RecordStore:
 
     def _where(self, entry: ChunkEntry) -> str:
         return f"{self._path}: chunk at {entry.offset}"
-
-    def _named(
-        self, kind: type[N], what: str, name: str, offset: int, length: int, max_bytes: int = MAX_CHUNK_BYTES
-    ) -> N:
-        raw = self._raw(offset, length, max_bytes)
-        try:
-            record = read_record(raw)
-        except RecordingError as error:
-            raise RecordingError(f"{self._path}: {error}.") from error
-        if not isinstance(record, kind):
-            raise self._another(raw)
-        if record.name != name:
-            raise RecordingError(
-                f"{self._path}: found {what} {record.name!r} at {offset}, expected {name!r}."
-            )
-        return record
 
     def _raw(self, offset: int, length: int, max_bytes: int = MAX_CHUNK_BYTES) -> RawRecord:
         """Return a record whose length, with its head, is known."""

@@ -209,15 +209,19 @@ def _read_chunk(body: bytes, offset: int) -> ReadChunk:
     """Return the chunk in a record, after comparing its checksum and looking at each of its messages."""
     where = f"chunk at {offset}"
     head, records = unpack_chunk(body, where)
-    channel, times, offsets = _checked_messages(records, where)
+    channel, times, offsets = checked_messages(records, where)
     length, size = RECORD_HEAD.size + len(body), head.uncompressed_size
     span = head.start_time, head.end_time
     entry = ChunkEntry(offset, length, size, *span, channel, head.compression.encode(), len(times))
     return ReadChunk(body, entry, records, times, offsets)
 
 
-def _checked_messages(records: bytes, where: str) -> tuple[int, NDArray[np.uint64], NDArray[np.uint64]]:
-    """Return channel, times and offsets of a chunk's messages."""
+def checked_messages(records: bytes, where: str) -> tuple[int, NDArray[np.uint64], NDArray[np.uint64]]:
+    """Return channel, times and offsets of a chunk's messages.
+
+    Raises:
+        RecordingError: no recorder writes such messages.
+    """
     if len(records) < HEADER_BYTES:
         raise RecordingError(f"{where}: holds no whole message")
     _, length, channel, *_ = MESSAGE_HEAD.unpack_from(records)
@@ -229,7 +233,6 @@ def _checked_messages(records: bytes, where: str) -> tuple[int, NDArray[np.uint6
             raise RecordingError(f"{where}: its messages differ in size")
         block = np.frombuffer(records, np.dtype([*HEADER, ("data", "u1", (size - HEADER_BYTES,))]))
         offsets = np.arange(len(block), dtype=np.uint64) * np.uint64(size)
-        lengths: int | NDArray[np.uint64] = length
     else:
         starts, at = [], 0
         while at + HEADER_BYTES <= len(records):
@@ -242,7 +245,7 @@ def _checked_messages(records: bytes, where: str) -> tuple[int, NDArray[np.uint6
         heads = b"".join(records[start : start + HEADER_BYTES] for start in starts)
         block = np.frombuffer(heads, np.dtype(HEADER))
         offsets = np.array(starts, dtype=np.uint64)
-        lengths = np.diff(offsets, append=np.uint64(len(records))) - np.uint64(RECORD_HEAD.size)
+    lengths = np.diff(offsets, append=np.uint64(len(records))) - np.uint64(RECORD_HEAD.size)
     as_written = (
         (block["opcode"] == Opcode.MESSAGE)
         & (block["record_length"] == lengths)

@@ -11,7 +11,7 @@ import contextlib
 import json
 import re
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -36,10 +36,9 @@ from runner.recording.records import (
     Report,
     read_record,
 )
-from runner.recording.schema import Topic
+from runner.recording.run_file import Summary, parse_result
 from runner.recording.writer import RecordingFile
 from runner.util.files import open_regular
-from runner.util.values import JsonView, is_whole
 
 _CHUNK_TIMES_AND_SIZE: Final = struct.Struct("<QQQ")
 _MAX_MESSAGES: Final = 2**62
@@ -69,7 +68,7 @@ class Repair:
         return not self.lost and not self.lost_bytes
 
 
-def repair(path: Path, report: Report = lambda *_: None, stated: JsonView | None = None) -> Repair:
+def repair(path: Path, report: Report = lambda *_: None, stated: Summary | None = None) -> Repair:
     """Make a recording whole; the file is not touched until its successor is complete and read back.
 
     Args:
@@ -81,16 +80,17 @@ def repair(path: Path, report: Report = lambda *_: None, stated: JsonView | None
         RecordingError: it is not a dualtaxi recording, or its description is damaged.
         StorageError: there is no space for the new file, or the folder cannot be written.
     """
+    counts = _recorded_counts(stated or Summary())
     with contextlib.suppress(RecordingError):
         check_integrity(path, report)
         done = Repair(path, was_whole=True)
         with contextlib.suppress(RecordingError), open_recording(path) as recording:
-            done.lost = recording.lost or _missing(_stated_counts(stated or {}), recording.message_counts)
+            done.lost = recording.lost or _missing(counts, recording.message_counts)
         return done
     fresh = path.with_suffix(".repairing")
     try:
         fresh.unlink(missing_ok=True)
-        done = _salvage(path, fresh, report, _stated_counts(stated or {}))
+        done = _salvage(path, fresh, report, counts)
         _read_back(fresh, done, report)
         if done.lost:
             number = 1
@@ -108,15 +108,21 @@ def repair(path: Path, report: Report = lambda *_: None, stated: JsonView | None
 
 def can_be_repaired(path: Path) -> bool:
     """Return whether a damaged recording holds messages that a repair can keep."""
-    described, has_messages = set(), False
     with contextlib.suppress(RecordingError, OSError), open_regular(path) as stream:
-        for record in DamagedFile(stream, path).good_records():
-            has_messages |= isinstance(record, ReadChunk)
-            if isinstance(record, MetadataRecord):
-                described.add(record.name)
-            if has_messages and described >= REQUIRED_RECORDS:
-                return True
+        described, has_messages = _description(DamagedFile(stream, path))
+        return has_messages and described.keys() >= REQUIRED_RECORDS
     return False
+
+
+def _description(file: DamagedFile) -> tuple[dict[str, dict[str, str]], bool]:
+    """Return the metadata before the first chunk by name, and whether there is a chunk."""
+    described: dict[str, dict[str, str]] = {}
+    for record in file.good_records():
+        if isinstance(record, ReadChunk):
+            return described, True
+        if isinstance(record, MetadataRecord):
+            described[record.name] = record.entries
+    return described, False
 
 
 def _salvage(path: Path, fresh: Path, report: Report, stated: Mapping[str, int]) -> Repair:
@@ -125,19 +131,15 @@ def _salvage(path: Path, fresh: Path, report: Report, stated: Mapping[str, int])
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
     with stream:
-        # The kind decides what the new file begins with, so it is looked for in a reading of its own.
-        topics = schema.KINDS[_kind(DamagedFile(stream, path), path)]
-        return _Salvage(path, DamagedFile(stream, path), topics, stated).write(fresh, report)
-
-
-def _kind(file: DamagedFile, path: Path) -> str:
-    for record in file.good_records():
-        if isinstance(record, MetadataRecord) and record.name == "run":
-            check_run(record.entries, str(path))
-            return kind_of(record.entries)
-        if isinstance(record, ReadChunk):
-            break
-    return "job"
+        # What the new file begins with, and how messages are read, is looked for in a reading of its own.
+        described, _ = _description(DamagedFile(stream, path))
+        if missing := REQUIRED_RECORDS - described.keys():
+            raise RecordingError(
+                f"{path}: its metadata {', '.join(sorted(missing))} is damaged or was never written: "
+                "its messages cannot be interpreted. `dualtaxi resume` retrains the run."
+            )
+        check_run(described["run"], str(path))
+        return _Salvage(path, DamagedFile(stream, path), described["run"], stated).write(fresh, report)
 
 
 def _read_back(fresh: Path, done: Repair, report: Report) -> None:
@@ -148,71 +150,51 @@ def _read_back(fresh: Path, done: Repair, report: Report) -> None:
     """
     check_integrity(fresh, report)
     with open_recording(fresh) as recording:
-        for topic in recording.topics:
-            if topic in recording.dtypes:
-                found = sum(len(block) for block in recording.table(topic).blocks())
-            else:
-                found = recording.table(topic).count()
-            expected = done.kept.get(topic.name, 0)
-            if found != expected:
-                raise RecordingError(f"{fresh}: found {found} messages of {topic.name}, expected {expected}.")
+        for name, found in recording.message_counts.items():
+            if found != (expected := done.kept.get(name, 0)):
+                raise RecordingError(f"{fresh}: found {found} messages of {name}, expected {expected}.")
 
 
 class _Salvage:
-    """Copies the good records of a damaged file into a new one."""
+    """Copies the good records of a damaged file into a new one.
+
+    Args:
+        run: its metadata record `run`.
+        stated: messages of each topic, as the run states them; its result is believed rather.
+    """
 
     def __init__(
-        self, path: Path, damaged: DamagedFile, topics: Sequence[Topic], stated: Mapping[str, int]
+        self, path: Path, damaged: DamagedFile, run: Mapping[str, str], stated: Mapping[str, int]
     ) -> None:
-        self._path = path
-        self._topics = topics
-        self._damaged = damaged
+        self._path, self._damaged, self._counts = path, damaged, stated
+        self._topics = schema.KINDS[kind_of(run)]
+        self._dtypes = dtypes_of(run, str(path))
         self._done = Repair(path)
-        self._dtypes: dict[Topic, np.dtype[np.void]] = {}
-        self._next = dict.fromkeys(topics, 0)
+        self._next = dict.fromkeys(self._topics, 0)
         """The number of the next message expected of each topic."""
         self._extra_columns: list[tuple[int, str]] = []
         self._extra_widths: set[int] = set()
         self._result: dict[str, str] | None = None
-        self._counts = stated
-        """Messages of each topic, according to the result, or else as the run states them."""
 
     def write(self, fresh: Path, report: Report) -> Repair:
         """Write the new file."""
-        described = set()
         with RecordingFile(fresh, self._topics) as file:
             for record in self._damaged.good_records(report):
-                if isinstance(record, MetadataRecord):
-                    described.add(record.name)
-                    self._take_metadata(file, record)
-                elif isinstance(record, ReadChunk):
-                    self._check_described(described)
+                if isinstance(record, ReadChunk):
                     self._take_chunk(file, record)
-                else:
+                elif isinstance(record, MetadataRecord) and record.name == "result":
+                    self._take_result(record.entries)
+                elif record.name != "repair":
                     file.copy(record)
-            self._check_described(described)
             self._finish(file)
         return self._done
 
-    def _check_described(self, described: set[str]) -> None:
-        if missing := REQUIRED_RECORDS - described:
-            raise RecordingError(
-                f"{self._path}: its metadata {', '.join(sorted(missing))} is damaged or was never written: "
-                "its messages cannot be interpreted. `dualtaxi resume` retrains the run."
-            )
-
-    def _take_metadata(self, file: RecordingFile, record: MetadataRecord) -> None:
-        name, entries = record
-        if name == "result":
-            with contextlib.suppress(RecordingError):  # one that makes no sense is worth as much as none
-                self._counts, self._result = _recorded_counts(entries), entries
-            return
-        if name == "repair":
-            return
-        if name == "run":
-            check_run(entries, str(self._path))
-            self._dtypes = dtypes_of(entries, str(self._path))
-        file.copy(record)
+    def _take_result(self, entries: dict[str, str]) -> None:
+        problems: list[str] = []
+        with contextlib.suppress(RecordingError):  # one that makes no sense is worth as much as none
+            result = parse_result(json_object(entries.get("json"), "the metadata 'result'"), problems)
+            if not problems:
+                self._counts, self._result = _recorded_counts(result), entries
 
     def _take_chunk(self, file: RecordingFile, chunk: ReadChunk) -> None:
         """Copy a good chunk; note a hole before it."""
@@ -220,20 +202,18 @@ class _Salvage:
         topic, count = chunk.topic, len(chunk.times)
         if topic not in self._topics:
             raise RecordingError(f"{where}: found messages of another kind of run.")
-        expected = self._next[topic]
-        first = expected
         if topic is schema.EXTRA_COLUMNS_TOPIC:
             self._take_extra_columns(chunk)
         if topic.message is schema.EXTRA and len(chunk.records) // count not in self._extra_widths:
             self._damaged.lost_bytes += len(chunk.body)  # their names are lost
             return
-        if topic in self._dtypes:
-            if len(chunk.records) % self._dtypes[topic].itemsize:
-                raise RecordingError(f"{where}: found messages of another size.")
-            numbers = np.frombuffer(chunk.records, self._dtypes[topic])[schema.NUMBERED_BY[topic.message]]
-            first, last = int(numbers[0]), int(numbers[-1])
-            if last - first + 1 != len(numbers) or not 0 <= first <= last < _MAX_MESSAGES:
-                raise RecordingError(f"{where}: found {len(numbers)} messages, numbered {first} to {last}.")
+        if topic in self._dtypes and len(chunk.records) != count * self._dtypes[topic].itemsize:
+            raise RecordingError(f"{where}: found messages of another size.")
+        first = expected = self._next[topic]
+        if topic.message in schema.NUMBERED_BY:
+            first, last = self._numbers(chunk)
+            if last - first + 1 != count or not 0 <= first <= last < _MAX_MESSAGES:
+                raise RecordingError(f"{where}: found {count} messages, numbered {first} to {last}.")
         if first < expected:
             raise RecordingError(f"{self._path}: {topic.name} goes back from {expected} to {first}.")
         if first > expected:
@@ -241,6 +221,15 @@ class _Salvage:
         self._next[topic] = first + count
         file.copy(chunk)
         self._done.kept[topic.name] = self._done.kept.get(topic.name, 0) + count
+
+    def _numbers(self, chunk: ReadChunk) -> tuple[int, int]:
+        """Return the numbers of a chunk's first and last message."""
+        topic, name = chunk.topic, schema.NUMBERED_BY[chunk.topic.message]
+        if topic in self._dtypes:
+            numbers = np.frombuffer(chunk.records, self._dtypes[topic])[name]
+            return int(numbers[0]), int(numbers[-1])
+        first, last = (decode(topic.message, chunk.messages[k][HEADER_BYTES:])[name] for k in (0, -1))
+        return first, last
 
     def _take_extra_columns(self, chunk: ReadChunk) -> None:
         """Note how wide the records of extras are from here on."""
@@ -279,22 +268,10 @@ def _missing(stated: Mapping[str, int], found: Mapping[str, int]) -> dict[str, l
     return {name: [[found[name], n]] for name, n in stated.items() if name in found and found[name] < n}
 
 
-def _recorded_counts(result: dict[str, str]) -> dict[str, int]:
-    """Return how many messages of each topic were recorded, according to a result.
-
-    Raises:
-        RecordingError: it does not say.
-    """
-    return _stated_counts(json_object(result.get("json"), "the metadata 'result'"))
-
-
-def _stated_counts(values: JsonView) -> dict[str, int]:
-    counts = values.get("messages", {})
-    if not isinstance(counts, dict) or not all(is_whole(n, 0, _MAX_MESSAGES) for n in counts.values()):
-        raise RecordingError("the metadata 'result' does not say how many messages there were")
-    steps = {topic.name for topic in schema.ALL_TOPICS if topic.message in schema.STEP_MESSAGES}
-    left_out = set() if values.get("steps_recorded", True) else steps
-    return {name: count for name, count in counts.items() if name not in left_out}
+def _recorded_counts(summary: Summary) -> dict[str, int]:
+    """Return how many messages of each topic were recorded; steps may have been left out."""
+    is_whole = summary.steps_recorded
+    return {name: n for name, n in summary.messages.items() if is_whole or not name.endswith("/step")}
 
 
 _LIKE_A_CHUNK: Final = re.compile(
@@ -374,11 +351,11 @@ class DamagedFile:
         """Return the offset of the next good chunk, or the end of the file."""
         while offset < self.size:
             piece = self._read(offset, _PIECE + _LIKE_BYTES)
-            for like in _LIKE_A_CHUNK.finditer(piece, 0, len(piece)):
-                at = offset + like.start()
-                raw = RawRecord.of(piece[like.start() : like.start() + RECORD_HEAD.size], at)
-                if like.start() < _PIECE and self._good_record(raw) is not None:
-                    return at
+            for like in _LIKE_A_CHUNK.finditer(piece):
+                start = like.start()
+                raw = RawRecord.of(piece[start : start + RECORD_HEAD.size], offset + start)
+                if start < _PIECE and self._good_record(raw) is not None:
+                    return raw.offset
             offset += _PIECE
         return self.size
 

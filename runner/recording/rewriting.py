@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 
 from runner.errors import RecordingError
 from runner.recording.digest import ContentHash, combined_digest
-from runner.recording.integrity import check_integrity
-from runner.recording.reader import open_recording
+from runner.recording.integrity import check_up_to_cut
+from runner.recording.reader import Recording, open_recording
 from runner.recording.records import (
     MetadataRecord,
     RawRecord,
@@ -19,7 +18,6 @@ from runner.recording.records import (
     walk,
 )
 from runner.recording.run_file import Summary
-from runner.recording.schema import ALL_TOPICS, STEP_MESSAGES, Topic
 from runner.recording.writer import RecordingFile
 from runner.util.files import open_regular
 
@@ -49,22 +47,33 @@ def rewrite(
         OSError: the new file exists or cannot be written.
     """
     result = None
+
+    def transform(record: Record) -> Record | None:
+        nonlocal result
+        if isinstance(record, MetadataRecord):
+            changed = change(*record)
+            if record.name == "result":
+                result, changed = changed, None
+            return None if changed is None else record._replace(entries=changed)
+        name = record.topic.name if isinstance(record, ReadChunk) else record.name
+        return None if name in left_out else record
+
+    check_up_to_cut(path)
     with open_recording(path) as recording:
         topics = recording.topics
     with RecordingFile(fresh, topics) as file:
-        for record in whole_records(path):
-            if isinstance(record, MetadataRecord):
-                changed = change(*record)
-                if record.name == "result":
-                    result = changed
-                elif changed is not None:
-                    file.copy(record._replace(entries=changed))
-            elif (record.topic if isinstance(record, ReadChunk) else record).name not in left_out:
-                file.copy(record)
+        copy(path, transform, file)
         add(file)
         for name, added in (more or {}).items():
             file.add_metadata(name, added)
         file.finish("" if result is None else "result", result)
+
+
+def copy(path: Path, transform: Callable[[Record], Record | None], into: RecordingFile) -> None:
+    """Append the records of a recording to another one, as they are transformed; None leaves one out."""
+    for record in whole_records(path):
+        if (transformed := transform(record)) is not None:
+            into.copy(transformed)
 
 
 def content_of(path: Path) -> str:
@@ -75,11 +84,9 @@ def content_of(path: Path) -> str:
     Raises:
         RecordingError: it is damaged, or states another digest than its messages have.
     """
-    seen = ContentHash()
-    for chunk in _chunks(path):
-        seen.update(chunk.topic, chunk.records)
+    check_up_to_cut(path)
     with open_recording(path) as recording:
-        result = recording.result
+        seen, result = content_hash(recording), recording.result
     if result.content_digest is not None and not _is_stated(result, seen.topics()):
         raise RecordingError(
             f"{path}: found messages of other content than the digest it states; it was altered."
@@ -87,53 +94,49 @@ def content_of(path: Path) -> str:
     return result.content_digest or seen.content()
 
 
+def content_hash(recording: Recording) -> ContentHash:
+    """Return the digests of a recording's messages."""
+    seen = ContentHash()
+    for topic in recording.topics:
+        for records in recording.table(topic).records() if topic.digested else ():
+            seen.update(topic, records)
+    return seen
+
+
 def continues(path: Path, earlier: Path) -> bool:
     """Return whether a recording begins with all messages of another one of the same job.
 
     Only topics that the digest covers are compared, byte for byte.
     """
+    for checked in (path, earlier):
+        check_up_to_cut(checked)
     with open_recording(path) as later, open_recording(earlier) as before:
         if later.run != before.run:
             return False
-    counts: Counter[Topic] = Counter()
-    expected, seen = ContentHash(), ContentHash()
-    for chunk in _chunks(earlier):
-        expected.update(chunk.topic, chunk.records)
-        counts[chunk.topic] += len(chunk.offsets)
-    for chunk in _chunks(path):
-        shared = min(counts[chunk.topic], len(chunk.offsets))
-        counts[chunk.topic] -= shared
-        end = len(chunk.records) if shared == len(chunk.offsets) else int(chunk.offsets[shared])
-        seen.update(chunk.topic, memoryview(chunk.records)[:end])
+        expected, seen = content_hash(before), ContentHash()
+        for topic in before.topics:
+            table = before.table(topic)
+            left = sum(table.entry(k).uncompressed_size for k in range(len(table)))
+            for records in later.table(topic).records() if left and topic.digested else ():
+                seen.update(topic, memoryview(records)[:left])
+                left -= min(left, len(records))
     return seen.topics() == expected.topics()
 
 
 def _is_stated(result: Summary, seen: dict[str, str]) -> bool:
     """Return whether a result states these digests; those of steps that are not recorded are not compared."""
     if not result.steps_recorded:
-        steps = {topic.name for topic in ALL_TOPICS if topic.message in STEP_MESSAGES}
-        seen = seen | {name: digest for name, digest in result.topic_digests.items() if name in steps}
+        seen = seen | {name: own for name, own in result.topic_digests.items() if name.endswith("/step")}
     return dict(result.topic_digests) == seen and combined_digest(seen) == result.content_digest
-
-
-def _chunks(path: Path) -> Iterator[ReadChunk]:
-    return (record for record in whole_records(path) if isinstance(record, ReadChunk))
 
 
 def whole_records(path: Path) -> Iterator[Record]:
     """Yield the metadata, attachments and chunks of a recording, up to where the file may be cut off.
 
     Raises:
-        RecordingError: it is damaged.
+        RecordingError: one is damaged.
     """
-    with open_recording(path) as recording:
-        finished = recording.finished
-    if finished:
-        check_integrity(path)
-    try:
-        with open_regular(path) as stream:
-            for raw in walk(stream, path.stat().st_size):
-                if not isinstance(record := read_record(raw), RawRecord):
-                    yield record
-    except RecordingError as error:
-        raise RecordingError(f"{path}: {error}; `dualtaxi repair` mends it.") from error
+    with open_regular(path) as stream:
+        for raw in walk(stream, path.stat().st_size):
+            if not isinstance(record := read_record(raw), RawRecord):
+                yield record

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.errors import RecordingError
 from runner.recording.actions import kept_dtype, unpacked
 from runner.recording.topic_chunks import FOREVER, TopicChunks
 
@@ -54,14 +56,47 @@ class Steps(TopicChunks):
             yield from super().rows(times)
             return
         # A message has the time of its last step.
-        for fields in self.actions.decoded(times=times and range(times.start, FOREVER)):
-            where = f"{self.file.path}: {self.actions.topic.name}"
-            block = unpacked(fields, self.row_dtype, self.file.environments, where)
-            if times is not None:
-                if block["log_time"][0] >= times.stop:
-                    return
-                block = block[(block["log_time"] >= times.start) & (block["log_time"] < times.stop)]
-            yield block
+        for block in self._unpacked(times=times and range(times.start, FOREVER)):
+            log_time = block["log_time"]
+            if times is not None and log_time[0] >= times.stop:
+                return
+            yield block if times is None else block[(log_time >= times.start) & (log_time < times.stop)]
 
     def _blocks_from(self, start: int, stop: int) -> Iterator[NDArray[np.void]]:
-        return self.rows() if self.are_actions else super()._blocks_from(start, stop)
+        if not self.are_actions:
+            return super()._blocks_from(start, stop)
+        return self._unpacked(chunks=self.actions.chunks_from("step", start))
+
+    def _unpacked(
+        self, times: range | None = None, chunks: Sequence[int] | None = None
+    ) -> Iterator[NDArray[np.void]]:
+        """Yield the steps of each message with actions, as `TopicChunks.messages` selects them."""
+        where = f"{self.file.path}: {self.actions.topic.name}"
+        for fields in self.actions.decoded(times=times, chunks=chunks):
+            yield unpacked(fields, self.row_dtype, self.file.environments, where)
+
+    @cached_property
+    def _numbers(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """The number of each chunk's first step, and the number after its last."""
+        if self.are_actions:
+            raise RecordingError(
+                f"{self.file.path}: has only the actions of the steps in {self.topic.name}: `rows` yields "
+                "them, `total` counts them, and `dualtaxi rerecord` brings the whole steps back."
+            )
+        return super()._numbers
+
+
+def aligned(
+    blocks: Iterable[NDArray[np.void]], n: int, stop: int | None = None
+) -> Iterator[tuple[NDArray[np.void], int]]:
+    """Yield steps, up to number `stop`, in blocks of as many of each of n environments, and how many wait."""
+    left: NDArray[np.void] | None = None
+    done = 0
+    for block in blocks:
+        rows = block if left is None or not len(left) else np.concatenate([left, block])
+        if stop is not None:
+            rows = rows[: max(stop - done, 0)]
+        whole = len(rows) - len(rows) % n
+        left = rows[whole:]
+        done += whole
+        yield rows[:whole], len(left)

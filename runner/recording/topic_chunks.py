@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import pairwise
 from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -13,11 +14,12 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, topic_dtype
+from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD, topic_dtype
 from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry
 from runner.recording.index import ChunkTable, Index
 from runner.recording.messages import Message, decode
 from runner.recording.record_store import RecordStore
+from runner.recording.records import checked_messages
 from runner.recording.schema import ALL_TOPICS, Topic
 
 M = TypeVar("M")
@@ -32,7 +34,7 @@ _ROWS_BYTES: Final = 16 << 20
 def chunks_by_topic(index: Index, store: RecordStore, path: str) -> dict[Topic, NDArray[np.intp]]:
     """Return which chunks of a file hold each topic's messages, in order."""
     table = index.chunks
-    channels = table.columns["channel"].copy() if table else np.empty(0, np.uint16)
+    channels = table.columns["channel"].copy()
     for k in np.flatnonzero(channels == 0).tolist():  # the file was cut off before the chunk's index
         channels[k] = store.first_channel(table[k])
     for k in np.flatnonzero(~np.isin(channels, list(index.channels))).tolist():
@@ -78,10 +80,8 @@ class TopicChunks:
     """Of a message record; None if messages vary in size."""
     lost: Sequence[Sequence[int]] = ()
     """Ranges (first, stop) of the numbers of messages that a repair could not save."""
-    _last: tuple[bytes, NDArray[np.void]] | None = field(default=None, init=False)
-    """The records of a chunk that was checked last, and the array of them."""
-    _last_rows: tuple[int, NDArray[np.void]] | None = field(default=None, init=False)
-    """The number of a chunk of messages of varying size that was decoded last, and its messages."""
+    _last: tuple[int, NDArray[np.void]] = field(default=(-1, np.empty(0, np.void)), init=False)
+    """The number of a chunk that was checked last, and its messages."""
 
     def __len__(self) -> int:
         return len(self.places)
@@ -91,9 +91,11 @@ class TopicChunks:
         return self.file.chunks[int(self.places[k])]
 
     def count(self) -> int:
-        """Return the number after that of the last message; where messages vary in size, by reading them."""
+        """Return the number after that of the last message, or how many there are if they have none."""
         if self.dtype is None:
-            return sum(1 for _ in self.messages())
+            if self.topic.message in schema.NUMBERED_BY:
+                return int(self._rows_of(len(self) - 1)[-1][self._number]) + 1 if self else 0
+            return sum(len(self._checked(k)[1]) for k in range(len(self)))
         _, ends = self._numbers
         return int(ends[-1]) if len(ends) else 0
 
@@ -108,17 +110,19 @@ class TopicChunks:
         """Yield the messages number `start` up to `stop`, a chunk at a time; they must have one size."""
         firsts, ends = self._numbers
         stop = int(ends[-1]) if stop is None and len(ends) else (stop or 0)
-        chunks = range(
-            int(np.searchsorted(ends, start, side="right")), int(np.searchsorted(firsts, stop, side="left"))
-        )
-        for k, data in zip(chunks, self.file.store.chunks(map(self.entry, chunks)), strict=True):
+        begin, end = np.searchsorted(ends, start, side="right"), np.searchsorted(firsts, stop, side="left")
+        for k, block in self._blocks_of(range(int(begin), int(end))):
             first = int(firsts[k])
-            yield self._block(k, data)[max(start - first, 0) : stop - first]
+            yield block[max(start - first, 0) : stop - first]
 
     def array(self, start: int = 0, stop: int | None = None) -> NDArray[np.void]:
         """Return the messages number `start` up to `stop` as one array; they must have one size."""
         blocks = list(self.blocks(start, stop))
         return np.concatenate(blocks) if blocks else np.empty(0, self.dtype)
+
+    def records(self) -> Iterator[bytes]:
+        """Yield the message records of each chunk, as they are in the file."""
+        return self.file.store.chunks(map(self.entry, range(len(self))))
 
     def rows(self, times: range | None = None) -> Iterator[NDArray[np.void]]:
         """Yield the messages as records in blocks, also those that vary in size.
@@ -161,23 +165,28 @@ class TopicChunks:
         """Yield blocks as `rows` does, the first of which begins with message number `start` or before it."""
         if self.dtype is not None:
             return self.blocks(start, stop)
-        k = bisect_right(range(len(self)), start, key=lambda k: self._first_of(k)[self._number])
-        return map(self._rows_of, range(max(k - 1, 0), len(self)))  # within a chunk no message is missing
+        return map(self._rows_of, self.chunks_from(self._number, start))  # none is missing within a chunk
+
+    def chunks_from(self, field: str, value: int) -> range:
+        """Return the chunks from the last that begins below a value of a field that never decreases."""
+        k = bisect_left(range(len(self)), value, key=lambda k: self._first_of(k)[field])
+        return range(max(k - 1, 0), len(self))
 
     def _first_of(self, k: int) -> Any:
         """Return the first message of chunk number k."""
         if self.dtype is None:
-            return next(self.decoded(chunks=range(k, k + 1)))
+            return next(self.decoded(chunks=[k]))
         return self._rows_of(k)[0]
 
     def _rows_of(self, k: int) -> NDArray[np.void]:
         """Return the messages of chunk number k as records."""
         if self.dtype is not None:
-            firsts, ends = self._numbers  # which refuses a chunk that is no multiple of the records' size
-            return next(self.blocks(int(firsts[k]), int(ends[k])))
-        if self._last_rows is None or self._last_rows[0] != k:
-            self._last_rows = k, np.concatenate(list(self._decoded_rows(chunks=range(k, k + 1))))
-        return self._last_rows[1]
+            return next(self._blocks_of([k]))[1]
+        number, rows = self._last
+        if number != k:
+            rows = np.concatenate(list(self._decoded_rows(chunks=[k])))
+            self._last = k, rows
+        return rows
 
     @property
     def _number(self) -> str:
@@ -192,7 +201,7 @@ class TopicChunks:
         return self.dtype
 
     def _decoded_rows(
-        self, times: range | None = None, chunks: range | None = None
+        self, times: range | None = None, chunks: Sequence[int] | None = None
     ) -> Iterator[NDArray[np.void]]:
         learners, size = self.file.learners, 0
         messages: list[Message] = []
@@ -211,23 +220,23 @@ class TopicChunks:
             yield _records_of(messages, self.row_dtype)
 
     def _blocks_between(self, times: range) -> Iterator[NDArray[np.void]]:
-        firsts, ends = self._numbers
-        if not len(firsts):
-            return
-        start, stop = np.uint64(max(times.start, 0)), np.uint64(max(times.stop, 0))
-        spans = self.file.chunks.columns[self.places]
-        first, end = np.searchsorted(spans["end_time"], start), np.searchsorted(spans["start_time"], stop)
-        if first >= end:
-            return
-        for block in self.blocks(int(firsts[first]), int(ends[end - 1])):
+        start, stop = _log_times(times)
+        for _, block in self._blocks_of(self._overlapping(times)):
             low, high = (int(np.searchsorted(block["log_time"], time)) for time in (start, stop))
             if low < high:
                 yield block[low:high]
 
+    def _overlapping(self, times: range, chunks: Sequence[int] | None = None) -> list[int]:
+        """Return those of some chunks, by default of all, that may have messages of these times."""
+        numbers = np.array(range(len(self)) if chunks is None else chunks, np.intp)
+        start, stop = _log_times(times)
+        spans = self.file.chunks.columns[self.places[numbers]]
+        overlapping: list[int] = numbers[(spans["end_time"] >= start) & (spans["start_time"] < stop)].tolist()
+        return overlapping
+
     def first_from(self, field: str, value: int) -> int:
         """Return the number of the first message of that value or more in a field that never decreases."""
-        k = bisect_left(range(len(self)), value, key=lambda k: self._first_of(k)[field])
-        for place in range(max(k - 1, 0), min(k + 1, len(self))):
+        for place in self.chunks_from(field, value)[:2]:
             rows = self._rows_of(place)
             at = int(np.searchsorted(rows[field], value))
             if at < len(rows):
@@ -235,7 +244,7 @@ class TopicChunks:
         return self.count()
 
     def messages(
-        self, times: range | None = None, chunks: range | None = None
+        self, times: range | None = None, chunks: Sequence[int] | None = None
     ) -> Iterator[tuple[int, bytes]]:
         """Yield (log time in nanoseconds, payload) of the messages.
 
@@ -243,27 +252,29 @@ class TopicChunks:
             times: of the log times, from the first to before the last; None for all.
             chunks: the numbers of the chunks to read; None for all.
         """
-        numbers = np.array(range(len(self)) if chunks is None else chunks, np.intp)
-        if times is not None and len(numbers):
-            spans = self.file.chunks.columns[self.places[numbers]]
-            start, stop = np.uint64(max(times.start, 0)), np.uint64(max(times.stop, 0))
-            numbers = numbers[(spans["end_time"] >= start) & (spans["start_time"] < stop)]
-        for k in numbers.tolist():
-            data, at = self.file.store.chunk(self.entry(k)), 0
-            while at < len(data):
-                if at + HEADER_BYTES > len(data):
-                    raise self._damaged(k, f"stray bytes at {at}")
-                kind, length, channel, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, at)
-                end = at + RECORD_HEAD.size + length
-                whole = at + HEADER_BYTES <= end <= len(data)
-                if kind != MESSAGE or not whole or channel != self.topic.channel:
-                    raise self._damaged(k, f"no message of {self.topic.name} at {at}")
+        if times is not None:
+            chunks = self._overlapping(times, chunks)
+        for k in range(len(self)) if chunks is None else chunks:
+            data, log_times, offsets = self._checked(k)
+            edges = pairwise([*offsets.tolist(), len(data)])
+            for log_time, (start, stop) in zip(log_times.tolist(), edges, strict=True):
                 if times is None or log_time in times:
-                    yield log_time, data[at + HEADER_BYTES : end]
-                at = end
+                    yield log_time, data[start + HEADER_BYTES : stop]
+
+    def _checked(self, k: int) -> tuple[bytes, NDArray[np.uint64], NDArray[np.uint64]]:
+        """Return the message records of chunk number k, their log times, and where each begins."""
+        entry = self.entry(k)
+        data = self.file.store.chunk(entry)
+        channel, log_times, offsets = checked_messages(data, f"{self.file.path}: chunk at {entry.offset}")
+        if channel != self.topic.channel:
+            raise self._damaged(k, f"other messages than of {self.topic.name}")
+        return data, log_times, offsets
 
     def decoded(
-        self, max_bytes: int = MAX_CHUNK_BYTES, times: range | None = None, chunks: range | None = None
+        self,
+        max_bytes: int = MAX_CHUNK_BYTES,
+        times: range | None = None,
+        chunks: Sequence[int] | None = None,
     ) -> Iterator[Message]:
         """Yield the messages of a topic of variable size: `log_time` and the fields, by name.
 
@@ -284,7 +295,7 @@ class TopicChunks:
         parse: Callable[[bytes], M],
         max_bytes: int = MAX_CHUNK_BYTES,
         times: range | None = None,
-        chunks: range | None = None,
+        chunks: Sequence[int] | None = None,
     ) -> Iterator[tuple[int, M]]:
         """Yield (log time in nanoseconds, parsed message) of the messages, in order.
 
@@ -308,9 +319,7 @@ class TopicChunks:
                 f"{self.file.path}: the messages of {self.topic.name} vary in size; read them one by one."
             )
         width = 1 if self.dtype is None else self.dtype.itemsize
-        sizes = np.empty(0, np.int64)
-        if len(self):
-            sizes = self.file.chunks.columns["uncompressed_size"][self.places].astype(np.int64)
+        sizes = self.file.chunks.columns["uncompressed_size"][self.places].astype(np.int64)
         if (odd := np.flatnonzero(sizes % width)).size:
             k = int(odd[0])
             raise self._damaged(k, f"{sizes[k]} bytes, not a multiple of {width}")
@@ -323,18 +332,19 @@ class TopicChunks:
             ends[after] += stop - start
         return firsts, ends
 
-    def _block(self, k: int, data: bytes) -> NDArray[np.void]:
-        """Return chunk number k as an array, after checking its constant bytes."""
+    def _blocks_of(self, chunks: Sequence[int]) -> Iterator[tuple[int, NDArray[np.void]]]:
+        """Yield the number of each of these chunks and its messages, after checking their constant bytes."""
         assert self.dtype is not None
-        if self._last is not None and self._last[0] is data:
-            return self._last[1]
-        block = np.frombuffer(data, dtype=self.dtype)
-        if (block["channel_id"] != self.topic.channel).any() or (
-            block["record_length"] != self.dtype.itemsize - RECORD_HEAD.size
-        ).any():
-            raise self._damaged(k, f"other messages than of {self.topic.name}")
-        self._last = data, block
-        return block
+        self._numbers  # noqa: B018 - refuses chunks that are no multiple of the records' size
+        for k, data in zip(chunks, self.file.store.chunks(map(self.entry, chunks)), strict=True):
+            number, block = self._last
+            if number != k:
+                block = np.frombuffer(data, dtype=self.dtype)
+                is_foreign = block["channel_id"] != self.topic.channel
+                if (is_foreign | (block["record_length"] != self.dtype.itemsize - RECORD_HEAD.size)).any():
+                    raise self._damaged(k, f"other messages than of {self.topic.name}")
+                self._last = k, block
+            yield k, block
 
     def _damaged(self, k: int, found: str) -> RecordingError:
         return _damaged(self.file.path, self.entry(k), found)
@@ -345,6 +355,11 @@ def _records_of(messages: Sequence[Message], dtype: np.dtype[np.void]) -> NDArra
     for name in messages[0]:
         records[name] = [message[name] for message in messages]
     return records
+
+
+def _log_times(times: range) -> tuple[np.uint64, np.uint64]:
+    """Return the ends of a range of times as NumPy compares them with those of messages."""
+    return np.uint64(max(times.start, 0)), np.uint64(max(times.stop, 0))
 
 
 def _damaged(path: str, entry: ChunkEntry, found: str) -> RecordingError:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import stat
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from itertools import islice
@@ -21,9 +20,11 @@ from runner.recording.index import read_index
 from runner.recording.messages import Scalars, decode_scalars
 from runner.recording.metadata import check_file, dtypes_of
 from runner.recording.record_store import RecordStore
+from runner.recording.records import AttachmentRecord, MetadataRecord
 from runner.recording.schema import EXTRA_COLUMNS_TOPIC, SCALAR_TOPIC, STEP_MESSAGES, Topic, topics_of
 from runner.recording.steps import Steps
 from runner.recording.topic_chunks import ChunkFile, TopicChunks, chunks_by_topic
+from runner.util.files import open_regular
 
 _MAX_SCALARS: Final = 8_192
 
@@ -37,9 +38,7 @@ class TopicReader(RunDescription):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         try:
-            if not stat.S_ISREG(path.stat().st_mode):  # to open a pipe would wait for its writer
-                raise RecordingError(f"{path}: cannot be read: it is no file.")
-            self._stream = path.open("rb")
+            self._stream = open_regular(path)
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise RecordingError(f"{path}: cannot be read ({reason}).") from error
@@ -86,22 +85,23 @@ class TopicReader(RunDescription):
         Raises:
             RecordingError: there is none of that name, or it cannot be read.
         """
-        return self._store.metadata(name, *self._position("metadata", self._index.metadata, name))
+        place = self._position("metadata", self._index.metadata, name)
+        return self._store.named(MetadataRecord, name, *place).entries
 
     @property
     def metadata_names(self) -> list[str]:
         """The names of the metadata records, in the order of the file."""
-        return sorted(self._index.metadata, key=lambda name: self._index.metadata[name][0])
+        return sorted(self._index.metadata, key=self._index.metadata.__getitem__)
 
     @property
     def attachment_names(self) -> list[str]:
         """The names of the attachments, in the order of the file."""
-        return sorted(self._index.attachments, key=lambda name: self._index.attachments[name][0])
+        return sorted(self._index.attachments, key=self._index.attachments.__getitem__)
 
     def attachments(self) -> Iterator[tuple[str, str, bytes]]:
         """Yield name, media type and data of each attachment, in the order of the file."""
-        for name, place in sorted(self._index.attachments.items(), key=lambda item: item[1]):
-            yield name, *self._store.attachment(name, *place)
+        for name in self.attachment_names:
+            yield self._store.named(AttachmentRecord, name, *self._index.attachments[name])
 
     def attachment(self, name: str) -> bytes:
         """Return an attachment's data, after comparing its checksum.
@@ -109,7 +109,8 @@ class TopicReader(RunDescription):
         Raises:
             RecordingError: there is none of that name, or it is damaged.
         """
-        return self._store.attachment(name, *self._position("attachment", self._index.attachments, name))[1]
+        place = self._position("attachment", self._index.attachments, name)
+        return self._store.named(AttachmentRecord, name, *place).data
 
     def _position(self, kind: str, places: Mapping[str, tuple[int, int]], name: str) -> tuple[int, int]:
         if name not in places:

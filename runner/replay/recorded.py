@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording.loop_blocks import aligned
 from runner.recording.reader import Recording
 from runner.recording.reset_states import ResetState
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.spaces import Value
+from runner.recording.steps import aligned
 from runner.recording.topic_chunks import FOREVER
 
 _BLOCK_BYTES: Final = 16 << 20

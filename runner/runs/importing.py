@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Final
 
 from runner.errors import RecordingError, RunnerError, StorageError
-from runner.recording.integrity import is_merely_cut_off
 from runner.recording.labels import LABELS_FILE, MAX_TAGS, Labels, as_json, change_labels, labels_from
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of, continues, rewrite
@@ -95,10 +94,7 @@ def import_recording(
         exported = _export_record(opened)
         record = exported if details is None else details
         facts = checked_facts(opened, record)
-        finished = opened.finished
         contents = [checkpoint.digest for checkpoint in read_checkpoints(opened, recordings)]
-    if not finished and not is_merely_cut_off(recording):
-        raise RecordingError(f"{recording}: is damaged, not merely cut off; `dualtaxi repair` repairs it.")
     own_labels = record.get("labels")
     labels = labels_from(own_labels) if isinstance(own_labels, dict) else Labels()
     digest, anonymous = content_of(recording), exported.get("anonymous") is True

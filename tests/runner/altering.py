@@ -65,7 +65,8 @@ def without_chunk(path: Path, topic: Topic, number: int) -> int:
 def _records(recording: Any, topic: Topic, change: Change) -> tuple[list[bytes], list[int]]:
     """Return the bytes and the log time of each message of a topic, changed."""
     if topic in recording.dtypes:
-        blocks = [block.copy() for block in recording.table(topic).blocks()]
+        table = recording.table(topic)
+        blocks = [block.copy() for block in table.blocks()] if table else []
         if not blocks:
             return [], []
         whole = change(np.concatenate(blocks))

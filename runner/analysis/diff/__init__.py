@@ -266,7 +266,7 @@ def as_json(difference: RunDiff) -> dict[str, object]:
 def can_compare_steps(a: Recording, b: Recording) -> bool:
     """Return whether two runs have recorded training steps of the same states and actions, or spaces."""
     are_alike = _same_sizes(a, b) if a.has_tables and b.has_tables else have_same_spaces(a, b)
-    return are_alike and all(recording.train.steps.count() for recording in (a, b))
+    return are_alike and all(recording.train.steps for recording in (a, b))
 
 
 def divergences(a: Recording, b: Recording) -> Iterator[Divergence]:
@@ -338,10 +338,10 @@ def _notes(a: Recording, b: Recording) -> list[str]:
             notes.append(f"{name} is not finished: compared as far as it got")
         if recording.leaves_out_steps:
             notes.append(_left_out(name, recording))
-        elif not recording.train.steps.count():
+        elif not recording.train.steps:
             notes.append(f"{name} has no training steps, so no trajectory of training is compared")
         whole = unbroken(recording)[0]
-        if whole < recording.train.steps.count():
+        if recording.train.steps and whole < recording.train.steps.count():
             notes.append(f"{name} lost steps from step {whole:,} on: training is compared up to there")
         if any(topic.startswith("/eval/") for topic in recording.lost):
             notes.append(f"{name} lost parts of evaluations: those that are not whole are not compared")

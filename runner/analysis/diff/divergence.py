@@ -189,8 +189,9 @@ def evaluation_divergences(a: Recording, b: Recording) -> Iterator[Divergence]:
 def unbroken(recording: Recording) -> tuple[int, int]:
     """Return how many steps and episodes of training precede the first that were lost, if any."""
     steps, episodes = (
-        min([recording.table(topic).count(), *(start for start, _ in recording.lost.get(topic.name, []))])
+        min([table.count() if table else 0, *(start for start, _ in recording.lost.get(topic.name, []))])
         for topic in schema.PHASES["train"]
+        for table in [recording.table(topic)]
     )
     return steps, episodes
 

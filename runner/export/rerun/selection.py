@@ -168,7 +168,7 @@ def select(recording: Recording, request: Request) -> Selection:
 def episodes_of(recording: Recording, phase: str) -> Episodes:
     """Return the episodes of a phase that have steps."""
     own, n = recording.phase(phase), recording.environments
-    total, records = own.steps.count(), own.episodes.array()
+    total, records = own.steps.count() if own.steps else 0, own.episodes.array()
     last, length = (records[name].astype(np.int64) for name in ("last_step", "length"))
     if n > 1:
         return Episodes((last - (length - 1) * n) // n * n, (last // n + 1) * n, len(records))
@@ -283,7 +283,7 @@ def _complete_loop(
     recording: Recording, request: Request, selection: Selection, asked: Mapping[str, Ints]
 ) -> None:
     """Add all steps of a loop if there are few, its last steps of evaluation, and episodes to draw."""
-    total, tested = recording.train.steps.count(), recording.eval.steps.count()
+    total, tested = (phase.steps.count() if phase.steps else 0 for phase in recording.phases)
     limit = total if request.everything else DEFAULT_STEPS
     if request.everything or (request.is_default and total <= limit):
         selection.train = [range(min(total, limit))] if total else []
@@ -308,7 +308,7 @@ def _select_drawn(
     n, total = recording.environments, 0
     shown = min(n, MAX_MEMBERS)
     for phase in schema.PHASES:
-        if not recording.phase(phase).steps.count():
+        if not recording.phase(phase).steps:
             continue
         lengths = episodes_of(recording, phase).lengths // n
         numbers = [np.arange(len(lengths)) if request.everything else asked[phase]]

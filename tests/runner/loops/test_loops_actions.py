@@ -24,7 +24,7 @@ from runner.errors import CannotRedo, ConfigError, Diverged, RecordingError, Run
 from runner.execution.rerecord import rerecord
 from runner.execution.verify import verify
 from runner.export.reports.report import render_report
-from runner.recording.actions import packed
+from runner.recording.actions import packed, unpacked
 from runner.recording.reader import open_recording
 from runner.replay.whole_steps import whole_steps
 from runner.runs.marks import MARK_FILE
@@ -130,6 +130,24 @@ def test_the_content_is_that_of_whole_steps_which_come_again(runs, tmp_path):
             parts = [[block.tobytes() for block in each.table(topic).blocks()] for each in (recording, full)]
             assert b"".join(parts[0]) == b"".join(parts[1])
     assert rerecord(after).summary == after.summary, "there is nothing left to do"
+
+
+def test_steps_of_actions_alone_are_found_by_number_and_not_taken_for_none(tmp_path, monkeypatch):
+    run = single("CartPole-v1")(tmp_path, steps="actions", chunk_steps=256)
+    unpacked_blocks = []
+    monkeypatch.setattr(
+        "runner.recording.steps.unpacked",
+        lambda fields, *more: unpacked_blocks.append(fields["step"]) or unpacked(fields, *more),
+    )
+    with open_recording(run.recording) as recording:
+        steps = recording.train.steps
+        (rows,) = steps.numbered(range(1030, 1036, 2))
+        assert rows["step"].tolist() == [1030, 1032, 1034]
+        assert unpacked_blocks[0] == 1024, "none before the first that is asked for"
+        for read in (steps.count, steps.array, lambda: next(steps.blocks(1030))):
+            with pytest.raises(RecordingError, match="has only the actions of the steps in /train/step"):
+                read()
+        assert steps.total() == 1500
 
 
 def test_one_episode_comes_again_alone(tmp_path):

@@ -65,5 +65,7 @@ def test_steps_around_a_hole_are_those_of_their_numbers(rooms, tmp_path):
         before, after = next((a, b) for a, b in itertools.pairwise(left) if b != a + 1)
         assert numbers(steps, range(before, after + 2)) == [before, after, after + 1]
         assert steps.one(after)["step"] == after
+        assert recording.lost == {"/train/step": [[before + 1, after]]}
+        assert steps.count() == STEPS
         with pytest.raises(RecordingError, match=f"number {before + 1:,} was lost"):
             steps.one(before + 1)
