@@ -63,16 +63,18 @@ def check_phase(recording: Recording, phase: str, complete: bool) -> Findings:
         Inconsistent: something does not follow from the rest.
     """
     own = recording.phase(phase)
-    last_reset = max((int(block["step"][-1]) for block in _numbered(own.resets)), default=0)
-    for _ in _numbered(own.episodes):
-        pass
+    for table in (own.resets, own.episodes):
+        for _ in _numbered(table):
+            pass
     if recording.leaves_out_steps:
         return Findings(last_time=_check_actions(own.steps))
     if own.steps.are_actions:
         raise Inconsistent(
             f"{own.steps.topic.name}: found actions alone, expected whole steps as in the configuration"
         )
-    return _PhaseCheck(recording, phase, None if complete else last_reset).check()
+    last = own.resets.last()
+    stop = None if complete else 0 if last is None else int(last["step"])
+    return _PhaseCheck(recording, phase, stop).check()
 
 
 def _check_actions(steps: WholeSteps) -> int:
@@ -132,6 +134,11 @@ class _Block(NamedTuple):
     """[like `rows`]: whether a reset came before a step."""
     only_reset: Flags
     """[like `rows`]: whether the environment was reset instead of taking the step."""
+
+    @property
+    def numbers(self) -> range:
+        """The numbers of the steps."""
+        return range(self.first, self.first + self.rows.size)
 
 
 class _PhaseCheck:
@@ -201,7 +208,7 @@ class _PhaseCheck:
         wrong = np.flatnonzero((times <= before) | (times % schema.STEP_NANOSECONDS != 0))
         if wrong.size:
             k = wrong[0]
-            raise self._wrong(b.first + k, "log_time", times[k], f"a later tick than {before[k]}")
+            raise self._wrong("step", b.numbers[k], "log_time", times[k], f"a later tick than {before[k]}")
         self._findings.last_time = int(times[-1])
 
     def _check_block(self, b: _Block) -> None:
@@ -209,7 +216,7 @@ class _PhaseCheck:
         self._check_times(b)
         rows = b.rows
         if (wrong := np.flatnonzero(b.only_reset & ~b.was_reset)).size:
-            raise self._wrong(b.first + wrong[0], "t", "that of a reset alone", "a reset before it")
+            raise self._wrong("step", b.numbers[wrong[0]], "t", "that of a reset alone", "a reset before it")
         over = rows["terminated"] | rows["truncated"]
         episodes = self._episodes.take(
             Steps(
@@ -223,9 +230,9 @@ class _PhaseCheck:
                 self._counts(b),
             )
         )
-        self._compare(b.first, "t", rows["t"], episodes.t)
-        self._compare(b.first, "episode", rows["episode"], episodes.number)
-        self._check_reset_episodes(b.resets, episodes.number[b.reset_at])
+        self._compare("step", b.numbers, "t", rows["t"], episodes.t)
+        self._compare("step", b.numbers, "episode", rows["episode"], episodes.number)
+        self._compare("reset", b.resets["reset"], "episode", b.resets["episode"], episodes.number[b.reset_at])
         self._check_observations(b)
         self._count_beginnings(b, np.vstack([self._over, over[:-1]]))
         self._compare_episodes(episodes.ended)
@@ -235,22 +242,14 @@ class _PhaseCheck:
 
     def _is_over(self, b: _Block) -> Flags:
         """Return where a game of several agents ended without the end of any: its episode record says so."""
-        is_over, stop = np.zeros(b.rows.shape, np.bool_), b.first + b.rows.size
+        is_over = np.zeros(b.rows.shape, np.bool_)
         if self._learners > 1 and self._n == 1:
             for block in self._own.episodes.blocks(self._episodes.ended):
                 silent = block["last_step"][~(block["terminated"] | block["truncated"])]
-                is_over[silent[(silent >= b.first) & (silent < stop)] - b.first] = True
-                if block["last_step"][-1] >= stop:
+                is_over[silent[(silent >= b.first) & (silent < b.numbers.stop)] - b.first] = True
+                if block["last_step"][-1] >= b.numbers.stop:
                     break
         return is_over
-
-    def _check_reset_episodes(self, resets: NDArray[np.void], expected: Ints) -> None:
-        if (wrong := np.flatnonzero(resets["episode"] != expected)).size:
-            k = wrong[0]
-            raise Inconsistent(
-                f"/{self._phase}/reset, reset {resets['reset'][k]}: episode: found {resets['episode'][k]}, "
-                f"expected {expected[k]}"
-            )
 
     def _check_observations(self, b: _Block) -> None:
         """Compare the states before steps with those after the steps, or resets, before them."""
@@ -263,25 +262,27 @@ class _PhaseCheck:
             expected = np.where(b.was_reset & ~b.only_reset, given, before)
             if b.only_reset.any():
                 expected = np.where(expected < 0, rows["state"], expected)  # unknown
-            self._compare(b.first, "state", rows["state"], expected)
-            self._compare(b.first, "next_state", after, np.where(b.only_reset, given, after))
+            self._compare("step", b.numbers, "state", rows["state"], expected)
+            self._compare("step", b.numbers, "next_state", after, np.where(b.only_reset, given, after))
         elif b.only_reset.any() and "next_observation" in names:
             observed = np.zeros(rows.shape, b.resets.dtype["observation"])
             observed[b.reset_at] = b.resets["observation"]
             same = _equal(rows["next_observation"][b.only_reset], observed[b.only_reset])
             if not same.all():
-                number = b.first + np.flatnonzero(b.only_reset)[np.flatnonzero(~same)[0]]
+                number = b.numbers[np.flatnonzero(b.only_reset)[np.argmin(same)]]
                 expected_value = "that of the reset before it"
-                raise self._wrong(number, "next_observation", "another value", expected_value)
+                raise self._wrong("step", number, "next_observation", "another value", expected_value)
         if self._learners == 1 and "agents_terminated" in names:
             for name in ("terminated", "truncated"):
-                self._compare(b.first, f"agents_{name}", rows[f"agents_{name}"], rows[name].astype(np.uint32))
+                self._compare(
+                    "step", b.numbers, f"agents_{name}", rows[f"agents_{name}"], rows[name].astype(np.uint32)
+                )
 
     def _count_beginnings(self, b: _Block, after_end: Flags) -> None:
         """Count the episodes after one that ended by itself, with a reset before them and without."""
         explained = b.was_reset | (b.rows["t"] > 0)
         if b.first == 0 and (missing := np.flatnonzero(~explained[0])).size:
-            raise self._wrong(missing[0], "reset", "none", "one before the first step")
+            raise self._wrong("step", missing[0], "reset", "none", "one before the first step")
         began = ~b.only_reset & after_end
         without = np.flatnonzero(began & ~explained)
         if without.size and not self._findings.begun_without:
@@ -319,11 +320,9 @@ class _PhaseCheck:
         for name, values in expected.items() if have else ():
             same = _equal(found[name], values[:have].astype(found[name].dtype))
             if not same.all():
-                k = int(np.flatnonzero(~same)[0])
-                raise Inconsistent(
-                    f"/{self._phase}/episode, episode {found['episode'][k]}: {name}: found "
-                    f"{found[name][k]}, expected {values[k]} by its steps"
-                )
+                k = int(np.argmin(same))
+                expected_value = f"{values[k]} by its steps"
+                raise self._wrong("episode", found["episode"][k], name, found[name][k], expected_value)
 
     def _finish(self, steps: int) -> None:
         """Check the resets after the last step, and that there is nothing else."""
@@ -334,7 +333,7 @@ class _PhaseCheck:
         environment %= self._n
         own = np.array(list(dict.fromkeys(environment.tolist())), np.int64)
         self._compare_episodes(self._episodes.interrupt(steps, own))
-        self._check_reset_episodes(rest, self._episodes.episode[environment])
+        self._compare("reset", rest["reset"], "episode", rest["episode"], self._episodes.episode[environment])
         has_more = {
             "reset": len(self._waiting) > 0,
             "episode": self._own.episodes.count() > self._episodes.ended,
@@ -343,13 +342,16 @@ class _PhaseCheck:
             if found:
                 raise Inconsistent(f"/{self._phase}/{name}: found more records than the steps account for")
 
-    def _compare(self, first: int, name: str, found: Array, expected: Array) -> None:
+    def _compare(self, what: str, numbers: range | Ints, name: str, found: Array, expected: Array) -> None:
+        """Compare a field of steps, resets or episodes, which have these numbers."""
         if (wrong := np.flatnonzero(found != expected)).size:
             k = wrong[0]
-            raise self._wrong(first + k, name, found.flat[k], expected.flat[k])
+            raise self._wrong(what, numbers[k], name, found.flat[k], expected.flat[k])
 
-    def _wrong(self, step: int, name: str, found: object, expected: object) -> Inconsistent:
-        return Inconsistent(f"/{self._phase}/step, step {step}: {name}: found {found}, expected {expected}")
+    def _wrong(self, what: str, number: int, name: str, found: object, expected: object) -> Inconsistent:
+        return Inconsistent(
+            f"/{self._phase}/{what}, {what} {number}: {name}: found {found}, expected {expected}"
+        )
 
 
 def _numbered(table: TopicChunks) -> Iterator[NDArray[np.void]]:

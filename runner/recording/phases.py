@@ -134,11 +134,7 @@ class Phase:
         n, total = self._file.environments, self.steps.total()
         if "content_digest" in self._file.result:
             return total
-        last = None
-        start = self.resets.entry(len(self.resets) - 1).start_time if self.resets else FOREVER
-        for resets in self.resets.rows(range(start, FOREVER)):
-            last = resets[-1]
-        if last is None:
+        if (last := self.resets.last()) is None:
             return 0
         for block in self.steps.rows(range(int(last["log_time"]), FOREVER)):
             over = (block["terminated"] | block["truncated"]) & (block["step"] >= last["step"])

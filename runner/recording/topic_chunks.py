@@ -94,7 +94,8 @@ class TopicChunks:
         """Return the number after that of the last message, or how many there are if they have none."""
         if self.dtype is None:
             if self.topic.message in schema.NUMBERED_BY:
-                return int(self._rows_of(len(self) - 1)[-1][self._number]) + 1 if self else 0
+                last = self.last()
+                return 0 if last is None else int(last[self._number]) + 1
             return sum(len(self._checked(k)[1]) for k in range(len(self)))
         _, ends = self._numbers
         return int(ends[-1]) if len(ends) else 0
@@ -160,6 +161,10 @@ class TopicChunks:
             row: np.void = rows[0]
             return row
         raise RecordingError(f"{self.file.path}: {self.topic.name}: number {number:,} was lost.")
+
+    def last(self) -> np.void | None:
+        """Return the last message, as `rows` does; None if there is none."""
+        return self._rows_of(len(self) - 1)[-1] if self else None
 
     def _blocks_from(self, start: int, stop: int) -> Iterator[NDArray[np.void]]:
         """Yield blocks as `rows` does, the first of which begins with message number `start` or before it."""
