@@ -17,6 +17,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, McapRecord, Metadata
 from mcap.writer import MCAP0_MAGIC
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
@@ -231,24 +232,23 @@ def checked_messages(records: bytes, where: str) -> tuple[int, NDArray[np.uint64
     if schema.TOPIC_OF[channel] in schema.UNIFORM_TOPICS:
         if size < HEADER_BYTES or len(records) % size:
             raise RecordingError(f"{where}: its messages differ in size")
-        block = np.frombuffer(records, np.dtype([*HEADER, ("data", "u1", (size - HEADER_BYTES,))]))
-        offsets = np.arange(len(block), dtype=np.uint64) * np.uint64(size)
+        offsets = np.arange(0, len(records), size, dtype=np.uint64)
+        heads = np.frombuffer(records, np.uint8).reshape(-1, size)[:, :HEADER_BYTES]
     else:
-        starts, at = [], 0
+        starts, at, unpack_head = [], 0, RECORD_HEAD.unpack_from
         while at + HEADER_BYTES <= len(records):
             starts.append(at)
-            at += RECORD_HEAD.size + max(
-                RECORD_HEAD.unpack_from(records, at)[1], HEADER_BYTES - RECORD_HEAD.size
-            )
+            at += RECORD_HEAD.size + unpack_head(records, at)[1]
         if at != len(records):
             raise RecordingError(f"{where}: its messages do not fill it")
-        heads = b"".join(records[start : start + HEADER_BYTES] for start in starts)
-        block = np.frombuffer(heads, np.dtype(HEADER))
         offsets = np.array(starts, dtype=np.uint64)
+        heads = sliding_window_view(np.frombuffer(records, np.uint8), HEADER_BYTES)[starts]
+    block = heads.view(np.dtype(HEADER))[:, 0]
     lengths = np.diff(offsets, append=np.uint64(len(records))) - np.uint64(RECORD_HEAD.size)
     as_written = (
         (block["opcode"] == Opcode.MESSAGE)
         & (block["record_length"] == lengths)
+        & (lengths >= HEADER_BYTES - RECORD_HEAD.size)
         & (block["channel_id"] == channel)
         & (block["sequence"] == 0)
         & (block["publish_time"] == block["log_time"])
