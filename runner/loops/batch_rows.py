@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.loops.description import Described
-from runner.loops.values import require_reset
-from runner.loops.vector_rows import ResetsBetween, VectorRows
+from runner.loops.generators import States
+from runner.loops.vector_rows import VectorRows
 from runner.recording.episode_log import Flags
 from runner.recording.gym_values import fitted, put_unknown
 from runner.recording.recorder import Recorder
+from runner.util.arrays import Array
 
 
 class BatchRows(VectorRows):
@@ -34,11 +35,8 @@ class BatchRows(VectorRows):
     ) -> None:
         super().__init__(recorder, described, phase, first_action, mode == AutoresetMode.NEXT_STEP)
         self._mode = mode
-
-    @property
-    def has_begun(self) -> bool:
-        """Whether the phase has a reset."""
-        return self._reset_count > 0
+        self._current: Array = np.zeros(0, self._resets.dtype["observation"])
+        """The observations after the last step or reset."""
 
     def take_batch(
         self,
@@ -60,12 +58,11 @@ class BatchRows(VectorRows):
         Raises:
             ResetNeeded: the phase has no reset yet.
         """
-        require_reset(self._reset_count, self._phase)
         if not self._room:
-            self._first_action(actions)
-            self._make_room()
+            self._begin(actions)
         steps, n = rewards.shape
-        own = fitted(self._action_leaves, actions, (steps, n), self._action_dtype)
+        of_one = np.dtype((self._actions.dtype, self._actions.shape[2:]))
+        own = fitted(self._leaves[1], actions, (steps, n), of_one)
         seen = self._fitted(observations, steps, n)
         last = None if finals is None else self._fitted(finals, steps, n)
         if self._mode == AutoresetMode.DISABLED:
@@ -78,31 +75,33 @@ class BatchRows(VectorRows):
                 )
         done = 0
         while done < steps:
-            row = self._filled
-            if not row:
-                self._abandon(np.flatnonzero(self._over))
-            count = min(self._room - row, steps - done)
+            row, count = self._filled, min(self._room - self._filled, steps - done)
             rows, part = slice(row, row + count), slice(done, done + count)
             self._actions[rows], self._observations[rows] = own[part], seen[part]
-            self._rewards[rows] = rewards[part]
-            self._terminated[rows], self._truncated[rows] = terminated[part], truncated[part]
+            self._paid[rows] = rewards[part]
+            self._ends[rows, 0], self._ends[rows, 1] = terminated[part], truncated[part]
             if self._mode == AutoresetMode.SAME_STEP:
-                at, which = np.nonzero(self._terminated[rows] | self._truncated[rows])
-                if last is None:
-                    final = np.empty(len(which), self._observation_dtype)
-                    put_unknown(self._observation_leaves, final)
-                else:
-                    final = last[done + at, which]
-                self._finals.append((row + at, which, final))
-                none, after = [None] * len(which), self._observations[row + at, which]
-                self._block_resets.append(ResetsBetween(row + at + 1, which, after, none, none))
+                at, which = np.nonzero(self._ends[rows].any(axis=1))
+                self._add_resets(row + at + 1, which, self._observations[row + at, which])
+                if last is not None:
+                    self._observations[row + at, which] = last[done + at, which]
+                elif len(at):
+                    unknown = np.empty(len(at), self._resets.dtype["observation"])
+                    put_unknown(self._leaves[0], unknown)
+                    self._observations[row + at, which] = unknown
             self._filled += count
             done += count
-            if self._filled == self._room:
+            if self._filled >= self._room:
                 self.commit()
                 self._recorder.write_if_full()
+        self._current = seen[-1].copy()
+
+    def reset(self, observation: object, seeds: Sequence[int | None], which: Flags, states: States) -> None:
+        """Record a reset of all environments; arguments as for a vector."""
+        super().reset(observation, seeds, which, states)
+        self._current = self._fitted(observation, self._n)
 
     def continues_with(self, observations: object) -> bool:
         """Return whether these are the observations [N, ...] after the last step or reset of the phase."""
-        given, now = self._fitted(observations, self._n), self._now()
+        given, now = self._fitted(observations, self._n), self._current
         return bool((given == now).all()) if now.dtype.hasobject else given.tobytes() == now.tobytes()

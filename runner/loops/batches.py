@@ -198,7 +198,7 @@ class RecordedBatches(Recorded[BatchRows]):
 
     def _begin_with(self, observations: object) -> None:
         """Take the observations before a batch: its reset, or those that the last batch ended with."""
-        if not self._rows.has_begun:
+        if not self._rows.resets:
             self._rows.reset(observations, (), np.ones(self.env.num_envs, np.bool_), {})
         elif not self._rows.continues_with(observations):
             raise ConfigError(

@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
 from runner.errors import ConfigError
+from runner.loops.description import Described
 from runner.loops.extras import TOPICS, begin_layout
-from runner.loops.rows import Rows
 from runner.loops.shard_sources import PHASES, Source
-from runner.recording.episode_log import Flags
+from runner.loops.single_rows import SingleRows
+from runner.recording.episode_log import Columns, Flags
 from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAME_LENGTH, MAX_NAMES, ExtraLayout
+from runner.recording.gym_values import Put
 from runner.recording.recorder import BLOCK_BYTES, Recorder
-from runner.util.arrays import Ints
+from runner.util.arrays import Array
 
 _STEP_FIELDS: Final = ("state", "action", "next_state")
 _TRANSITION_FIELDS: Final = ("action", "next_observation", "acted", "agents_terminated", "agents_truncated")
@@ -29,22 +31,26 @@ class Copied:
 
     kind: str
     mdp: Mdp | None
+    environments: int = 1
 
 
-class CopiedRows(Rows):
+class CopiedRows(SingleRows):
     """Rows that are copied as they are, but for their numbers."""
 
     def __init__(self, recorder: Recorder, copied: Copied, phase: str) -> None:
-        self._fields = ("t", *(_STEP_FIELDS if copied.kind == "step" else _TRANSITION_FIELDS))
         super().__init__(recorder, copied, phase, lambda _: None)  # type: ignore[arg-type]
         steps = recorder.dtype(self._topics.steps)
-        self._scratch_dtype = np.dtype(
-            [(name, steps[name]) for name in ("rewards", "terminated", "truncated")]
-        )
-        self.open()
+        self._fields = {*_STEP_FIELDS, *_TRANSITION_FIELDS} & set(steps.names or ())
+        self._room = recorder.capacity(self._topics.steps)
+        self._copied = np.zeros(self._room, steps)
+        self._scratch = np.zeros(self._room, self._scratch.dtype)
 
-    def _set_leaves(self, described: object) -> None:
+    def reshape(self, described: Described) -> None:  # noqa: ARG002
         """Do nothing: values are copied."""
+        self._leaves = None, None
+
+    def _filler(self, leaves: object, column: Array) -> Put:  # noqa: ARG002
+        return column[:, 0].__setitem__
 
     @property
     def begun(self) -> int:
@@ -53,39 +59,30 @@ class CopiedRows(Rows):
 
     def put_reset(self, reset: np.void, environment: int) -> None:
         """Copy a reset."""
-        self._reset_block["environment"][len(self._reset_rows)] = environment
+        self._resets["environment"][self._waiting] = environment
         self.reset(reset["observation"], int(reset["seed"]) if reset["seeded"] else None)
 
     def put(self, rows: NDArray[np.void]) -> None:
         """Copy consecutive steps of the environment that was reset last."""
         while len(rows):
-            part, rows = np.split(rows, [self._room - self.filled])
-            at, self.filled = self.filled, self.filled + len(part)
-            for name in self._fields:
-                self._block[name][at : self.filled] = part[name]
-            for name in self._scratch.dtype.names or ():
-                self._scratch[name][at : self.filled] = part[name]
+            part, rows = np.split(rows, [self._room - self._filled])
+            at, self._filled = self._filled, self._filled + len(part)
+            self._copied[at : self._filled] = part
+            scratch = self._scratch[at : self._filled]
+            scratch["rewards"][:, 0] = part["rewards"]
+            scratch["ends"][:, 0, 0], scratch["ends"][:, 1, 0] = part["terminated"], part["truncated"]
             self._begun += int(np.count_nonzero(part["t"] == 0))
             if self._are_bytes:
                 self._hold(*part["action"], *part["next_observation"])
-            if self.filled == self._room or self._held > BLOCK_BYTES:
+            if self._filled >= self._room or self._held > BLOCK_BYTES:
                 self.commit()
-                self.open()
 
-    def _put_reset(self, observation: object, seed: int | None) -> None:  # noqa: ARG002
-        self._reset_block["observation"][len(self._reset_rows)] = observation
-        if self._are_bytes:
-            self._hold(observation)  # type: ignore[arg-type]
+    def _turns(self, was_reset: Flags) -> tuple[Flags, Flags | bool, Flags | bool]:
+        # An episode begins also after a game that ended without the end of any agent.
+        return was_reset | (self._copied["t"][: len(was_reset), np.newaxis] == 0), False, False
 
-    def _begins(self, n: int) -> Flags:
-        """Return where an episode begins, also after a game that ended without the end of any agent."""
-        return np.asarray(self._block["t"][:n] == 0)
-
-    def _transitions(self, n: int) -> tuple[Ints, Ints, Ints]:
-        if "state" not in self._fields:
-            return super()._transitions(n)
-        state, action, after = (self._block[name][:n].astype(np.int64) for name in _STEP_FIELDS)
-        return state, action, after
+    def _values(self, rows: int, *_: object) -> Columns:
+        return {name: self._copied[name][:rows, np.newaxis] for name in self._fields}
 
 
 class CopiedExtras:

@@ -18,21 +18,20 @@ from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, maker_of
 from runner.loops.options import PackingOptions, options_of
 from runner.loops.recorded import RecordedAlone, require_pictures
-from runner.loops.rows import Rows
-from runner.loops.single_rows import ROWS
+from runner.loops.single_rows import ROWS, SingleRows
 from runner.loops.values import UNCHANGEABLE, as_given, check_phase
 from runner.loops.wrappers import return_name
 from runner.replay.makers import class_name, layers_of
 from runner.runs.run import Run
 
 
-class RecordedEnv(RecordedAlone[Rows], gymnasium.Wrapper[object, object, object, object]):
+class RecordedEnv(RecordedAlone[SingleRows], gymnasium.Wrapper[object, object, object, object]):
     """A Gymnasium environment whose every reset and step is recorded; made by `record`."""
 
     env: Env
 
     def __init__(
-        self, env: Env, loop: Loop[Rows], phase: str = "train", owner: RecordedEnv | None = None
+        self, env: Env, loop: Loop[SingleRows], phase: str = "train", owner: RecordedEnv | None = None
     ) -> None:
         gymnasium.Wrapper.__init__(self, env)
         self._owner = owner
@@ -173,7 +172,7 @@ def record(
     if frames_every:
         require_pictures(env)
     maker = maker_of(env, checked_make(make))
-    loop: Loop[Rows] = Loop(described, options_of(recordings, options), maker, ROWS[described.kind])
+    loop: Loop[SingleRows] = Loop(described, options_of(recordings, options), maker, ROWS[described.kind])
     return RecordedEnv(env, loop, phase)
 
 

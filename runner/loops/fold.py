@@ -307,7 +307,6 @@ class _Fold:
             topics = schema.topics_of(copied.kind, phase)
             if own is not active:
                 active.commit()
-                own.open()
                 active = own
             unit["new_reset"] = own.resets
             unit["new_step"] = own.place[0]

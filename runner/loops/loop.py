@@ -16,8 +16,8 @@ from runner.loops.flushing import FLUSHER
 from runner.loops.loop_run import LoopRun
 from runner.loops.messages import Messages
 from runner.loops.options import Options
+from runner.loops.rows import Rows
 from runner.loops.values import check_phase, warn_user
-from runner.loops.vector_rows import PhaseRows
 from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.metadata import RECORDING_STOPPED
@@ -28,7 +28,7 @@ from runner.util.values import is_whole
 _UNDECIDED_SECONDS: Final = 5.0
 """The dtype of actions is left open this long while no step is taken; then it is that of their space."""
 
-R = TypeVar("R", bound=PhaseRows)
+R = TypeVar("R", bound=Rows)
 
 
 class _IgnoredRows:
@@ -46,7 +46,6 @@ class _IgnoredRows:
         """Return a function that does nothing."""
         return self.ignore
 
-    open = ignore
     commit = ignore
     finish = ignore
     extend = ignore
@@ -155,7 +154,6 @@ class Loop(Generic[R]):
         if self.active is not None and self.active is not rows:
             self.active.commit()
             self.extras.finish()
-            self.active.open()
         self.active = rows
 
     def note(self, phase: str, rows: R, values: Mapping[str, object]) -> None:
@@ -190,7 +188,7 @@ class Loop(Generic[R]):
             raise RunnerError(f"run {self.run.run_id} is closed: nothing more can be recorded in it.")
         return self._recorder.position + (self.active.filled if self.active else 0)
 
-    def moment(self, rows: PhaseRows) -> tuple[int, int, int]:
+    def moment(self, rows: Rows) -> tuple[int, int, int]:
         """Return `position`, and the steps and the episode of a phase."""
         step, episode = rows.place
         if (active := self.active) is None:
@@ -214,8 +212,6 @@ class Loop(Generic[R]):
                 raise ConfigError(f"at_step: found {steps!r}, expected a whole number from {before:,} up")
             self.position  # noqa: B018 - it raises an error if the loop is closed
             self._commit()
-            if self.active is not None:
-                self.active.open()  # else the next steps would replace those just committed
             self.extras.finish()
             if taken["train"]:
                 raise RunnerError(
@@ -340,8 +336,6 @@ class Loop(Generic[R]):
         """Write everything, and go on."""
         self._commit()
         self._recorder.flush()
-        for rows in self._rows.values():
-            rows.open()
 
     def flush(self) -> bool:
         """Write what is half a second old, also while the loop does something else.

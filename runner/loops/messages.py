@@ -17,9 +17,8 @@ from runner.loops.media import media_of
 from runner.loops.options import ALL_INFO, Options, pillow
 from runner.loops.outcomes import Outcomes
 from runner.loops.pictures import Picture
-from runner.loops.rows import MAX_SEED
+from runner.loops.rows import MAX_SEED, Rows
 from runner.loops.values import MAX_ARRAY_BYTES, arrays_of, check_log_name, logged_number
-from runner.loops.vector_rows import PhaseRows
 from runner.recording import schema
 from runner.recording.messages import encode, encode_image, encode_log, frame_id, scalar_encoder
 from runner.recording.recorder import Recorder
@@ -65,10 +64,10 @@ class LoopState(Protocol):
     def position(self) -> int:
         """The number of steps executed so far; raises `RunnerError` if the loop is closed."""
 
-    def moment(self, rows: PhaseRows) -> tuple[int, int, int]:
+    def moment(self, rows: Rows) -> tuple[int, int, int]:
         """Return `position`, and the steps and the episode of a phase."""
 
-    def rows(self, phase: str) -> PhaseRows:
+    def rows(self, phase: str) -> Rows:
         """Return the steps of a phase; raises `ConfigError` if there is no such phase."""
 
     def records(self) -> bool:
@@ -82,7 +81,7 @@ class _Series(NamedTuple):
     """The numbers that are logged under one name in one phase."""
 
     name: str
-    rows: PhaseRows
+    rows: Rows
     encode: Callable[[float, int, int], bytes]
     """Returns the message for a value, step and episode."""
 

@@ -16,12 +16,12 @@ from runner.loops.generators import GeneratorWatch
 from runner.loops.loop import Loop, R
 from runner.loops.messages import Messages
 from runner.loops.options import Arguments, Options
-from runner.loops.rows import Rows
+from runner.loops.single_rows import SingleRows
 from runner.loops.values import frozen_options
 from runner.recording.episode_log import Flags
 from runner.runs.run import Run
 
-S = TypeVar("S", bound=Rows)
+S = TypeVar("S", bound=SingleRows)
 
 
 class Recorded(Generic[R]):

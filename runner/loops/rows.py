@@ -1,223 +1,243 @@
-"""The steps of one phase of a loop: put down as they come, completed and committed some thousands at a time.
+"""The steps of one phase of a loop: put down as they come, completed and recorded some thousands at a time.
 
-What a step brings is written to its final place; what follows from the order of steps (their numbers, the
-state before each, the lengths of episodes) is computed for a whole block at once.
+N environments step at once, and one alone is N = 1: record number n of a phase belongs to environment n
+modulo N. What follows from the order of steps (their numbers, the state before each, the lengths and returns
+of episodes) is computed for a whole block at once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final, SupportsFloat
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from runner.environments.mdp import step_counts
+from runner.environments.mdp import Mdp, step_counts
+from runner.errors import RecordingError
 from runner.loops.description import Described
-from runner.loops.values import warn_user
+from runner.loops.values import require_reset, warn_user
 from runner.recording import schema
 from runner.recording.episode_log import Columns, EpisodeLog, Flags, Steps
-from runner.recording.gym_values import leaves_of
+from runner.recording.gym_values import Put, leaves_of
 from runner.recording.recorder import BLOCK_BYTES, Recorder
-from runner.util.arrays import Ints
+from runner.recording.reset_states import ResetState
+from runner.util.arrays import Array, Ints, Records
 
 MAX_SEED: Final = 2**64 - 1
 """The largest seed that the record of a reset holds."""
+_MAX_STATE: Final = 2**32 - 1
+_RESET: Final = [("row", "<i8"), ("environment", "<i8"), ("seed", "<u8"), ("seeded", "?")]
+"""What is kept of a reset until it is recorded, besides its observation: the row that comes after it."""
 
 
 class Rows:
-    """The rows of one phase of one environment that are not committed yet, and the state of its episodes.
+    """The rows of one phase that are not committed yet, and the state of its episodes.
+
+    Not thread-safe: the caller holds the loop's lock.
 
     Args:
         first_action: called with the first action of the phase before it is put down; may call `reshape`.
     """
 
-    _scratch_dtype: np.dtype[np.void]
-    """What a step brings that waits until its block is completed: `rewards`, `terminated`, `truncated`."""
-    _scratch: NDArray[np.void] = np.zeros(0, "V1")
-
     def __init__(
         self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[object], None]
     ) -> None:
-        self._first_action = first_action
-        self._set_leaves(described)
+        # Python reads attributes slower if there are more than 30, and some are read at each step.
+        self._recorder, self._first_action = recorder, first_action
         self._topics = schema.topics_of(described.kind, phase)
-        self._recorder = recorder
-        self._phase = phase
-        self._mdp = described.mdp
-        self._log = EpisodeLog(
-            1, recorder.dtype(self._topics.episodes)["returns"].shape[0], self._mdp, zero=-0.0
-        )
+        self._mdp, self._n = described.mdp, described.environments
+        learners = recorder.dtype(self._topics.episodes)["returns"].shape[0]
+        self._log = EpisodeLog(self._n, learners, self._mdp, zero=-0.0)
+        observation = recorder.dtype(self._topics.resets)["observation"]
+        self._are_bytes = observation.hasobject
+        """Whether values vary in size."""
+        self._held = 0
+        """The bytes of such values in the block."""
         self.off_table = 0
         """Committed steps whose reward the environment's table excludes; 0 without a table."""
-        self.filled = 0
-        """Rows that are not committed."""
-        self._room = 0
-        self._reset_rows: list[int] = []
-        self._seeds: list[int | None] = []
-        self._fresh = True
-        """Whether the next step begins an episode."""
-        self._begun = 0
-        """Episodes that have begun."""
-        self._reset_count = 0
+        self._filled, self._room = 0, 0
+        """Rows of the block that are in use, and with how many it is full."""
+        self._scratch: Records = np.zeros(
+            0, [("rewards", "<f8", (self._n, learners)), ("ends", "?", (2, self._n))]
+        )
+        """The rewards of each row, and whether it terminated or truncated the episodes."""
+        self.resets = 0
+        """The number of resets so far."""
+        room = max(recorder.capacity(self._topics.resets), self._n)
+        self._resets = np.zeros(room, [*_RESET, ("observation", observation)])
+        self._waiting, self._reset_room = 0, room
+        """Resets that are not committed, and the most of them."""
+        self._states: dict[int, ResetState] = {}
+        """What those resets depended on, by their place, where it is to be recorded."""
+        self._state = np.zeros(self._n, np.int64)
+        """The observations before the first row, where both spaces are discrete."""
         self._last_position = 0
+        """The steps of the run when the last step of the phase was taken."""
+        self._starts: tuple[int, ...] = ()
+        """The least observation and action, where both spaces are discrete."""
+        self.reshape(described)
+
+    def reshape(self, described: Described) -> None:
+        """Prepare for actions of another dtype, before the first step."""
+        if described.kind == "step":
+            spaces = described.observation, described.action
+            self._starts = tuple(int(space.start) for space in spaces)  # type: ignore[attr-defined]
+        self._leaves: tuple[Any, Any] = (
+            leaves_of(described.observation, "observation", on_rounded=warn_user),
+            leaves_of(described.recorded_action, "action", on_rounded=warn_user),
+        )
+
+    @property
+    def _phase(self) -> str:
+        return self._topics.steps.phase
+
+    @property
+    def filled(self) -> int:
+        """Steps of single environments that the recorder does not have yet."""
+        return self._filled * self._n
 
     @property
     def place(self) -> tuple[int, int]:
-        """The steps of the phase so far, and the number of the episode that began last; 0 before any."""
-        return self._recorder.steps[self._phase] + self.filled, max(self._begun - 1, 0)
-
-    # --- what a loop does -----------------------------------------------------------------------------
-
-    def take(
-        self,
-        action: object,
-        observation: object,
-        reward: SupportsFloat,
-        terminated: object,
-        truncated: object,
-    ) -> None:
-        """Put down a step."""
+        """The steps of the phase so far, and the number of an episode."""
         raise NotImplementedError
 
-    @property
-    def resets(self) -> int:
-        """The number of resets so far."""
-        return self._reset_count + len(self._reset_rows)
+    # --- the block ------------------------------------------------------------------------------------
 
-    def reset(self, observation: object, seed: int | None) -> None:
-        """Put down a reset; it ends an episode in progress, neither terminated nor truncated."""
-        if not self._room:  # it is the first one
-            self.open()
-        if seed is not None and not 0 <= seed <= MAX_SEED:
-            seed = None
-        self._put_reset(observation, seed)
-        self._fresh = True
-        self._reset_rows.append(self.filled)
-        self._seeds.append(seed)
-        if len(self._reset_rows) >= self._reset_room:
-            self.commit()
-            self.open()
+    def _begin(self, action: object) -> None:
+        """Allocate the block before the first step: with its action, the dtype of all is known.
 
-    def _count(self, is_over: object) -> None:
-        """Count the row that was just put down; `is_over` is whether the episode ended with it."""
-        self._begun += self._fresh
-        self._fresh = bool(is_over)
-        self.filled += 1
-        if self.filled == self._room:
-            self.commit()
-            self._recorder.write_if_full()
-            self.open()
+        Raises:
+            ResetNeeded: there was no reset.
+        """
+        require_reset(self.resets, self._phase)
+        self._first_action(action)
+        self._room = max(1, self._recorder.capacity(self._topics.steps) // self._n)
+        self._allocate()
 
-    def _set_leaves(self, described: Described) -> None:
-        self._action_leaves = leaves_of(described.recorded_action, "action", on_rounded=warn_user)
-        self._observation_leaves = leaves_of(described.observation, "observation", on_rounded=warn_user)
+    def _allocate(self) -> None:
+        """Make room for rows: actions and observations [rows, N, ...], and what else a step brings."""
+        shape, steps = (self._room, self._n), self._recorder.dtype(self._topics.steps)
+        self._actions: Array = np.zeros(shape, np.int64 if self._starts else steps["action"])
+        self._observations: Array = np.zeros(shape, self._resets.dtype["observation"])
+        self._scratch = np.zeros(self._room, self._scratch.dtype)
+        self._put_observation, self._put_action = map(
+            self._filler, self._leaves, (self._observations, self._actions)
+        )
 
-    def reshape(self, described: Described) -> None:
-        """Take new blocks for actions of another dtype, before the first step."""
-        self._set_leaves(described)
-        self.open()
+    def _filler(self, leaves: Any, column: Array) -> Put:
+        """Return a function that puts a value of all environments into a row of a column [rows, N, ...]."""
+        raise NotImplementedError
 
     def _hold(self, *values: bytes) -> None:
         """Count the bytes of values of varying size; with many of them, the block is full."""
         self._held += sum(map(len, values))
         if self._held > BLOCK_BYTES:
-            self._room, self._reset_room = self.filled + 1, len(self._reset_rows) + 1
+            self._room, self._reset_room = self._filled + 1, self._waiting + 1
 
-    # --- blocks ---------------------------------------------------------------------------------------
-
-    def open(self) -> None:
-        """Take the free part of the recorder's blocks, to put rows into."""
-        self._room, self._reset_room = self._open_steps()
+    # --- records --------------------------------------------------------------------------------------
 
     def commit(self) -> None:
-        """Complete what was put down and hand it to the recorder; then `open` again."""
-        n, before, first = self.filled, self._recorder.position, self._recorder.steps[self._phase]
-        if not (n or self._reset_rows):
+        """Make the records of what was put down and hand them to the recorder."""
+        rows, n, before = self._filled, self._n, self._recorder.position
+        first = self._recorder.steps[self._phase]
+        if not (rows or self._waiting):
             return
-        resets, transitions = np.array(self._reset_rows, np.int64), self._transitions(n)
-        numbers = np.empty(0, np.int64)
-        if n:
-            episodes = self._log.take(self._as_steps(n, first, resets, transitions))
-            numbers = episodes.number[:, 0]
-            self._finish_steps(n, numbers, episodes.t[:, 0], before)
+        resets = self._resets[: self._waiting]
+        was_reset = np.zeros((rows + 1, n), np.bool_)
+        was_reset[resets["row"], resets["environment"] % n] = True
+        number = np.empty((0, n), np.int64)
+        if rows:
+            begins, only_reset, is_over = self._turns(was_reset[:-1])
+            rewards, both = self._scratch["rewards"][:rows], self._scratch["ends"][:rows]
+            terminated, truncated = both[:, 0], both[:, 1]
+            columns = self._values(rows, resets, only_reset)
+            columns |= {"rewards": rewards, "terminated": terminated, "truncated": truncated}
+            ends = rewards, terminated, truncated
+            counts = None if self._mdp is None else self._counts(self._mdp, columns)
+            episodes = self._log.take(Steps(first, *ends, begins, only_reset, is_over, counts))
+            number = episodes.number
+            columns["step"] = first + np.arange(rows * n).reshape(rows, n)
+            columns |= {"episode": number, "t": episodes.t}
+            flat = {name: values.reshape(rows * n, *values.shape[2:]) for name, values in columns.items()}
+            self._recorder.put(self._topics.steps, flat, np.arange(before + 1, before + 1 + rows * n))
             self._put_ends(episodes.ended, first, before)
-        if len(resets):
-            if resets[-1] == n:
-                self._put_ends(self._log.interrupt(first + n, np.zeros(1, np.int64)), first, before)
-            self._finish_resets(np.append(numbers, self._log.episode)[resets], resets + first, before - first)
-            self._reset_count += len(resets)
-        self._recorder.steps[self._phase] += n
-        if n:
-            self._last_position = before + n
-        self.filled = 0
-        self._reset_rows, self._seeds = [], []
+        if self._waiting:
+            resets = self._resets[: self._waiting]
+            last = resets[resets["row"] == rows]
+            cut = list(dict.fromkeys((last["environment"] % n).tolist()))
+            if self._starts:
+                self._state[last["environment"] % n] = last["observation"]
+            ended = self._log.interrupt(first + rows * n, np.array(cut, np.int64))
+            self._put_ends(ended, first, before)
+            self._put_resets(np.vstack([number, self._log.episode]), first, before)
+            resets["seed"], resets["seeded"] = 0, False
+        self._recorder.steps[self._phase] += rows * n
+        if rows:
+            self._last_position = before + rows * n
+        self._filled = self._waiting = self._held = 0
+        self._room, self._reset_room = len(self._scratch), len(self._resets)
 
-    def _as_steps(self, n: int, first: int, resets: Ints, transitions: tuple[Ints, Ints, Ints]) -> Steps:
-        """Return the first n rows as steps of one environment; `resets` are the rows after resets."""
-        rows, is_over = self._outcomes(n)
-        rewards, was_reset = rows["rewards"].reshape(n, 1, -1), self._begins(n)
-        was_reset[resets[resets < n]] = True
-        counts = None
-        if self._mdp is not None:
-            counts, excluded = step_counts(self._mdp, rewards[:, 0, 0], *transitions)
-            self.off_table += int(np.count_nonzero(excluded))
-            counts = counts[:, np.newaxis]
-        ends = rows["terminated"][:, np.newaxis], rows["truncated"][:, np.newaxis]
-        return Steps(first, rewards, *ends, was_reset[:, np.newaxis], is_over=is_over, counts=counts)
+    def _turns(self, was_reset: Flags) -> tuple[Flags, Flags | bool, Flags | bool]:
+        """Return `was_reset`, `only_reset` and `is_over` of the `Steps`; put down the resets among these.
+
+        Args:
+            was_reset: [rows, N], where resets were put down so far.
+        """
+        return was_reset, False, False
+
+    def _values(self, rows: int, resets: Records, only_reset: Flags | bool) -> Columns:
+        """Return the fields of the records that follow from the values of the spaces, [rows, N, ...].
+
+        Args:
+            resets: those besides `only_reset`.
+        """
+        actions, after = self._actions[:rows], self._observations[:rows]
+        if not self._starts:
+            acted, ends = np.ones(after.shape[:2], np.uint32), self._scratch["ends"][:rows]
+            masks = {"acted": acted, "agents_terminated": ends[:, 0], "agents_truncated": ends[:, 1]}
+            return {"action": actions, "next_observation": after, **masks}
+        least_state, least_action = self._starts
+        state = np.vstack([self._state, after])
+        self._state = state[-1].copy()
+        state[resets["row"], resets["environment"]] = resets["observation"]
+        columns = {
+            "state": state[:-1] - least_state,
+            "action": actions - least_action,
+            "next_state": after - least_state,
+        }
+        for name, values in columns.items():
+            known = values if only_reset is False else values[~only_reset]
+            if known.size and not 0 <= known.min() <= known.max() <= _MAX_STATE:
+                raise RecordingError(
+                    f"found {name} {known.min()} to {known.max()}, outside of its Discrete space."
+                )
+        return columns
+
+    def _counts(self, mdp: Mdp, columns: Columns) -> Ints:
+        """Return the events and penalties of each step, and count those that the table excludes."""
+        names = ("state", "action", "next_state")
+        transitions = (columns[name].ravel().astype(np.int64, copy=False) for name in names)
+        counts, excluded = step_counts(mdp, self._scratch["rewards"][: self._filled, 0, 0], *transitions)
+        self.off_table += int(np.count_nonzero(excluded))
+        return counts[:, np.newaxis]
 
     def _put_ends(self, ended: Columns, first: int, before: int) -> None:
         """Record the ends of episodes, each at the time of its last step, which may be committed already."""
         rows = ended["last_step"].astype(np.int64) - first
-        self._recorder.put(
-            self._topics.episodes, ended, np.where(rows < 0, self._last_position, before + rows + 1)
-        )
+        positions = np.where(rows < 0, self._last_position, before) + rows + 1
+        self._recorder.put(self._topics.episodes, ended, positions)
 
-    def _finish_resets(self, episode: Ints, step: Ints, other: int) -> None:
-        """Complete the records of resets; `other` are the steps of the other phase before them."""
-        n = len(step)
-        block = self._recorder.block(self._topics.resets)[:n]
-        block["reset"] = self._reset_count + np.arange(n)
-        block["episode"], block["step"] = episode, step
-        block["seed"] = [seed or 0 for seed in self._seeds]
-        block["seeded"] = [seed is not None for seed in self._seeds]
-        self._recorder.take(self._topics.resets, (step + other).astype(np.uint64))
-
-    # --- what differs by the kind of spaces -----------------------------------------------------------
-
-    def _open_steps(self) -> tuple[int, int]:
-        """Take blocks of steps and resets; return the room in each."""
-        self._block = self._recorder.block(self._topics.steps)
-        self._reset_block = self._recorder.block(self._topics.resets)
-        self._are_bytes, self._held = self._block.dtype.hasobject, 0
-        room = len(self._block)
-        if len(self._scratch) < room:
-            self._scratch = np.zeros(room, self._scratch_dtype)
-            self._bytes = self._scratch.view(np.uint8).data
-        return room, len(self._reset_block)
-
-    def _put_reset(self, observation: object, seed: int | None) -> None:
-        raise NotImplementedError
-
-    def _outcomes(self, n: int) -> tuple[NDArray[np.void], Flags | bool]:
-        """Return what the first n steps brought, and where a game ended without the end of any agent."""
-        return self._scratch[:n], False
-
-    def _begins(self, n: int) -> Flags:
-        """Return before which of the first n rows an episode begins in any case, besides resets."""
-        return np.zeros(n, np.bool_)
-
-    def _transitions(self, n: int) -> tuple[Ints, Ints, Ints]:  # noqa: ARG002
-        """Return state, action and next state of the first n rows; empty arrays without states."""
-        nothing = np.empty(0, np.int64)
-        return nothing, nothing, nothing
-
-    def _finish_steps(self, n: int, episode: Ints, t: Ints, before: int) -> None:
-        """Complete the records of the first n rows and hand them to the recorder."""
-        block, rows = self._block[:n], self._scratch[:n]
-        block["rewards"] = rows["rewards"].reshape(n, -1)
-        block["terminated"], block["truncated"] = rows["terminated"], rows["truncated"]
-        block["step"] = self._recorder.steps[self._phase] + np.arange(n)
-        block["episode"] = episode
-        block["t"] = t
-        self._recorder.take(self._topics.steps, np.arange(before + 1, before + n + 1, dtype=np.uint64))
+    def _put_resets(self, episode: Ints, first: int, before: int) -> None:
+        """Record the resets in their order; `episode` is [rows + 1, N]."""
+        order = np.argsort(self._resets["row"][: self._waiting], kind="stable")
+        resets = self._resets[order]
+        steps, number = resets["row"] * self._n, self.resets - self._waiting
+        columns = {name: resets[name] for name in ("environment", "seed", "seeded", "observation")}
+        columns["episode"] = episode[resets["row"], resets["environment"] % self._n]
+        columns |= {"reset": number + np.arange(len(order)), "step": first + steps}
+        self._recorder.put(self._topics.resets, columns, before + steps)
+        for place, k in enumerate(order.tolist() if self._states else ()):
+            if k in self._states:
+                payload = self._states[k]._replace(reset=number + place).to_payload()
+                self._recorder.append(self._topics.reset_states, payload, before + int(steps[place]))
+        self._states = {}

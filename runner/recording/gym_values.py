@@ -244,13 +244,6 @@ def bytes_of(
     return whole
 
 
-def put_chosen(leaves: Sequence[Leaf], values: object, into: Array, which: NDArray[np.intp]) -> None:
-    """Put values of single environments into their rows, as a vector's info holds them."""
-    put = filler(leaves, into)
-    for i in which.tolist():
-        put(i, element_of(values, i))
-
-
 def element_of(values: Value, i: int | slice) -> Value:
     """Return one of many values, or some, that are nested as their space."""
     if isinstance(values, Mapping):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from runner.environments.gym_types import AnyVectorEnv, Space
 from runner.errors import CannotRedo
 from runner.recording import schema
-from runner.recording.gym_values import filler, leaves_of, put_chosen
+from runner.recording.gym_values import element_of, filler, leaves_of
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value
 from runner.replay.recorded import RecordedReset, calls
@@ -150,7 +150,9 @@ class VectorStepper(Stepper):
         self._over = np.asarray(terminated) | np.asarray(truncated)
         final = final_observations(infos) if self._autoreset == "SameStep" else None
         if final is not None and self._over.any():
-            put_chosen(self._leaves, final, after, np.flatnonzero(self._over))
+            put = filler(self._leaves, after)
+            for i in np.flatnonzero(self._over).tolist():
+                put(i, element_of(final, i))
         if self._recording.has_states:
             after = after - int(self.observation_space.start)  # type: ignore[attr-defined]
         results.observations[rows] = after
