@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow as pa
 from blake3 import blake3
 
-from runner.archive.columns import Shape, Table, shape_of
+from runner.archive.columns import Shape, Table
 from runner.archive.manifest import Entry
-from runner.archive.rows import WHOLE, batch_of, bytes_of, differing, records_of
+from runner.archive.rows import WHOLE, batch_of, bytes_of, records_of, whole
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import message_record
@@ -28,7 +28,7 @@ class Batches:
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self.shape: Shape = shape_of(recording, tuple(recording.extra_layouts))
+        self.shape = Shape(recording, recording.extra_layouts)
         self._hashes = {topic.name: blake3() for topic in recording.topics}
         self._counts = dict.fromkeys(self._hashes, 0)
 
@@ -105,7 +105,7 @@ class Batches:
             batch = batch_of(table, topic, records, self.shape)
             restored = list(records_of(table, topic, batch, self.shape))
             if [part.dtype for part in restored] == [records.dtype]:
-                differs = differing(records, restored[0])
+                differs = whole(records) != whole(restored[0])
                 if not differs.any():
                     return batch
                 number += int(differs.argmax())

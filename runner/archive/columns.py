@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
@@ -55,30 +54,41 @@ class Table:
         return pa.schema({"run_id": TEXT, **phase, "position": pa.int64(), **own})
 
 
-@dataclass(frozen=True)
 class Shape:
-    """The facts of a run that determine its tables and their columns."""
+    """The facts of a run that determine its tables and their columns.
 
-    run_id: str
-    kind: str
-    """One of `schema.KINDS`."""
-    learners: tuple[str, ...]
-    agents: tuple[str, ...]
-    action_counts: tuple[int, ...]
-    events: tuple[str, ...]
-    dtypes: Mapping[Topic, np.dtype[np.void]]
-    """The dtype of each fixed-width topic's message records."""
-    spaces: Mapping[str, SpaceColumns] = field(default_factory=dict)
-    """The spaces of a loop by the field of their values; those of extras have all names."""
-    extras: tuple[ExtraLayout, ...] = ()
-    """The names of extras, from when on."""
+    Args:
+        extras: the names of its extras, from when on.
+
+    Raises:
+        RecordingError: they contradict each other.
+    """
+
+    def __init__(self, run: RunDescription, extras: Sequence[ExtraLayout] = ()) -> None:
+        self.run_id, self.learners, self.extras = run.run_id, run.agents, extras
+        self._topics = run.topics
+        self._mdp = run.mdp if run.tabular else None
+        self._events = self._mdp.event_names if self._mdp else ()
+        where = str(run.path)
+        if len(self._events) != int(run.run["events"]):
+            raise RecordingError(f"{where}: found {len(self._events)} events, expected {run.run['events']}.")
+        self.dtypes = dtypes_of(run.run, where)
+        """The dtype of each fixed-width topic's message records."""
+        self.spaces: dict[str, SpaceColumns] = {}
+        """The spaces of a loop by the field of their values; those of extras have all names."""
+        if extras:
+            self.spaces["values"] = SpaceColumns(extras[-1].description, "values", where, "extra")
+            self.dtypes |= dict.fromkeys(schema.EXTRA_TOPICS, extras[-1].record)
+        if not run.can_train_again:
+            for name in ("action", "next_observation", "observation"):
+                self.spaces[name] = SpaceColumns(run.spaces[name.removeprefix("next_")], name, where)
 
     @cached_property
     def tables(self) -> dict[str, Table]:
         """The tables of messages by name, without Q-tables, in the order in which they are written."""
         tables = {}
         for name, topic_names in layout.TOPICS.items():
-            topics = tuple(topic for topic in schema.KINDS[self.kind] if topic.name in topic_names)
+            topics = tuple(topic for topic in self._topics if topic.name in topic_names)
             if topics and (name != layout.EXTRAS or self.extras):
                 tables[name] = Table(name, topics, tuple(self._columns_of(topics[0].message)))
         return tables
@@ -90,12 +100,12 @@ class Shape:
     @cached_property
     def own_actions(self) -> list[str]:
         """The columns of the agents' own actions, such as `action_taxi_1`; none if there is one agent."""
-        return _names("action_", self.agents) if len(self.agents) > 1 else []
+        return _names("action_", self._mdp.agents) if self._mdp and len(self._mdp.agents) > 1 else []
 
     @cached_property
     def event_columns(self) -> list[str]:
         """The columns that count events, such as `n_taxi_1_drop_off`."""
-        return _names("n_", self.events)
+        return _names("n_", self._events)
 
     def _columns_of(self, message: MessageType) -> list[Column]:
         fields = {field.name: field for field in message.fields}
@@ -121,13 +131,13 @@ class Shape:
         if name == "seed":
             column = nullable(column, lambda records: records["seeded"])
         own = self.own_actions if message is schema.STEP and name == "action" else []
-        return [column, *(Column(action, _INT32, self._action_of(i)) for i, action in enumerate(own))]
+        return [column, *(self._action_of(i, action) for i, action in enumerate(own))]
 
-    def _action_of(self, agent: int) -> Callable[[Records], pa.Array]:
-        """Return the function that reads an agent's own action from the joint one."""
-        counts, joint = self.action_counts, math.prod(self.action_counts)
-        divisor, count = math.prod(counts[agent + 1 :]), counts[agent]
-        return lambda records: pa.array((records["action"] % joint // divisor % count).astype(np.int32))
+    def _action_of(self, agent: int, name: str) -> Column:
+        """Return the column of an agent's own action, which follows from the joint one."""
+        assert self._mdp is not None
+        own = self._mdp.own_actions[:, agent].astype(np.int32)
+        return Column(name, _INT32, lambda records: pa.array(own[records["action"] % len(own)]))
 
     def _summed(self, name: str, source: str) -> list[Column]:
         """Return the column of the learners' sum and, where there are several, one for each."""
@@ -184,36 +194,3 @@ def _names(prefix: str, names: tuple[str, ...]) -> list[str]:
     if len(set(made)) < len(made):
         made = [f"{prefix}{number}" for number in range(1, len(made) + 1)]
     return made
-
-
-def shape_of(run: RunDescription, extras: tuple[ExtraLayout, ...] = ()) -> Shape:
-    """Return the shape of a run.
-
-    Args:
-        extras: the names of its extras, from when on.
-
-    Raises:
-        RecordingError: they contradict each other.
-    """
-    where, mdp = str(run.path), run.mdp if run.tabular else None
-    events = mdp.event_names if mdp else ()
-    if len(events) != int(run.run["events"]):
-        raise RecordingError(f"{where}: found {len(events)} events, expected {run.run['events']}.")
-    spaces, dtypes = {}, dtypes_of(run.run, where)
-    if extras:
-        spaces["values"] = SpaceColumns(extras[-1].description, "values", where, "extra")
-        dtypes |= dict.fromkeys(schema.EXTRA_TOPICS, extras[-1].record)
-    if not run.can_train_again:
-        for name in ("action", "next_observation", "observation"):
-            spaces[name] = SpaceColumns(run.spaces[name.removeprefix("next_")], name, where)
-    return Shape(
-        run_id=run.run_id,
-        kind=run.kind,
-        learners=run.agents,
-        agents=mdp.agents if mdp else (),
-        action_counts=mdp.action_counts if mdp else (),
-        events=events,
-        dtypes=dtypes,
-        spaces=spaces,
-        extras=extras,
-    )

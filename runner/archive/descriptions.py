@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Final
 
 import numpy as np
 import pyarrow as pa
@@ -14,32 +15,39 @@ from runner.environments.naming import actions_in_words, states_in_words
 from runner.errors import RecordingError
 from runner.recording.reader import Recording
 
+_RUN_TYPES: Final = {
+    "seed": pa.uint64(),
+    "created": pa.timestamp("ms", tz="UTC"),
+    **dict.fromkeys(("episodes", "train_steps", "eval_steps"), pa.int64()),
+    "environments": pa.int32(),
+}
+"""The types of the columns of a run that are no text."""
+
 
 def run_table(recording: Recording) -> pa.Table:
     """Return the table with one row that describes a run."""
-    facts, config = recording.run_facts(), recording.config
+    facts = recording.run_facts()
     summary = facts["summary"]
-    columns: dict[str, tuple[pa.DataType, object]] = {
-        "run_id": (pa.string(), facts["run_id"]),
-        "name": (pa.string(), recording.name),
-        "seed": (pa.uint64(), facts["seed"]),
-        "job": (pa.string(), recording.job),
-        "status": (pa.string(), facts["status"]),
-        "created": (pa.timestamp("ms", tz="UTC"), recording.began),
-        "content_digest": (pa.string(), summary.get("content_digest")),
-        "episodes": (pa.int64(), summary.get("episodes")),
-        "train_steps": (pa.int64(), summary.get("train_steps")),
-        "eval_steps": (pa.int64(), summary.get("eval_steps")),
-        "kind": (pa.string(), recording.kind),
-        "env_id": (pa.string(), str(recording.environment.get("env_id"))),
-        "environments": (pa.int32(), recording.environments),
-        "spaces": (pa.string(), recording.run.get("spaces")),
-        "config": (pa.string(), json.dumps(config)),
-        "result": (pa.string(), json.dumps(recording.raw_result)),
-        "provenance": (pa.string(), json.dumps(recording.provenance)),
+    columns = {
+        "run_id": facts["run_id"],
+        "name": recording.name,
+        "seed": facts["seed"],
+        "job": recording.job,
+        "status": facts["status"],
+        "created": recording.began,
+        **{key: summary.get(key) for key in ("content_digest", "episodes", "train_steps", "eval_steps")},
+        "kind": recording.kind,
+        "env_id": str(recording.environment.get("env_id")),
+        "environments": recording.environments,
+        "spaces": recording.run.get("spaces"),
+        "config": json.dumps(recording.config),
+        "result": json.dumps(recording.raw_result),
+        "provenance": json.dumps(recording.provenance),
     }
     try:
-        return pa.table({name: pa.array([value], kind) for name, (kind, value) in columns.items()})
+        return pa.table(
+            {name: pa.array([value], _RUN_TYPES.get(name, pa.string())) for name, value in columns.items()}
+        )
     except (pa.ArrowException, OverflowError) as error:
         raise RecordingError(f"{recording.path}: its result is invalid ({error}).") from error
 

@@ -22,9 +22,6 @@ VERSION: Final = 1
 
 STEPS: Final = "steps.parquet"
 EPISODES: Final = "episodes.parquet"
-TRAIN_METRICS: Final = "train_metrics.parquet"
-EVAL_METRICS: Final = "eval_metrics.parquet"
-OPTIMALITY: Final = "optimality.parquet"
 Q_TABLES: Final = "q_tables.parquet"
 RESETS: Final = "resets.parquet"
 INFOS: Final = "infos.parquet"
@@ -33,14 +30,9 @@ ARRAYS: Final = "arrays.parquet"
 FRAMES: Final = "frames.parquet"
 EXTRA_COLUMNS: Final = "extra_columns.parquet"
 EXTRAS: Final = "extras.parquet"
-RESET_STATES: Final = "reset_states.parquet"
-CHECKPOINTS: Final = "checkpoints.parquet"
 CONTENTS: Final = "checkpoints/"
 """The folder of the contents of checkpoints, named by their digests."""
 LOG: Final = "log.parquet"
-CLOCK: Final = "clock.parquet"
-HOST: Final = "host.parquet"
-CONSOLE: Final = "console.parquet"
 FRAME_ID: Final = "frame_id"
 """A column that archives of earlier versions do not have."""
 RUN: Final = "run.parquet"
@@ -58,22 +50,22 @@ TEXT: Final = pa.dictionary(pa.int8(), pa.string())
 TOPICS: Final = {
     STEPS: ("/train/step", "/eval/step"),
     EPISODES: ("/train/episode", "/eval/episode"),
-    TRAIN_METRICS: ("/train/metrics",),
-    EVAL_METRICS: ("/eval/metrics",),
-    OPTIMALITY: ("/eval/optimality",),
+    "train_metrics.parquet": ("/train/metrics",),
+    "eval_metrics.parquet": ("/eval/metrics",),
+    "optimality.parquet": ("/eval/optimality",),
     RESETS: ("/train/reset", "/eval/reset"),
     INFOS: ("/train/info", "/eval/info"),
     SCALARS: ("/scalar",),
     ARRAYS: ("/array",),
     FRAMES: ("/train/frame", "/eval/frame", "/image"),
     LOG: ("/log",),
-    CLOCK: ("/clock",),
-    HOST: ("/host",),
-    CONSOLE: ("/console",),
-    CHECKPOINTS: ("/checkpoint",),
+    "clock.parquet": ("/clock",),
+    "host.parquet": ("/host",),
+    "console.parquet": ("/console",),
+    "checkpoints.parquet": ("/checkpoint",),
     EXTRA_COLUMNS: ("/extra",),
     EXTRAS: ("/train/extra", "/eval/extra"),
-    RESET_STATES: ("/train/reset_state", "/eval/reset_state"),
+    "reset_states.parquet": ("/train/reset_state", "/eval/reset_state"),
 }
 """The tables of messages in the order in which they are written, without Q-tables, and their topics."""
 FIELDS: Final[Mapping[MessageType, tuple[str, ...]]] = {
@@ -133,7 +125,10 @@ Q_TABLE_COLUMNS: Final = pa.schema(
     ]
 )
 
-LEFT_OUT_IF_EMPTY: Final = frozenset({EXTRA_COLUMNS, EXTRAS, RESET_STATES, CHECKPOINTS, CLOCK, HOST, CONSOLE})
+LEFT_OUT_IF_EMPTY: Final = {
+    *("clock.parquet", "host.parquet", "console.parquet", "checkpoints.parquet", "reset_states.parquet"),
+    *(EXTRA_COLUMNS, EXTRAS),
+}
 """The tables that an archive need not have."""
 EXTRA_PREFIX: Final = "extra_"
 _MAY_BE_NULL: Final = frozenset({"data", "seed"})

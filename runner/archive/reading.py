@@ -7,6 +7,7 @@ before any of it is decompressed. The memory limit of `places.restore_to` bounds
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Final
@@ -15,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from runner.archive import layout
-from runner.archive.columns import Shape, shape_of
+from runner.archive.columns import Shape
 from runner.archive.manifest import MAX_MANIFEST_BYTES, Entry, Manifest, entry_of, is_inside, read_manifest
 from runner.errors import RecordingError
 from runner.recording import schema
@@ -25,13 +26,21 @@ from runner.recording.metadata import check_run, json_object
 from runner.recording.records import MAX_UNPACKED_RATIO
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.util.files import open_regular
-from runner.util.values import Json
+from runner.util.stored import stored_as
 
 MAX_DESCRIPTION_BYTES: Final = 64 << 20
 MAX_ROWS_A_GROUP: Final = 1 << 21
 _UNPACKED_ANYWAY: Final = 1 << 30
 _ROW_BYTES: Final = 88
 """The size of a step in a recording."""
+
+
+@dataclass(frozen=True)
+class _Description:
+    """The contents of `metadata.json`: metadata records by name, and name and media type of attachments."""
+
+    metadata: list[tuple[str, dict[str, str]]]
+    attachments: list[tuple[str, str]]
 
 
 class Archive(RunDescription):
@@ -71,34 +80,23 @@ class Archive(RunDescription):
                 raise RecordingError(f"{path}: {hashes or sizes}: the archive is damaged there.")
 
     @cached_property
+    def _description(self) -> _Description:
+        where = str(self.folder / layout.METADATA)
+        return stored_as(_Description, json_object(self._bytes(layout.METADATA), where), where)
+
+    @cached_property
     def _metadata(self) -> dict[str, dict[str, str]]:
-        try:
-            records = {str(name): dict(entries) for name, entries in self._description["metadata"]}
-            texts = [text for entries in records.values() for pair in entries.items() for text in pair]
-            if not all(isinstance(text, str) for text in texts):
-                raise TypeError("a value is not a text")
-            check_run(records["run"], str(self.folder))
-        except (KeyError, TypeError, ValueError) as error:
-            raise self._invalid(error) from error
+        records = dict(self._description.metadata)
+        check_run(records.get("run", {}), str(self.folder))
         return records
 
     @cached_property
     def attachments(self) -> list[tuple[str, str]]:
         """Name and media type of the recording's attachments, in order."""
-        try:
-            named = [(str(name), str(media_type)) for name, media_type in self._description["attachments"]]
-        except (KeyError, TypeError, ValueError) as error:
-            raise self._invalid(error) from error
+        named = self._description.attachments
         if strange := [name for name, _ in named if not is_inside(name) or name not in self.manifest.files]:
             raise RecordingError(f"{self.folder}: has no attachment {strange[0]!r}.")
         return named
-
-    @cached_property
-    def _description(self) -> Json:
-        return json_object(self._bytes(layout.METADATA), str(self.folder / layout.METADATA))
-
-    def _invalid(self, error: Exception) -> RecordingError:
-        return RecordingError(f"{self.folder / layout.METADATA}: is invalid ({error!r}).")
 
     def metadata(self, name: str) -> dict[str, str]:
         """Return a metadata record's entries.
@@ -123,13 +121,13 @@ class Archive(RunDescription):
     @cached_property
     def shape(self) -> Shape:
         """The shape of the run, which determines its tables."""
-        return shape_of(self, tuple(self._extra_layouts()))
+        return Shape(self, self._extra_layouts())
 
     def _extra_layouts(self) -> list[ExtraLayout]:
         count = self.count(schema.EXTRA_COLUMNS_TOPIC)
         if not count or self.can_train_again:
             return []
-        table = shape_of(self).tables[layout.EXTRA_COLUMNS]
+        table = Shape(self).tables[layout.EXTRA_COLUMNS]
         columns = [
             (row["position"] * STEP_NANOSECONDS, row["json"])
             for batch in self.batches(table.name, table.columns, count, MAX_NAMES)

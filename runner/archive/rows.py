@@ -8,11 +8,10 @@ are objects.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
 from numpy.typing import NDArray
 
 from runner.archive.columns import Shape, Table
@@ -74,19 +73,18 @@ def records_of(table: Table, topic: Topic, batch: pa.RecordBatch, shape: Shape) 
         yield _encoded(topic, fields, shape)
 
 
+def whole(records: Records) -> NDArray[Any]:
+    """Return message records as an array of their bytes, [n]."""
+    if records.dtype == WHOLE:
+        return records["message"]
+    return records.view(f"V{records.itemsize}")
+
+
 def bytes_of(records: Records) -> memoryview:
     """Return the bytes of whole message records, which follow one another."""
     if records.dtype == WHOLE:
-        return memoryview(b"".join(records["message"].tolist()))
-    return records.view(np.uint8).data.cast("B")
-
-
-def differing(a: Records, b: Records) -> NDArray[np.bool_]:
-    """Return whether message records of one dtype differ, [n]."""
-    if a.dtype == WHOLE:
-        return np.asarray(a["message"] != b["message"])
-    found, expected = (records.view(np.uint8).reshape(len(records), -1) for records in (a, b))
-    return np.asarray((found != expected).any(axis=1))
+        return memoryview(b"".join(whole(records)))
+    return whole(records).data.cast("B")
 
 
 def _filled(table: Table, records: Records, times: NDArray[np.uint64], batch: pa.RecordBatch) -> Records:
@@ -115,17 +113,15 @@ def _dtype(topic: Topic, shape: Shape) -> np.dtype[np.void]:
 
 def _decoded(topic: Topic, records: Records, shape: Shape) -> Records:
     """Return the fields of `WHOLE` records."""
-    messages = [decode(topic.message, message[HEADER_BYTES:]) for message in records["message"].tolist()]
-    fields = np.zeros(len(records), _dtype(topic, shape))
-    for field in topic.message.fields:
-        values = [message[field.name] for message in messages]
-        if field.kind == Pb.TYPE_ENUM:
-            values = [log_level(number) for number in values]
-        elif field.name in shape.spaces:
-            values = shape.spaces[field.name].unpack(values)
-        is_object = fields.dtype[field.name].kind == "O"
-        fields[field.name] = np.fromiter(values, object, len(values)) if is_object else values
-    return fields
+    rows = []
+    for time, message in records.tolist():
+        values = decode(topic.message, message[HEADER_BYTES:])
+        if topic.message is schema.LOG:
+            values["level"] = log_level(values["level"])
+        for name in values.keys() & shape.spaces.keys():
+            values[name] = shape.spaces[name].unpack(values[name])
+        rows.append((time, time, *values.values()))
+    return np.array(rows, _dtype(topic, shape))
 
 
 def _encoded(topic: Topic, fields: Records, shape: Shape) -> Records:

@@ -128,13 +128,13 @@ class SpaceColumns:
         """The columns, in order."""
         return [column for _, column in self.columns_by_leaf]
 
-    def unpack(self, values: Sequence[bytes]) -> list[Value]:
-        """Return encoded values as they are assigned to records.
+    def unpack(self, value: bytes) -> Value:
+        """Return an encoded value as it is assigned to a record.
 
         Raises:
-            RecordingError: one is not a value of the space.
+            RecordingError: it is not a value of the space.
         """
-        return [_as_record(decode(self._description, value, self._where)) for value in values]
+        return _as_record(decode(self._description, value, self._where))
 
     def pack(self, values: Array) -> list[bytes]:
         """Return the encoded values of records."""

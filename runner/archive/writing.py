@@ -90,21 +90,20 @@ class TableWriter:
         self._waiting, self._rows, self._bytes = [], 0, 0
 
     def close(self) -> None:
-        """Write what is left, and the footer."""
+        """Write what is left."""
         if self._waiting:
             self._send()
         if self._under_way is not None:
             self._under_way.result()
-        self._thread.shutdown()
-        self._writer.close()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
-        if kind is None:
-            self.close()
-        else:
+        try:
+            if kind is None:
+                self.close()
+        finally:
             self._thread.shutdown()
             self._writer.close()
 

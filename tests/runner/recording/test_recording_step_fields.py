@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 
 from runner.analysis import frames
@@ -10,7 +12,7 @@ from runner.archive import layout
 from runner.archive.columns import Shape
 from runner.archive.rows import batch_of, records_of
 from runner.recording import schema
-from runner.recording.blocks import blank_records, record_dtype
+from runner.recording.blocks import blank_records
 
 NAMES = [field.name for field in schema.STEP.fields]
 
@@ -27,9 +29,19 @@ def test_a_data_frame_has_it(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_an_archive_keeps_it(name):
-    dtype = record_dtype(schema.STEP, 1)
-    shape = Shape("k3v9m2xq", "job", ("agency",), ("a", "b"), (6, 6), (), {schema.TRAIN_STEP: dtype})
-    records = blank_records(schema.TRAIN_STEP, dtype, 1)
+    run = {"kind": "job", "learners": "1", "events": "0"}
+    shape = Shape(
+        SimpleNamespace(
+            path="a recording",
+            run_id="k3v9m2xq",
+            agents=("agency",),
+            topics=schema.KINDS["job"],
+            tabular=False,
+            can_train_again=True,
+            run=run,
+        )
+    )
+    records = blank_records(schema.TRAIN_STEP, shape.dtypes[schema.TRAIN_STEP], 1)
     records[name] = 1
     table = shape.tables[layout.STEPS]
     batch = batch_of(table, schema.TRAIN_STEP, records, shape)
