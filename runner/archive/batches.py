@@ -11,7 +11,7 @@ from blake3 import blake3
 
 from runner.archive.columns import Shape, Table
 from runner.archive.manifest import Entry
-from runner.archive.rows import WHOLE, batch_of, bytes_of, records_of, whole
+from runner.archive.rows import batch_of, bytes_of, records_of, whole
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import message_record
@@ -72,19 +72,24 @@ class Batches:
         """Yield the messages of a topic as records, `WHOLE` ones if they vary in size."""
         if topic.message is schema.EXTRA:
             yield from self._recording.phase(topic.phase).extras.blocks()
-        elif topic in self.shape.dtypes:
-            table = self._recording.table(topic)
-            yield from table.blocks() if table else ()  # of steps there may be the actions alone
+        elif not self.shape.dtypes[topic].hasobject:
+            yield from self._recording.table(topic).blocks()
         else:
             messages, size = [], 0
             for time, payload in self._recording.table(topic).messages():
                 messages.append((time, message_record(topic, time, payload)))
                 size += len(payload)
                 if len(messages) == _ROWS_AT_ONCE or size > _BYTES_AT_ONCE:
-                    yield np.array(messages, WHOLE)
+                    yield self._records_of(topic, messages)
                     messages, size = [], 0
             if messages:
-                yield np.array(messages, WHOLE)
+                yield self._records_of(topic, messages)
+
+    def _records_of(self, topic: Topic, messages: list[tuple[int, bytes]]) -> Records:
+        """Return records that have times and message records only."""
+        records = np.zeros(len(messages), self.shape.dtypes[topic])
+        records["log_time"], records["record"] = zip(*messages, strict=True)
+        return records
 
     def count(self, topic: Topic, records: bytes | memoryview, count: int) -> None:
         """Count and hash messages, given as whole message records."""

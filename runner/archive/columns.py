@@ -16,6 +16,7 @@ from runner.archive.layout import TEXT
 from runner.archive.values import Column, SpaceColumns, nullable, numbers, stored
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.blocks import FIXED
 from runner.recording.description import RunDescription
 from runner.recording.extras import ExtraLayout
 from runner.recording.metadata import dtypes_of
@@ -72,16 +73,32 @@ class Shape:
         where = str(run.path)
         if len(self._events) != int(run.run["events"]):
             raise RecordingError(f"{where}: found {len(self._events)} events, expected {run.run['events']}.")
-        self.dtypes = dtypes_of(run.run, where)
-        """The dtype of each fixed-width topic's message records."""
         self.spaces: dict[str, SpaceColumns] = {}
         """The spaces of a loop by the field of their values; those of extras have all names."""
         if extras:
-            self.spaces["values"] = SpaceColumns(extras[-1].description, "values", where, "extra")
-            self.dtypes |= dict.fromkeys(schema.EXTRA_TOPICS, extras[-1].record)
+            self.spaces["values"] = SpaceColumns(extras[-1].description, "values", where, "extra", "given")
         if not run.can_train_again:
             for name in ("action", "next_observation", "observation"):
                 self.spaces[name] = SpaceColumns(run.spaces[name.removeprefix("next_")], name, where)
+        self.dtypes = {topic: self._varying(topic.message) for topic in run.topics} | dtypes_of(
+            run.run, where
+        )
+        """The dtype of each topic's records: message records, or those of `_varying`."""
+        if extras:
+            self.dtypes |= dict.fromkeys(schema.EXTRA_TOPICS, extras[-1].record)
+
+    def _varying(self, message: MessageType) -> np.dtype[np.void]:
+        """Return the dtype of messages of varying size: time, bytes of the message record, and fields."""
+
+        def held(field: Field) -> object:
+            if field.name in self.spaces:
+                return self.spaces[field.name].dtype
+            if field.repeated:
+                return ("<f8", len(self.learners)) if message is schema.TRANSITION else object
+            return FIXED[field.kind][0] if field.kind in FIXED else object
+
+        head = [("log_time", "<u8"), ("publish_time", "<u8"), ("record", object)]
+        return np.dtype([*head, *((field.name, held(field)) for field in message.fields)])
 
     @cached_property
     def tables(self) -> dict[str, Table]:
@@ -123,8 +140,6 @@ class Shape:
             return [stored(event, _INT32, _item(name, i)) for i, event in enumerate(self.event_columns)]
         if name == "explored":
             return self._explored()
-        if message is schema.EXTRA and name == "values":
-            return [_extra(leaf.path[0], column) for leaf, column in self.spaces[name].columns_by_leaf]
         if field.kind == Pb.TYPE_BYTES and name in self.spaces:
             return self.spaces[name].columns
         column = stored(field.stored_name, _type_of(field), lambda records: records[name])
@@ -162,16 +177,6 @@ def _bit(field: str, i: int, name: str) -> Column:
         records[field] |= numbers(column).astype(np.uint32) << i
 
     return Column(name, _FLAG, lambda records: pa.array(records[field] >> i & 1 != 0), write)
-
-
-def _extra(name: str, column: Column) -> Column:
-    """Return the column of an extra, or of a part of it, which is null where it was not given."""
-
-    def given_in(records: Records) -> Array | None:
-        given = records["given"]
-        return given[name] if name in (given.dtype.names or ()) else None
-
-    return nullable(column, given_in)
 
 
 def _type_of(field: Field) -> pa.DataType:

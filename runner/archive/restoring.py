@@ -17,7 +17,7 @@ from runner.archive import layout
 from runner.archive.columns import Table
 from runner.archive.manifest import Entry, Manifest
 from runner.archive.reading import Archive
-from runner.archive.rows import WHOLE, bytes_of, records_of
+from runner.archive.rows import bytes_of, records_of
 from runner.config.loading import recorded_packing
 from runner.errors import RecordingError
 from runner.recording import schema
@@ -26,7 +26,7 @@ from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.messages import QTable, encode_q_table
 from runner.recording.pipeline import MessageBatches, Pipeline
 from runner.recording.reader import open_recording
-from runner.recording.recorder import BLOCK_BYTES, capacity_of
+from runner.recording.recorder import capacity_of
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
 from runner.replay.snapshots import DerivedTables
@@ -127,13 +127,10 @@ class _Restorer:
     def _records(self, table: Table) -> Iterator[tuple[Topic, Records]]:
         """Yield the rows of a table as records, at most as many as a chunk has."""
         archive, topics = self._archive, table.topics
-        dtype = self._shape.dtypes.get(topics[0])
-        if dtype is not None:
-            rows = capacity_of(topics[0], dtype, self._chunk_steps)
-        elif any(map(pa.types.is_binary, table.columns.types)):
-            rows = 1
-        else:
-            rows = max(1, min(BLOCK_BYTES // layout.row_bytes(table.columns), _ROWS_AT_ONCE))
+        rows = capacity_of(topics[0], self._shape.dtypes[topics[0]], self._chunk_steps)
+        if self._shape.dtypes[topics[0]].hasobject:
+            has_bytes = any(map(pa.types.is_binary, table.columns.types))
+            rows = 1 if has_bytes else min(rows, _ROWS_AT_ONCE)
         for batch in archive.batches(table.name, table.columns, archive.count(*topics), rows):
             for topic, mine in self._by_topic(table, batch):
                 try:
@@ -163,16 +160,20 @@ class _Restorer:
     def _send(self, topic: Topic, records: Records) -> None:
         """Send records to the file: as a chunk, or as messages that share chunks."""
         times = records["log_time"]
-        if records.dtype != WHOLE:
+        if records.dtype.hasobject:
+            self._send_messages(topic, times.tolist(), records["record"].tolist())
+        else:
             offsets = np.arange(len(records), dtype=np.uint64) * np.uint64(records.itemsize)
             self._send_chunk(topic, bytes_of(records), times, offsets)
-            return
-        messages = records["message"].tolist()
-        if (longest := max(map(len, messages))) > MAX_CHUNK_BYTES:
-            raise RecordingError(f"{self._where}: {topic.name}: found a message of {longest:,} bytes.")
-        if not topic.digested:
-            self._undigested[topic].update(bytes_of(records))
-        for time, message in zip(times.tolist(), messages, strict=True):
+
+    def _send_messages(self, topic: Topic, times: list[int], messages: list[bytes]) -> None:
+        for time, message in zip(times, messages, strict=True):
+            if len(message) > MAX_CHUNK_BYTES:
+                raise RecordingError(
+                    f"{self._where}: {topic.name}: found a message of {len(message):,} bytes."
+                )
+            if not topic.digested:
+                self._undigested[topic].update(message)
             self._batches.add(topic, [time], [message])
             if topic.message is schema.IMAGE or self._archive.can_train_again:
                 self._batches.flush()
@@ -212,8 +213,7 @@ class _Restorer:
             tables.give(row["step"], row["table"], values)
         table = QTable(row["step"], row["episode"], row["agent"], row["table"], values)
         topic, time = schema.Q_TABLE_TOPIC, row["position"] * STEP_NANOSECONDS
-        message = message_record(topic, time, encode_q_table(table))
-        self._send(topic, np.array([(time, message)], WHOLE))
+        self._send_messages(topic, [time], [message_record(topic, time, encode_q_table(table))])
 
     def _compare(self) -> None:
         """Compare what was restored with what was archived."""

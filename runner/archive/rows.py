@@ -1,8 +1,7 @@
 """Message records as batches of columns, and back.
 
-Records are those of the file where messages have one size. Others stand as `WHOLE` records: the time, and the
-bytes of the whole message record; in between their fields are records too, in which values of varying size
-are objects.
+Records are those of the file where messages have one size. Others have the bytes of the whole message record
+as an object, and then its fields, in which values of varying size are objects too.
 """
 
 from __future__ import annotations
@@ -18,13 +17,11 @@ from runner.archive.columns import Shape, Table
 from runner.archive.layout import PHASES
 from runner.archive.values import numbers
 from runner.recording import schema
-from runner.recording.blocks import FIXED, HEADER_BYTES, blank_records, message_record
+from runner.recording.blocks import HEADER_BYTES, blank_records, message_record
 from runner.recording.messages import Message, decode, encode, encode_image, encode_log, log_level
-from runner.recording.schema import STEP_NANOSECONDS, Field, Topic
+from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.util.arrays import Records
 
-WHOLE: Final = np.dtype([("log_time", "<u8"), ("message", object)])
-"""The dtype of messages of varying size as records."""
 _TICK: Final = np.uint64(STEP_NANOSECONDS)
 _MAX_POSITION: Final = 2**63 // STEP_NANOSECONDS
 
@@ -42,7 +39,7 @@ def batch_of(table: Table, topic: Topic, records: Records, shape: Shape) -> pa.R
         "phase": _constant(phases.index(topic.phase), n, phases),
         "position": pa.array((records["log_time"] // _TICK).astype(np.int64)),
     }
-    fields = records if topic in shape.dtypes else _decoded(topic, records, shape)
+    fields = _decoded(topic, records, shape) if records.dtype.hasobject else records
     columns |= {column.name: column.read(fields) for column in table.messages}
     return pa.record_batch([columns[name] for name in table.columns.names], schema=table.columns)
 
@@ -57,86 +54,61 @@ def records_of(table: Table, topic: Topic, batch: pa.RecordBatch, shape: Shape) 
     if len(positions) and not 0 <= positions.min() <= positions.max() < _MAX_POSITION:
         raise ValueError(f"after {positions.min()} to {positions.max()} steps")
     times = positions.astype(np.uint64) * _TICK
+    layouts = [(0, shape.dtypes[topic])]
     if topic.message is schema.EXTRA:
-        starts = np.array([layout.start_time for layout in shape.extras], np.uint64)
-        numbers_of_layouts = np.searchsorted(starts, times, "right") - 1
-        for k in np.unique(numbers_of_layouts).tolist():
-            mine = numbers_of_layouts == k
-            dtype = shape.extras[k].record
-            yield _filled(
-                table, blank_records(topic, dtype, int(mine.sum())), times[mine], batch.filter(pa.array(mine))
-            )
-    elif topic in shape.dtypes:
-        yield _filled(table, blank_records(topic, shape.dtypes[topic], len(times)), times, batch)
-    else:
-        fields = _filled(table, np.zeros(len(times), _dtype(topic, shape)), times, batch)
-        yield _encoded(topic, fields, shape)
+        layouts = [(layout.start_time, layout.record) for layout in shape.extras]
+    starts = np.array([start for start, _ in layouts], np.uint64)
+    numbers_of_layouts = np.searchsorted(starts, times, "right") - 1
+    for k in np.unique(numbers_of_layouts).tolist():
+        mine = numbers_of_layouts == k
+        rows = batch if mine.all() else batch.filter(pa.array(mine))
+        records = blank_records(topic, layouts[k][1], rows.num_rows)
+        records["log_time"] = records["publish_time"] = times[mine]
+        for column in table.messages:
+            if column.write is not None:
+                column.write(records, rows.column(column.name))
+        if records.dtype.hasobject:
+            _encode(topic, records, shape)
+        yield records
 
 
 def whole(records: Records) -> NDArray[Any]:
     """Return message records as an array of their bytes, [n]."""
-    if records.dtype == WHOLE:
-        return records["message"]
+    if records.dtype.hasobject:
+        return records["record"]
     return records.view(f"V{records.itemsize}")
 
 
 def bytes_of(records: Records) -> memoryview:
     """Return the bytes of whole message records, which follow one another."""
-    if records.dtype == WHOLE:
+    if records.dtype.hasobject:
         return memoryview(b"".join(whole(records)))
     return whole(records).data.cast("B")
 
 
-def _filled(table: Table, records: Records, times: NDArray[np.uint64], batch: pa.RecordBatch) -> Records:
-    """Return blank records with the values of rows."""
-    records["log_time"] = times
-    records["publish_time"] = times
-    for column in table.messages:
-        if column.write is not None:
-            column.write(records, batch.column(column.name))
-    return records
-
-
-def _dtype(topic: Topic, shape: Shape) -> np.dtype[np.void]:
-    """Return the dtype of the fields of messages of varying size."""
-
-    def held(field: Field) -> object:
-        if field.name in shape.spaces:
-            return shape.spaces[field.name].dtype
-        if field.repeated:
-            return ("<f8", len(shape.learners)) if topic.message is schema.TRANSITION else object
-        return FIXED[field.kind][0] if field.kind in FIXED else object
-
-    times = [("log_time", "<u8"), ("publish_time", "<u8")]
-    return np.dtype([*times, *((field.name, held(field)) for field in topic.message.fields)])
-
-
 def _decoded(topic: Topic, records: Records, shape: Shape) -> Records:
-    """Return the fields of `WHOLE` records."""
+    """Return records with the fields of their messages."""
     rows = []
-    for time, message in records.tolist():
-        values = decode(topic.message, message[HEADER_BYTES:])
+    for time, record in records[["log_time", "record"]].tolist():
+        values = decode(topic.message, record[HEADER_BYTES:])
         if topic.message is schema.LOG:
             values["level"] = log_level(values["level"])
         for name in values.keys() & shape.spaces.keys():
             values[name] = shape.spaces[name].unpack(values[name])
-        rows.append((time, time, *values.values()))
-    return np.array(rows, _dtype(topic, shape))
+        rows.append((time, time, record, *values.values()))
+    return np.array(rows, records.dtype)
 
 
-def _encoded(topic: Topic, fields: Records, shape: Shape) -> Records:
-    """Return the `WHOLE` records of fields."""
-    columns = {field.name: fields[field.name].tolist() for field in topic.message.fields}
+def _encode(topic: Topic, records: Records, shape: Shape) -> None:
+    """Set the messages of records to those of their fields."""
+    columns = {field.name: records[field.name].tolist() for field in topic.message.fields}
     for name in columns.keys() & shape.spaces.keys():
-        columns[name] = shape.spaces[name].pack(fields[name])
-    records = np.zeros(len(fields), WHOLE)
-    records["log_time"] = fields["log_time"]
+        columns[name] = shape.spaces[name].pack(records[name])
     rows = (dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True))
-    records["message"] = [
+    records["record"] = [
         message_record(topic, time, _payload(topic, time, row))
         for time, row in zip(records["log_time"].tolist(), rows, strict=True)
     ]
-    return records
 
 
 def _payload(topic: Topic, time: int, row: Message) -> bytes:

@@ -103,10 +103,11 @@ class SpaceColumns:
 
     Args:
         prefix: the beginning of the columns' names; the field unless given.
+        given: the field that says of each name whether it has a value; else all have.
     """
 
     def __init__(
-        self, description: Mapping[str, object], field: str, where: str, prefix: str | None = None
+        self, description: Mapping[str, object], field: str, where: str, prefix: str = "", given: str = ""
     ) -> None:
         self._description, self._where = description, where
         self._leaves = leaves_of(description, where)
@@ -119,14 +120,10 @@ class SpaceColumns:
         ]
         if len(set(names)) < len(names):
             names = [f"{prefix}_{number}" for number in range(1, len(names) + 1)]
-        self.columns_by_leaf: list[tuple[Leaf, Column]] = [
-            (leaf, _column(name, field, leaf, at)) for name, (leaf, at) in zip(names, parts, strict=True)
+        self.columns = [
+            _column(name, field, given, leaf, at) for name, (leaf, at) in zip(names, parts, strict=True)
         ]
-
-    @property
-    def columns(self) -> list[Column]:
         """The columns, in order."""
-        return [column for _, column in self.columns_by_leaf]
 
     def unpack(self, value: bytes) -> Value:
         """Return an encoded value as it is assigned to a record.
@@ -163,7 +160,7 @@ def _spreadable(leaf: Leaf) -> int:
     return count if count <= MAX_NUMBERS else 0
 
 
-def _column(name: str, field: str, leaf: Leaf, at: tuple[int, ...] | None) -> Column:
+def _column(name: str, field: str, given: str, leaf: Leaf, at: tuple[int, ...] | None) -> Column:
     """Return the column of one number of a leaf, or of all of it."""
     if leaf.dtype is None:
         kind = pa.string()
@@ -174,7 +171,13 @@ def _column(name: str, field: str, leaf: Leaf, at: tuple[int, ...] | None) -> Co
     else:
         kind = pa.from_numpy_dtype(leaf.dtype.base.newbyteorder("="))
     place: Any = (..., *(at or ()))
-    return stored(name, kind, lambda records: _inside(records[field], leaf)[place])
+
+    def given_in(records: Records) -> Array | None:
+        flags = records[given]
+        return flags[leaf.path[0]] if leaf.path[0] in (flags.dtype.names or ()) else None
+
+    column = stored(name, kind, lambda records: _inside(records[field], leaf)[place])
+    return nullable(column, given_in) if given else column
 
 
 def _inside(values: NDArray[Any], leaf: Leaf) -> NDArray[Any]:
