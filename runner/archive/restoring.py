@@ -9,7 +9,6 @@ from typing import Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from blake3 import blake3
 from numpy.typing import NDArray
 
@@ -18,6 +17,7 @@ from runner.archive.columns import Table
 from runner.archive.manifest import Entry, Manifest
 from runner.archive.reading import Archive
 from runner.archive.rows import bytes_of, records_of
+from runner.archive.values import numbers
 from runner.config.loading import recorded_packing
 from runner.errors import RecordingError
 from runner.recording import schema
@@ -140,22 +140,25 @@ class _Restorer:
                         f"{self._where}: {table.name}: {topic.name}: is invalid ({error})."
                     ) from error
 
-    def _by_topic(self, table: Table, batch: pa.RecordBatch) -> list[tuple[Topic, pa.RecordBatch]]:
-        """Return the rows of each topic.
+    def _by_topic(self, table: Table, batch: pa.RecordBatch) -> Iterator[tuple[Topic, pa.RecordBatch]]:
+        """Yield the rows of each topic.
 
         Raises:
             RecordingError: there is a phase other than those of the topics.
         """
         if len(table.topics) == 1:
-            return [(table.topics[0], batch)]
+            yield table.topics[0], batch
+            return
+        topics = {topic.phase: topic for topic in table.topics}
         phases = batch.column("phase")
-        parts = [(topic, batch.filter(pc.equal(phases, topic.phase))) for topic in table.topics]
-        if sum(part.num_rows for _, part in parts) != batch.num_rows:
-            raise RecordingError(
-                f"{self._where}: {table.name}: found phases {pc.unique(phases).to_pylist()}, "
-                f"expected {[topic.phase for topic in table.topics]}."
-            )
-        return [(topic, part) for topic, part in parts if part.num_rows]
+        names, codes = phases.dictionary.to_pylist(), numbers(phases.indices)
+        for code in np.unique(codes).tolist():
+            if names[code] not in topics:
+                raise RecordingError(
+                    f"{self._where}: {table.name}: found phases {names}, expected {list(topics)}."
+                )
+            mine = codes == code
+            yield topics[names[code]], batch if mine.all() else batch.filter(pa.array(mine))
 
     def _send(self, topic: Topic, records: Records) -> None:
         """Send records to the file: as a chunk, or as messages that share chunks."""
