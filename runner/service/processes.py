@@ -41,6 +41,7 @@ PRELOADED: Final = (
     "runner.runs.importing",
     "runner.service.computed",
     "runner.service.fragments",
+    "runner.service.jobs.worker",
     "runner.service.uploads",
 )
 """Modules that every process has from its start, where processes can be forked; those that are installed.

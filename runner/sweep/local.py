@@ -9,14 +9,17 @@ import signal
 from collections.abc import Callable
 from multiprocessing import connection
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnContext
 from multiprocessing.synchronize import Event
-from typing import Final, Generic, Protocol, Self, TypeVar
+from typing import Any, Final, Generic, Protocol, Self, TypeVar
 
-from runner.util.processes import starting_processes
+from runner.util.processes import process_context, start_process, starting_processes
 
 CLOSE_SECONDS: Final = 30.0
 """The time that a worker has to close its recording before it is killed."""
+
+
+PRELOADED: Final = ("runner.execution.session", "runner.sweep.local")
+"""Modules that every worker has from its start, where processes can be forked."""
 
 
 class Work(Protocol):
@@ -55,8 +58,7 @@ class LocalWorkers(Generic[T, R]):
 
     def __init__(self, count: int) -> None:
         self._count = count
-        # Fresh interpreters: a fork would copy locks that threads of this one hold.
-        self._context = multiprocessing.get_context("spawn")
+        self._context = process_context(PRELOADED)
         with starting_processes():  # an event starts one that tracks it
             self._stopping = self._context.Event()
         self._idle: list[_Worker[R]] = []
@@ -109,13 +111,9 @@ class LocalWorkers(Generic[T, R]):
 class _Worker(Generic[R]):
     """A process and the pipe to it."""
 
-    def __init__(self, context: SpawnContext, stopping: Event) -> None:
+    def __init__(self, context: Any, stopping: Event) -> None:
         self.pipe, theirs = context.Pipe()
-        self._process = context.Process(
-            target=serve, args=(theirs, stopping), name="sweep-worker", daemon=True
-        )
-        with starting_processes():
-            self._process.start()
+        self._process = start_process(context, serve, theirs, stopping, name="sweep-worker", daemon=True)
         theirs.close()
 
     def send(self, task: Work) -> bool:
@@ -147,7 +145,8 @@ class _Worker(Generic[R]):
 def serve(pipe: Connection, stopping: Event) -> None:
     """Run the tasks that come through a pipe until it is closed; the main function of a worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of a terminal
-    parent = os.getppid()
+    parent = multiprocessing.parent_process()
+    assert parent is not None
     with contextlib.suppress(EOFError, OSError):
         while True:
-            pipe.send(pipe.recv().run(lambda: stopping.is_set() or os.getppid() != parent))
+            pipe.send(pipe.recv().run(lambda: stopping.is_set() or not parent.is_alive()))

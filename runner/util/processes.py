@@ -21,6 +21,7 @@ import traceback
 import types
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from multiprocessing import process
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Final, ParamSpec, Self, TypeVar
 
@@ -133,6 +134,27 @@ def process_context(preload: Sequence[str] = ()) -> Any:
     if preload:  # or it would forget those of others, if it does not run yet
         context.set_forkserver_preload(list(preload))
     return context
+
+
+def start_process(context: Any, target: Callable[..., None], *args: object, **keywords: Any) -> BaseProcess:
+    """Start and return a process with the variables of this one, also where a fork server starts it.
+
+    Args:
+        keywords: of `multiprocessing.Process`.
+    """
+    variables = dict(os.environ)
+    started: BaseProcess = context.Process(
+        target=_with_variables, args=(variables, target, *args), **keywords
+    )
+    with starting_processes():
+        started.start()
+    return started
+
+
+def _with_variables(variables: Mapping[str, str], target: Callable[..., None], *args: object) -> None:
+    os.environ.clear()
+    os.environ.update(variables)
+    target(*args)
 
 
 class ChildProcess:

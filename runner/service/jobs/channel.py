@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -70,7 +69,6 @@ class PipeChannel:
 
     def __init__(self, pipe: Connection) -> None:
         self._pipe = pipe
-        self._parent = os.getppid()
         self._stopping = threading.Event()
         self._lock = threading.Lock()
         threading.Thread(target=self._receive, name="channel", daemon=True).start()
@@ -82,7 +80,7 @@ class PipeChannel:
 
     def stop(self) -> bool:
         """Return whether the job must stop."""
-        return self._stopping.is_set() or os.getppid() != self._parent
+        return self._stopping.is_set()
 
     def request_stop(self, *_: object) -> None:
         """Stop the job; also a handler of signals."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
 import threading
 import time
 from collections.abc import Container, Iterator
@@ -21,8 +20,9 @@ from runner.service.jobs.channel import JobSpec, Message, Outcome
 from runner.service.jobs.store import WITHOUT_RUNS, Job, JobStore, now
 from runner.service.jobs.worker import work
 from runner.service.logs import LOG
+from runner.service.processes import PRELOADED
 from runner.util.humanize import size
-from runner.util.processes import starting_processes
+from runner.util.processes import process_context, start_process
 
 STOP_SECONDS: Final = 15.0
 """How long a worker may take to close its recording before it is killed."""
@@ -58,7 +58,7 @@ class WorkerPool:
 
     def __init__(self, store: JobStore, size: int, ray: str | None) -> None:
         self.size, self._store, self._ray, self._lock = size, store, ray, store.lock
-        self._context = multiprocessing.get_context("spawn")
+        self._context = process_context(PRELOADED)
         self._busy: dict[int, _Worker] = {}
         self._progress: dict[int, JobProgress] = {}
         """The last progress that each job's worker sent, also when the job is over."""
@@ -165,10 +165,8 @@ class WorkerPool:
         ours, theirs = self._context.Pipe()
         with contextlib.closing(theirs):
             # Not a daemon: a sweep's worker has child processes of its own.
-            process = self._context.Process(target=work, args=(theirs, spec), name=f"job-{job.number}")
             try:
-                with starting_processes():
-                    process.start()
+                process = start_process(self._context, work, theirs, spec, name=f"job-{job.number}")
             except BaseException:
                 ours.close()
                 raise
