@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from runner.learning import algorithms, kernel
 from runner.learning.kernel import Tally
-from runner.learning.learner import NEVER, Learner
+from runner.learning.learner import CHOSEN, NEVER, Learner
 from runner.learning.schedules import compile_schedule, schedule_value
 from runner.planning.evaluation import joint_probabilities
 
@@ -105,12 +105,17 @@ class Continuation:
             np.zeros(1, np.int64),
         )
         play = self._train if moment.phase == "train" else self._evaluate
-        filled, ended = play(action, cursor, tally, steps[:1], episodes)
+        ends = kernel.Ends.of(episodes)
+        filled, ended = play(action, cursor, tally, steps[:1], ends)
         if not ended and len(steps) > 1:
-            filled += play(None, cursor, tally, steps[1:], episodes)[0]
+            more, ended = play(None, cursor, tally, steps[1:], ends)
+            filled += more
+        ends.put(episodes, ended)
         return int(filled)
 
-    def _train(self, action: int | None, cursor: Records, tally: Tally, *blocks: Records) -> tuple[int, int]:
+    def _train(
+        self, action: int | None, cursor: Records, tally: Tally, steps: Records, ends: kernel.Ends
+    ) -> tuple[int, int]:
         learner, rules, tables = self._learner, self._rules, self._learner.tables
         if action is not None:  # greedy agents that prefer it take it
             state, own = self._moment.state, learner.model.own_action[action]
@@ -122,18 +127,19 @@ class Continuation:
                     row = tables.extra[algorithms.POLICY, offset + state * width :][:width]
                     row[:] = np.arange(width) == choice
         fixed = (learner.seed, learner.model, tables, rules)
-        filled, ended = kernel.train(cursor, *fixed, tally, *blocks, self._moment.episode + 1, NEVER, None)
+        until = self._moment.episode + 1
+        filled, ended = kernel.train(cursor, *fixed, tally, steps, ends, until, NEVER, CHOSEN)
         return filled, ended
 
     def _evaluate(
-        self, action: int | None, cursor: Records, tally: Tally, *blocks: Records
+        self, action: int | None, cursor: Records, tally: Tally, steps: Records, ends: kernel.Ends
     ) -> tuple[int, int]:
         learner, moment, policy = self._learner, self._moment, self._learner.trial_actions
         if action is not None:
             policy = policy.copy()
             policy[moment.state] = action
         fixed = (learner.seed, learner.model, learner.tables, policy)
-        filled, ended = kernel.evaluate(cursor, *fixed, tally, *blocks, moment.episode + 1, moment.state)
+        filled, ended = kernel.evaluate(cursor, *fixed, tally, steps, ends, moment.episode + 1, moment.state)
         return filled, ended
 
     def _scheduled(self, schedule: NDArray[np.float64]) -> float:

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.learning import draws
+from runner.learning.compiling import inlined
 from runner.learning.model import Model
 from runner.learning.schedules import schedule_value
 
@@ -120,14 +121,14 @@ Index = np.uint64
 # --- acting -------------------------------------------------------------------------------------------
 
 
-@numba.njit(inline="always")
+@inlined
 def exploring(rules: Rules, episode: int, step: int) -> float:
     """Return the probability of exploring at a training step."""
     epsilon = schedule_value(rules.epsilon, episode, step)
     return 1.0 - epsilon if rules.epsilon_exploits else epsilon
 
 
-@numba.njit(inline="always")
+@inlined
 def choose(
     seed: np.uint64,
     model: Model,
@@ -165,7 +166,7 @@ def choose(
     return action, explored
 
 
-@numba.njit(inline="always")
+@inlined
 def _own_choice(
     seed: np.uint64, model: Model, tables: Tables, rules: Rules, episode: int, t: int, i: int, state: int
 ) -> int:
@@ -195,7 +196,7 @@ def drawn(model: Model, tables: Tables, i: int, state: int, u: float) -> int:
 # --- learning -----------------------------------------------------------------------------------------
 
 
-@numba.njit(inline="always")
+@inlined
 def learn(
     seed: np.uint64,
     model: Model,
@@ -274,7 +275,7 @@ def learn(
     return bootstrapped, second
 
 
-@numba.njit(inline="always")
+@inlined
 def update_rate(rules: Rules, episode: int, step: int, step_size: float, second: bool) -> float:
     """Return the weight of the target in an update; `step_size` at this step, `second` as of `learn`."""
     if len(rules.algorithm) == HYSTERETIC_Q_LEARNING and second:
@@ -282,7 +283,7 @@ def update_rate(rules: Rules, episode: int, step: int, step_size: float, second:
     return step_size
 
 
-@numba.njit(inline="always")
+@inlined
 def _expected(tables: Tables, i: int, state: int, row: int, width: int, epsilon: float) -> float:
     """Return a state's expected value under the epsilon-greedy policy.
 
@@ -323,7 +324,7 @@ def _improve_policy(
     policy[row + best] += moved
 
 
-@numba.njit(inline="always")
+@inlined
 def _set(tables: Tables, i: int, state: int, action: int, row: int, width: int, new: float) -> None:
     """Set Q_i(state, action), and update the state's greedy action and value."""
     old = tables.q[row + action]
@@ -342,7 +343,7 @@ def _set(tables: Tables, i: int, state: int, action: int, row: int, width: int, 
         tables.value[i, state] = new
 
 
-@numba.njit(inline="always")
+@inlined
 def _best(q: NDArray[np.float64], row: int, width: int) -> int:
     best = Index(0)
     highest = q[row]

@@ -5,8 +5,7 @@ generators", OOPSLA 2014) whose state is keyed by seed, stream and episode. Noth
 to be saved: any draw of a run can be computed on its own, no stream can disturb another, and two runs
 of one seed see the same start states and the same exploration draws.
 
-These are functions of numbers alone, which LLVM inlines at no cost. If Numba inlined them first
-(`inline="always"`, as it must what takes arrays), every loop would take seconds longer to compile.
+These are functions of numbers alone, which LLVM inlines at no cost.
 """
 
 from __future__ import annotations

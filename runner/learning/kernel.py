@@ -25,6 +25,7 @@ from runner.learning.algorithms import (
     exploring,
     learn,
 )
+from runner.learning.compiling import inlined, loop
 from runner.learning.ledger import outcome_of
 from runner.learning.model import Model
 from runner.learning.schedules import schedule_value
@@ -43,11 +44,35 @@ class Tally(NamedTuple):
     """Ring over the last episodes: length of episode k at k modulo its length."""
 
 
-_loop = numba.njit(cache=True, nogil=True, _nrt=False)
-"""Compiles a loop. It allocates nothing, so it need not count references to its arrays (`_nrt`): inlined
-functions would count them at every step, atomically, and take four times as long."""
+class Ends(NamedTuple):
+    """Room for the episodes that a call ends, of one type for all environments: a loop is compiled once."""
+
+    counts: NDArray[np.int64]
+    """[n, 6 + E]: what `ENDS` names, and the steps by event."""
+    returns: NDArray[np.float64]
+    """[n, L]."""
+
+    @classmethod
+    def of(cls, episodes: NDArray[np.void]) -> Ends:
+        """Return room for as many episodes as a block of records has."""
+        n = len(episodes)
+        events, learners = episodes["events"].shape[1], episodes["returns"].shape[1]
+        return cls(np.empty((n, len(ENDS) + events), np.int64), np.empty((n, learners)))
+
+    def put(self, episodes: NDArray[np.void], ended: int) -> None:
+        """Fill the first records of a block with the first episodes that ended."""
+        episodes, counts = episodes[:ended], self.counts[:ended]
+        for column, name in enumerate(ENDS):
+            episodes[name] = counts[:, column]
+        episodes["events"] = counts[:, len(ENDS) :]
+        episodes["returns"] = self.returns[:ended]
+
 
 START_RANDOM, START_EACH = -1, -2
+
+ENDS = ("episode", "last_step", "length", "terminated", "truncated", "penalties")
+"""The fields of an ended episode that are one number each."""
+PENALTIES = ENDS.index("penalties")
 
 DRAWN = -2
 """In a policy to evaluate: each learner draws its action from the policy it has learned."""
@@ -59,7 +84,7 @@ CURSOR = np.dtype(
 SARSA the joint action to take there, and which learners explore by it."""
 
 
-@numba.njit(inline="always")
+@inlined
 def _start_state(model: Model, bits: np.uint64) -> int:
     """Return the start state that these bits select."""
     return Index(
@@ -67,7 +92,7 @@ def _start_state(model: Model, bits: np.uint64) -> int:
     )
 
 
-@numba.njit(inline="always")
+@inlined
 def _outcome(model: Model, pair: int, key: np.uint64, t: int) -> int:
     """Return the index of the outcome that follows the (state, joint action) `pair` at time t."""
     outcomes = model.cumulative.shape[1]
@@ -80,7 +105,7 @@ def _outcome(model: Model, pair: int, key: np.uint64, t: int) -> int:
     return pair * Index(outcomes) + k
 
 
-@numba.njit(inline="always")
+@inlined
 def _take_reward(model: Model, tally: Tally, record: np.record, kind: int) -> None:
     """Fill a step's record with the rewards of its outcome, and count them and its events."""
     for i in range(len(model.width)):
@@ -89,34 +114,31 @@ def _take_reward(model: Model, tally: Tally, record: np.record, kind: int) -> No
     tally.event_classes[Index(model.event_class[kind])] += 1
 
 
-@numba.njit(inline="always")
-def _end_episode(model: Model, tally: Tally, record: np.record, last: np.record) -> None:
-    """Fill the episode's record from the tally and its last step, and clear the tally."""
-    record.episode = last.episode
-    record.length = last.t + 1
-    record.last_step = last.step
-    record.terminated = last.terminated
-    record.truncated = last.truncated
-    record.penalties = 0
+@inlined
+def _end_episode(model: Model, tally: Tally, ends: Ends, row: int, last: np.record) -> None:
+    """Fill a row of `ends` from the tally and the episode's last step, and clear the tally."""
+    counts = ends.counts[Index(row)]
+    counts[0], counts[1], counts[2] = last.episode, last.step, last.t + 1
+    counts[3], counts[4] = last.terminated, last.truncated
+    for column in range(PENALTIES, len(counts)):
+        counts[column] = 0
     for i in range(len(tally.returns)):
-        record.returns[i] = tally.returns[i]
+        ends.returns[Index(row), Index(i)] = tally.returns[i]
         tally.returns[i] = 0.0
-    for event in range(len(record.events)):
-        record.events[event] = 0
     for k in range(len(tally.event_classes)):
         count = tally.event_classes[k]
         if count == 0:
             continue
         tally.event_classes[k] = 0
         mask = model.event_mask[k]
-        for event in range(len(record.events)):
+        for event in range(len(counts) - len(ENDS)):
             if mask >> np.uint32(event) & np.uint32(1):
-                record.events[event] += count
+                counts[len(ENDS) + event] += count
         if mask >> np.uint32(31):
-            record.penalties += count
+            counts[PENALTIES] += count
 
 
-@_loop
+@loop
 def train(
     cursor: NDArray[np.void],
     seed: np.uint64,
@@ -125,16 +147,16 @@ def train(
     rules: Rules,
     tally: Tally,
     steps: NDArray[np.void],
-    episodes: NDArray[np.void],
+    ends: Ends,
     until_episode: int,
     until_step: int,
-    replacement: NDArray[np.int32] | None,
+    replacement: NDArray[np.int32],
 ) -> tuple[int, int]:
     """Train until a block is full, or an episode or a step is reached; return (steps, episodes) filled.
 
-    `steps` and `episodes` are record arrays with the fields of the recording's messages; other fields are not
-    touched. All that a later call needs is in the cursor, tables and tally. `replacement` ([J], or None) is
-    the joint action that is taken instead of each one chosen, as at the step of a branch.
+    `steps` are records with the fields of the recording's messages; other fields are not touched. All that a
+    later call needs is in the cursor, tables and tally. `replacement` ([J], or empty) is the joint action
+    that is taken instead of each one chosen, as at the step of a branch.
     """
     at = cursor[0]
     step, episode, t, state = at.step, at.episode, at.t, Index(at.state)
@@ -151,7 +173,7 @@ def train(
     place = step % window
     filled = 0
     ended = 0
-    while filled < len(steps) and ended < len(episodes) and episode < until_episode and step < until_step:
+    while filled < len(steps) and ended < len(ends.counts) and episode < until_episode and step < until_step:
         if t == 0:
             state = _start_state(model, draws.draw(draws.key(seed, draws.START, episode), 0))
             exploration = draws.key(seed, draws.EXPLORATION, episode)
@@ -166,7 +188,7 @@ def train(
             action, explored = next_action, next_explored
         else:
             action, explored = choose(seed, model, tables, rules, epsilon, exploration, episode, t, state)
-        if replacement is not None:  # known when it is compiled: other jobs do not pay for it
+        if len(replacement):
             action = np.int64(replacement[action])
 
         # Take it, and observe.
@@ -210,7 +232,7 @@ def train(
         t += 1
         state = next_state
         if terminated or truncated:
-            _end_episode(model, tally, episodes[ended], record)
+            _end_episode(model, tally, ends, ended, record)
             tally.recent_lengths[episode % lengths] = t
             ended += 1
             episode += 1
@@ -220,7 +242,7 @@ def train(
     return filled, ended
 
 
-@_loop
+@loop
 def evaluate(
     cursor: NDArray[np.void],
     seed: np.uint64,
@@ -229,7 +251,7 @@ def evaluate(
     policy: NDArray[np.int32],
     tally: Tally,
     steps: NDArray[np.void],
-    episodes: NDArray[np.void],
+    ends: Ends,
     until_episode: int,
     start: int,
 ) -> tuple[int, int]:
@@ -245,7 +267,7 @@ def evaluate(
     chance = draws.key(seed, draws.EVALUATION_OUTCOME, episode)
     filled = 0
     ended = 0
-    while filled < len(steps) and ended < len(episodes) and episode < until_episode:
+    while filled < len(steps) and ended < len(ends.counts) and episode < until_episode:
         if t == 0:
             if start >= 0:
                 state = Index(start)
@@ -283,7 +305,7 @@ def evaluate(
         t += 1
         state = next_state
         if terminated or truncated:
-            _end_episode(model, tally, episodes[ended], record)
+            _end_episode(model, tally, ends, ended, record)
             ended += 1
             episode += 1
             t = 0
@@ -291,7 +313,57 @@ def evaluate(
     return filled, ended
 
 
-@_loop
+@inlined
+def relearn(
+    seed: np.uint64, model: Model, tables: Tables, rules: Rules, record: np.record, traced: int
+) -> tuple[int, bool]:
+    """Apply the updates of a recorded training step; return what `learn` returns of learner `traced`.
+
+    A recorded step and the run's draws hold all inputs of its update, so the update is equal to `train`'s,
+    to the last bit.
+    """
+    noted = np.int64(-1), False
+    if not rules.learns:
+        return noted
+    algorithm = len(rules.algorithm)
+    episode, step, t = record.episode, record.step, np.int64(record.t)
+    state, next_state = Index(record.state), Index(record.next_state)
+    step_size = schedule_value(rules.step_size, episode, step)
+    discount = schedule_value(rules.discount, episode, step)
+    next_epsilon = 0.0
+    if algorithm in (SARSA, EXPECTED_SARSA):
+        next_epsilon = exploring(rules, episode, step + 1)
+    next_action = 0
+    if algorithm == SARSA:
+        exploration = draws.key(seed, draws.EXPLORATION, episode)
+        next_action, _ = choose(
+            seed, model, tables, rules, next_epsilon, exploration, episode, t + 1, next_state
+        )
+    now = Moment(episode, step, t, step_size, discount, next_epsilon)
+    bootstraps = not record.terminated or rules.bootstrap_after_termination
+    for i in range(len(model.width)):
+        own = Index(model.own_action[record.action, 0 if rules.first_action_for_all else i])
+        next_own = Index(model.own_action[next_action, i])
+        reward = record.rewards[i]
+        made_of = learn(
+            seed, model, tables, rules, now, i, state, own, reward, next_state, next_own, bootstraps
+        )
+        if i == traced:
+            noted = made_of
+    return noted
+
+
+@inlined
+def _read_rows(model: Model, tables: Tables, rows: NDArray[np.float64], k: int, state: int) -> None:
+    """Read each learner's values of a state into row k of `rows`, [n, L, widest], if it has one."""
+    if k < len(rows):
+        for i in range(len(model.width)):
+            row = tables.offset[i] + state * model.width[i]
+            for action in range(model.width[i]):
+                rows[k, i, action] = tables.q[row + action]
+
+
+@loop
 def replay(
     seed: np.uint64,
     model: Model,
@@ -299,56 +371,26 @@ def replay(
     rules: Rules,
     steps: NDArray[np.void],
     rows: NDArray[np.float64],
-    updates: NDArray[np.void] | None = None,
-    traced: int = 0,
+    updates: NDArray[np.void],
+    traced: int,
 ) -> None:
     """Apply the updates of recorded training steps, in order, to the tables.
 
-    A recorded step and the run's draws hold all inputs of its update, so the replayed update is equal to
-    `train`'s, to the last bit. As far as `rows` ([steps, L, widest], or empty) goes, row k gets each
-    learner's values of the state before step k's update: those it chose by. Item k of `updates`
-    ([steps] of `ledger.UPDATE`, or None) gets what decides the weights of learner `traced`'s update.
+    As far as `rows` ([steps, L, widest], or empty) goes, row k gets each learner's values of the state before
+    step k's update: those it chose by. Item k of `updates` ([steps] of `ledger.UPDATE`, or empty) gets what
+    decides the weights of learner `traced`'s update.
     """
-    algorithm = len(rules.algorithm)
-    learners = len(model.width)
     for k in range(len(steps)):
         record = steps[k]
-        if k < len(rows):
-            for i in range(learners):
-                row = tables.offset[i] + record.state * model.width[i]
-                for action in range(model.width[i]):
-                    rows[k, i, action] = tables.q[row + action]
-        if not rules.learns:
-            continue
-        episode, step, t = record.episode, record.step, np.int64(record.t)
-        state, next_state = Index(record.state), Index(record.next_state)
-        step_size = schedule_value(rules.step_size, episode, step)
-        discount = schedule_value(rules.discount, episode, step)
-        next_epsilon = 0.0
-        if algorithm in (SARSA, EXPECTED_SARSA):
-            next_epsilon = exploring(rules, episode, step + 1)
-        next_action = 0
-        if algorithm == SARSA:
-            exploration = draws.key(seed, draws.EXPLORATION, episode)
-            next_action, _ = choose(
-                seed, model, tables, rules, next_epsilon, exploration, episode, t + 1, next_state
-            )
-        now = Moment(episode, step, t, step_size, discount, next_epsilon)
-        bootstraps = not record.terminated or rules.bootstrap_after_termination
-        for i in range(learners):
-            own = Index(model.own_action[record.action, 0 if rules.first_action_for_all else i])
-            next_own = Index(model.own_action[next_action, i])
-            reward = record.rewards[i]
-            bootstrapped, second = learn(
-                seed, model, tables, rules, now, i, state, own, reward, next_state, next_own, bootstraps
-            )
-            if updates is not None and i == traced:  # known when it is compiled, as None is a type
-                update = updates[k]
-                update.outcome, update.episode = outcome_of(model, record, i), episode
-                update.bootstrapped, update.second = bootstrapped, second
+        _read_rows(model, tables, rows, k, record.state)
+        bootstrapped, second = relearn(seed, model, tables, rules, record, traced)
+        if k < len(updates) and rules.learns:
+            update = updates[k]
+            update.outcome, update.episode = outcome_of(model, record, traced), record.episode
+            update.bootstrapped, update.second = bootstrapped, second
 
 
-@numba.njit(cache=True, nogil=True)
+@loop
 def read_states(
     tables: Tables, states: NDArray[np.int32], value: NDArray[np.float64], greedy: NDArray[np.int32]
 ) -> None:
@@ -364,7 +406,7 @@ def read_states(
                 greedy[i, k] = tables.greedy[i, state]
 
 
-@numba.njit(cache=True, nogil=True)
+@loop
 def replay_probed(
     seed: np.uint64,
     model: Model,
@@ -379,11 +421,12 @@ def replay_probed(
 ) -> None:
     """Replay steps, and read the states of row k of `states` before step `before[k]`."""
     at = 0
-    for k in range(len(before)):
-        replay(seed, model, tables, rules, steps[at : before[k]], rows[at : before[k]])
-        at = before[k]
-        read_states(tables, states[k], value[k], greedy[k])
-    replay(seed, model, tables, rules, steps[at:], rows[at:])
+    for k in range(len(steps)):
+        while at < len(before) and before[at] == k:
+            read_states(tables, states[at], value[at], greedy[at])
+            at += 1
+        _read_rows(model, tables, rows, k, steps[k].state)
+        relearn(seed, model, tables, rules, steps[k], 0)
 
 
 @numba.njit(cache=True)

@@ -23,6 +23,8 @@ from runner.learning.schedules import compile_schedule, schedule_value
 
 NEVER: Final = 2**62
 """A step that no training reaches."""
+CHOSEN: Final = np.empty(0, np.int32)
+"""As `Segment.replacement`: agents take the actions that they choose."""
 
 NamedTables = Mapping[str, NDArray[np.float64]]
 """The tables of one learner: its Q-table as `q`, and its algorithm's `EXTRA_TABLES` by name."""
@@ -36,8 +38,8 @@ class Segment(NamedTuple):
     stop: int
     """The step after the last one."""
     rules: Rules
-    replacement: NDArray[np.int32] | None
-    """[J]: the joint action that is taken at `start` instead of each one chosen; None to take the chosen."""
+    replacement: NDArray[np.int32]
+    """[J]: the joint action that is taken at `start` instead of each one chosen; empty to take the chosen."""
 
 
 class Learner:
@@ -120,7 +122,8 @@ class Learner:
         A branch on the way fills a block too.
         """
         segment = self.segment_at(self.step)
-        replacement = segment.replacement if segment.start == self.step else None
+        replacement = segment.replacement if segment.start == self.step else CHOSEN
+        ends = kernel.Ends.of(episodes)
         filled, ended = kernel.train(
             self._cursor,
             self.seed,
@@ -128,12 +131,13 @@ class Learner:
             self.tables,
             segment.rules,
             self._tally,
-            steps if replacement is None else steps[:1],
-            episodes,
+            steps[:1] if len(replacement) else steps,
+            ends,
             until_episode,
             min(until_step, segment.stop),
             replacement,
         )
+        ends.put(episodes, ended)
         self._mark_success(episodes[:ended])
         return filled, ended
 
@@ -172,6 +176,7 @@ class Learner:
         self, steps: NDArray[np.void], episodes: NDArray[np.void], until_episode: int
     ) -> tuple[int, int]:
         """Play trials until a block is full or trial `until_episode` (counted over the run) is reached."""
+        ends = kernel.Ends.of(episodes)
         filled, ended = kernel.evaluate(
             self._eval_cursor,
             self.seed,
@@ -180,10 +185,11 @@ class Learner:
             self._policy,
             self._eval_tally,
             steps,
-            episodes,
+            ends,
             until_episode,
             self._start,
         )
+        ends.put(episodes, ended)
         self._mark_success(episodes[:ended])
         return filled, ended
 
@@ -310,8 +316,8 @@ def _segments(config: ExperimentConfig, mdp: Mdp) -> list[Segment]:
     ]
 
 
-def _replacement(config: ExperimentConfig, mdp: Mdp, step: int) -> NDArray[np.int32] | None:
-    """Return the joint action to take instead of each one, [J], where branches set actions of agents."""
+def _replacement(config: ExperimentConfig, mdp: Mdp, step: int) -> NDArray[np.int32]:
+    """Return the joint action to take instead of each one, [J], where branches set it; else empty."""
     chosen = {
         agent: action
         for branch in config.branches
@@ -319,7 +325,7 @@ def _replacement(config: ExperimentConfig, mdp: Mdp, step: int) -> NDArray[np.in
         for agent, action in branch.actions.items()
     }
     if not chosen:
-        return None
+        return CHOSEN
     own = mdp.own_actions.copy()
     for agent, action in chosen.items():
         number = agent_of(mdp, agent)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +24,7 @@ from runner.learning.algorithms import (
     exploring,
     update_rate,
 )
+from runner.learning.compiling import inlined, loop
 from runner.learning.model import Model
 from runner.learning.schedules import schedule_value
 
@@ -54,7 +54,7 @@ class Ledger(NamedTuple):
     """[stretches, 2]: how much of the rewards in a stretch of episodes it has, and what these add to it."""
 
 
-@numba.njit(inline="always")
+@inlined
 def outcome_of(model: Model, record: np.record, i: int) -> int:
     """Return which outcome a recorded step had; of several that learner i cannot tell apart, the first."""
     outcomes = model.cumulative.shape[1]
@@ -73,7 +73,7 @@ def outcome_of(model: Model, record: np.record, i: int) -> int:
     return UNKNOWN_OUTCOME
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@loop
 def spread(
     model: Model,
     rules: Rules,

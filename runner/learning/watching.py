@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.learning.algorithms import Index, Rules, Tables, exploring
-from runner.learning.kernel import replay
+from runner.learning.compiling import inlined, loop
+from runner.learning.kernel import relearn
 from runner.learning.model import Model
 
 
@@ -66,7 +67,7 @@ def joined(parts: Sequence[tuple[Changes, int]]) -> Changes:
     return Changes(*map(np.concatenate, columns))
 
 
-@numba.njit(cache=True, nogil=True)
+@inlined
 def _joint_greedy(model: Model, tables: Tables, state: int) -> int:
     action = 0
     for i in range(len(model.width)):
@@ -74,7 +75,7 @@ def _joint_greedy(model: Model, tables: Tables, state: int) -> int:
     return action
 
 
-@numba.njit(cache=True, nogil=True)
+@inlined
 def _follow(model: Model, tables: Tables, watch: Watch, p: int) -> None:
     """Follow the greedy path number p through a deterministic environment, to its end or into a cycle.
 
@@ -100,7 +101,7 @@ def _follow(model: Model, tables: Tables, watch: Watch, p: int) -> None:
     watch.length[p] = n
 
 
-@numba.njit(cache=True, nogil=True)
+@inlined
 def _read(tables: Tables, watch: Watch, changes: Changes, k: int) -> None:
     """Fill row k of `changes` with the watched values as they are now."""
     for n in range(len(watch.cells)):
@@ -111,7 +112,7 @@ def _read(tables: Tables, watch: Watch, changes: Changes, k: int) -> None:
         changes.succeeds[k, p] = watch.succeeds[p]
 
 
-@numba.njit(cache=True, nogil=True)
+@loop
 def begin(model: Model, tables: Tables, watch: Watch, changes: Changes) -> None:
     """Follow all greedy paths, and fill the first row of `changes`."""
     for p in range(len(watch.starts)):
@@ -119,14 +120,13 @@ def begin(model: Model, tables: Tables, watch: Watch, changes: Changes) -> None:
     _read(tables, watch, changes, 0)
 
 
-@numba.njit(cache=True, nogil=True)
+@loop
 def replay_watched(
     seed: np.uint64,
     model: Model,
     tables: Tables,
     rules: Rules,
     steps: NDArray[np.void],
-    rows: NDArray[np.float64],
     watch: Watch,
     changes: Changes,
 ) -> int:
@@ -135,7 +135,6 @@ def replay_watched(
     An update changes values of its step's state only. So a greedy path is followed again only when the greedy
     action changed in one of its states.
     """
-    at = 0
     filled = 0
     for k in range(len(steps)):
         state = Index(steps[k].state)
@@ -143,15 +142,8 @@ def replay_watched(
         for p in range(len(watch.starts)):
             is_on_path |= watch.on_path[p, state]
         is_changed = watch.states[state]
-        if not is_on_path and not is_changed:
-            continue
-        before = 0
-        if is_on_path:
-            replay(seed, model, tables, rules, steps[at:k], rows)
-            at = k
-            before = _joint_greedy(model, tables, state)
-        replay(seed, model, tables, rules, steps[at : k + 1], rows)
-        at = k + 1
+        before = _joint_greedy(model, tables, state)
+        relearn(seed, model, tables, rules, steps[k], 0)
         if is_on_path and _joint_greedy(model, tables, state) != before:
             for p in range(len(watch.starts)):
                 if watch.on_path[p, state]:
@@ -162,7 +154,6 @@ def replay_watched(
             changes.row[filled] = k
             _read(tables, watch, changes, filled)
             filled += 1
-    replay(seed, model, tables, rules, steps[at:], rows)
     return filled
 
 

@@ -17,11 +17,13 @@ from runner.environments.mdp import Mdp
 from runner.errors import RecordingError
 from runner.learning import kernel
 from runner.learning.learner import Learner, NamedTables
+from runner.learning.ledger import UPDATE
 from runner.learning.watching import Changes, Watch, begin, empty_changes, joined, replay_watched
 from runner.replay.steps import check_steps
 from runner.util.arrays import Array
 
 NO_ROWS: Final = np.empty((0, 0, 0))
+NO_UPDATES: Final = np.empty(0, UPDATE)
 
 
 class StateProbe(NamedTuple):
@@ -131,14 +133,14 @@ class StepReplay:
         """
         if probe is not None:
             _check_probe(probe, self._mdp)
-        for state, part in self._segments(steps):
-            records = steps[part].view(np.recarray)
+        for segment, part in self._segments(steps):
+            what = (*segment, rows[part])
             if trace is not None:
-                kernel.replay(*state, records, rows[part], trace.updates[part], trace.learner)
+                kernel.replay(*what, trace.updates[part], trace.learner)
             elif probe is None:
-                kernel.replay(*state, records, rows[part])
+                kernel.replay(*what, NO_UPDATES, 0)
             else:
-                kernel.replay_probed(*state, records, rows[part], *probe.between(part.start, part.stop))
+                kernel.replay_probed(*what, *probe.between(part.start, part.stop))
 
     def begin_watch(self, watch: Watch) -> Changes:
         """Follow the greedy paths of `watch`, and return the watched values as they are now, as one row."""
@@ -153,9 +155,9 @@ class StepReplay:
             watch: `begin_watch` was called with it at `step`, or this method for the steps before.
         """
         parts = [(empty_changes(watch, 0), 0)]
-        for state, part in self._segments(steps):
+        for segment, part in self._segments(steps):
             changes = empty_changes(watch, part.stop - part.start)
-            filled = replay_watched(*state, steps[part].view(np.recarray), NO_ROWS, watch, changes)
+            filled = replay_watched(*segment, watch, changes)
             changes.row[:filled] += part.start
             parts.append((changes, filled))
         return joined(parts)
@@ -173,12 +175,14 @@ class StepReplay:
                 f"those from {self.step} on; `dualtaxi verify` checks the whole recording."
             )
         check_steps(steps, self._mdp, self._where)
+        records = steps.view(np.recarray)
+        records.flags.writeable = False  # as a file's are: the kernel is compiled once
         at = 0
         while at < len(steps):
             segment = self._learner.segment_at(self.step)
             stop = min(len(steps), at + segment.stop - self.step)
-            state = (self._learner.seed, self._learner.model, self._learner.tables, segment.rules)
-            yield state, slice(at, stop)
+            learner, part = self._learner, slice(at, stop)
+            yield (learner.seed, learner.model, learner.tables, segment.rules, records[part]), part
             self.step += stop - at
             at = stop
 

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from runner.config import ExperimentConfig, from_mapping
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
+from runner.learning import kernel
 from runner.learning.learner import Learner
 from runner.recording import schema
 from runner.recording.blocks import blank_records, topic_dtype
+from runner.replay.step_replay import NO_ROWS, NO_UPDATES
 from tests.runner.learning.twin import Twin
 
 SMALL_MAP = ["+---+", "|A: |", "| |B|", "+---+"]
@@ -141,6 +143,16 @@ def train(learner: Learner, until_episode: int, until_step: int, block: int) -> 
         assert filled
         blocks.append((steps[:filled].copy(), episodes[:ended].copy()))
     return _joined(blocks)
+
+
+def replay(
+    learner: Learner, steps: NDArray[np.void], updates: NDArray[np.void] = NO_UPDATES, i: int = 0
+) -> None:
+    """Apply the updates of recorded steps to a learner's tables; fill what decides learner i's weights."""
+    records = steps.view(np.recarray)
+    records.flags.writeable = False  # as `StepReplay` passes them: the kernel is compiled once
+    state = learner.seed, learner.model, learner.tables, learner.rules
+    kernel.replay(*state, records, NO_ROWS, updates, i)
 
 
 def evaluate(learner: Learner, first: int, trials: int, block: int) -> Played:

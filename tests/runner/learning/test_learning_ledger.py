@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runner.learning import kernel, ledger
+from runner.learning import ledger
 from runner.learning.learner import Learner
-from tests.runner.learning.harness import ALGORITHMS, RULES, SMALL, experiment, train
+from tests.runner.learning.harness import ALGORITHMS, RULES, SMALL, experiment, replay, train
 from tests.runner.learning.linear import LinearTwin
 
 STEPS = 500
@@ -22,8 +22,7 @@ def updates_of(config, mdp, steps, i):
     """Return what decides the weights of learner i's updates."""
     learner = Learner(config, mdp, 2)
     updates = np.zeros(len(steps), ledger.UPDATE)
-    state = learner.seed, learner.model, learner.tables, learner.rules
-    kernel.replay(*state, steps, np.empty((0, 0, 0)), updates, i)
+    replay(learner, steps, updates, i)
     return learner, updates
 
 

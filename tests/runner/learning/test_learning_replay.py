@@ -5,15 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runner.learning import kernel
 from runner.learning.learner import Learner
-from tests.runner.learning.harness import ALGORITHMS, GAMES, RULES, SMALL, Played, experiment, train
+from tests.runner.learning.harness import ALGORITHMS, GAMES, RULES, SMALL, Played, experiment, replay, train
 
 
 def replayed(config, mdp, seed, steps, tables=None):
     """Return the tables after these steps."""
     learner = Learner(config, mdp, seed, tables)
-    kernel.replay(learner.seed, learner.model, learner.tables, learner.rules, steps, np.empty((0, 0, 0)))
+    replay(learner, steps)
     return learner.tables
 
 
