@@ -57,13 +57,13 @@ def write_archive(
 class TableWriter:
     """A Parquet file that is being written; a thread compresses batches, a row group at a time."""
 
-    def __init__(self, path: Path, columns: pa.Schema, level: int = LEVEL) -> None:
+    def __init__(self, path: Path, columns: pa.Schema) -> None:
         encodings = layout.encodings_of(columns)
         self._writer = pq.ParquetWriter(
             path,
             columns,
             compression="zstd",
-            compression_level=level,
+            compression_level=LEVEL,
             data_page_size=PAGE_BYTES,
             use_dictionary=[name for name in columns.names if name not in encodings] if encodings else True,
             column_encoding=encodings or None,
