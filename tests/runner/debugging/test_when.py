@@ -17,7 +17,7 @@ from runner.environments.naming import action_names, actions_in_words
 from tests.runner.learning.twin import Twin
 from tests.runner.recording.making import TAXIS, experiment, make_run
 
-SHORT: dict[str, Any] = {"evaluation": None, "log": None, "episodes": 20, "recording": {"chunk_steps": 256}}
+SHORT: dict[str, Any] = {"evaluation": None, "log": None, "episodes": 12, "recording": {"chunk_steps": 256}}
 BY_STEP = {"schedule": "linear", "start": 1.0, "end": 0.1, "over": 900, "by": "step"}
 BY_EPISODE = {"schedule": "exponential", "start": 1.0, "factor": 0.9, "floor": 0.05}
 RUNS: dict[str, dict[str, Any]] = {

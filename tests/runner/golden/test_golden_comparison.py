@@ -23,9 +23,9 @@ def test_scores_that_are_worse_by_the_margin_pass_as_rarely_as_stated(seeds):
         non_inferiority(
             random.normal(0, 1, seeds).tolist(), random.normal(-1, 2, seeds).tolist(), 1.0, 0.05
         ).is_shown
-        for _ in range(2000)
+        for _ in range(600)
     )
-    assert passed / 2000 < 0.07
+    assert passed / 600 < 0.08  # 0.05, and more than three standard errors of 600 samples
 
 
 @pytest.mark.parametrize(
