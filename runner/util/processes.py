@@ -86,6 +86,9 @@ def starting_processes(with_main: bool = True, hash_seed: int | None = None) -> 
         with_main: whether the script of this process is imported in them, as `multiprocessing` does, for what
             it registers; never if it does not guard its statements, which would run once more there.
         hash_seed: their hash seed, if it is not to be that of this process.
+
+    Raises:
+        OSError: the system cannot start another process.
     """
     with _starting:
         variables = {_SAFE_PATH: "1"} | ({} if hash_seed is None else {_HASH_SEED: str(hash_seed)})
@@ -97,6 +100,8 @@ def starting_processes(with_main: bool = True, hash_seed: int | None = None) -> 
             sys.modules["__main__"] = types.ModuleType("__main__")
         try:
             yield
+        except EOFError as error:  # the fork server could not open what it needs
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE)) from error
         finally:
             sys.modules["__main__"], sys.path = main, path
             for name, value in before.items():
@@ -187,9 +192,6 @@ class ChildProcess:
         try:
             with starting_processes(with_main=False, hash_seed=hash_seed):
                 self._process.start()
-        except EOFError as error:  # the fork server could not open what it needs
-            self._pipe.close()
-            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE)) from error
         except BaseException:
             self._pipe.close()
             raise

@@ -6,7 +6,7 @@ import concurrent.futures
 import errno
 import json
 import time
-from multiprocessing.context import SpawnProcess
+from multiprocessing.process import BaseProcess
 
 import pytest
 from submitted import ENDLESS, ICY
@@ -236,8 +236,8 @@ def test_a_job_whose_worker_dies_is_retried_and_then_fails(client, submit):
     number = submit(ENDLESS)
     for _ in range(2):
         job_until(client, number, lambda job: job["progress"] is not None)
-        for process in psutil.Process().children():
-            if "spawn_main" in " ".join(process.cmdline()) and process.nice() > psutil.Process().nice():
+        for process in psutil.Process().children(recursive=True):
+            if process.nice() > psutil.Process().nice():
                 process.kill()
         job_until(client, number, lambda job: job["progress"] is None)
     failed = job_until(client, number, lambda job: job["state"] == "failed")
@@ -329,7 +329,7 @@ def test_a_worker_that_cannot_be_started_is_retried_and_readiness_reports_it(
 
     monkeypatch.setattr(workers, "RETRY_SECONDS", 0.05)
     with monkeypatch.context() as full:
-        full.setattr(SpawnProcess, "start", refused)
+        full.setattr(BaseProcess, "start", refused)
         number = jobs_of(client).store.add("config", "icy", 1, "", one_seed()).number
         waiting = "no worker process can be started (Resource temporarily unavailable)"
         until(
