@@ -153,6 +153,8 @@ class FilterParser(Parser[Part]):
             return self.marked(term.start(), len(term[0]), message)
         if "decimal" in error.msg:
             error.msg += " (a date, an age or a size is put in quotes)"
+        if "unterminated" in error.msg:
+            error.msg += """ (put words to search for in quotes: "O'Brien")"""
         return super().syntax_error(error)
 
     def fixed(self, value: float | str) -> Part:
@@ -187,7 +189,11 @@ class FilterParser(Parser[Part]):
         """Return the condition that compares a column with a constant, or two numbers."""
         if operator is ast.In:
             if not (isinstance(left, ast.Constant) and isinstance(left.value, str)):
-                raise self.error(left, f'found {self.text_of(left)}, expected a text, as in "keep" in tags.')
+                raise self.error(
+                    left,
+                    f'found {self.text_of(left)}, expected a text, as in "keep" in tags; put words to search '
+                    "for in quotes.",
+                )
             term, pattern = self.term(right), glob.escape(left.value)
             is_tags = term.column and term.column.kind is Kind.TAGS
             return self._matching(right, term, pattern if is_tags else f"*{pattern}*")

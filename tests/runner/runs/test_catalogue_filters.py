@@ -348,6 +348,8 @@ def test_any_text_is_a_filter_or_refused_with_its_place(folder, text):
         ("seed = 3", "equality is =="),
         ("episodes > 3 & seed == 3", "write `and`"),
         ("patient and red", "A text is put in quotes"),
+        ("lake in winter", "put words to search for in quotes"),
+        ("O'Brien", "put words to search for in quotes"),
         ("name == quick", "found quick, expected a text in quotes"),
         ('seed == "x"', "expected a whole number"),
         ("seed > 0.5", "expected a whole number from 0 to 18446744073709551615"),
