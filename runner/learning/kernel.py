@@ -419,7 +419,7 @@ def replay_probed(
     value: NDArray[np.float64],
     greedy: NDArray[np.int32],
 ) -> None:
-    """Replay steps, and read the states of row k of `states` before step `before[k]`."""
+    """Replay steps, and read the states of row k of `states` before step `before[k]`; they ascend."""
     at = 0
     for k in range(len(steps)):
         while at < len(before) and before[at] == k:

@@ -132,7 +132,8 @@ class Rows:
         """Count the bytes of values of varying size; with many of them, the block is full."""
         self._held += sum(map(len, values))
         if self._held > BLOCK_BYTES:
-            self._room, self._reset_room = self._filled + 1, self._waiting + 1
+            self._room = min(self._room, self._filled + 1)  # still 0 before the first step
+            self._reset_room = self._waiting + 1
 
     # --- records --------------------------------------------------------------------------------------
 

@@ -147,7 +147,8 @@ def start_process(context: Any, target: Callable[..., None], *args: object, **ke
     Args:
         keywords: of `multiprocessing.Process`.
     """
-    variables = dict(os.environ)
+    with _starting:  # not while another thread has changed them to start a process
+        variables = dict(os.environ)
     started: BaseProcess = context.Process(
         target=_with_variables, args=(variables, target, *args), **keywords
     )

@@ -156,7 +156,7 @@ def test_a_page_and_markdown_are_given_together(record, folder, tmp_path):
     assert "## Training" in result.stdout
     assert str(page) in result.stderr
     assert "where the shares differ most" in page.read_text("utf-8")
-    assert "| seconds |" in result.stdout
+    assert "| train_steps |" in result.stdout
 
 
 def test_the_steps_of_an_interrupted_run_are_compared(record, folder):
