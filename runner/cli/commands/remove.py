@@ -188,10 +188,13 @@ def _carry_out(
     """Show the removals, ask, carry them out and print what was freed.
 
     None of the removals is refused; `kept` has the reason for each run that stays, by id, for programs.
+
+    Raises:
+        RunnerError: some runs could not be removed, as they were tagged meanwhile; all others are gone.
     """
     from runner.runs.catalogue.removal import clean, contents_freed, remove
 
-    contents = contents_freed(removals)
+    contents, failures = contents_freed(removals), dict[str, str]()
     freed = sum(removal.freed for removal in removals) + contents
     if removals and not as_json:
         _draw(removals)
@@ -201,7 +204,14 @@ def _carry_out(
         runs = "this run" if len(removals) == 1 else f"these {len(removals):,} runs"
         _confirm(f"Remove {runs} for good, and free {size(freed)}?", yes)
         for removal in removals:
-            remove(removal, foreign)
+            try:
+                remove(removal, foreign)
+            except RunnerError as error:
+                failures[removal.run_id] = str(error)
+        staying = [removal for removal in removals if removal.run_id in failures]
+        removals = [removal for removal in removals if removal.run_id not in failures]
+        contents -= contents_freed(staying)
+        freed = sum(removal.freed for removal in removals) + contents
         for root in {removal.root for removal in removals}:
             clean(root)
     removed = [
@@ -214,7 +224,7 @@ def _carry_out(
         }
         for removal in removals
     ]
-    reasons = [{"run_id": run_id, "why": reason} for run_id, reason in kept.items()]
+    reasons = [{"run_id": run_id, "why": reason} for run_id, reason in (kept | failures).items()]
     result = {
         "dry_run": dry_run,
         "freed": freed,
@@ -222,7 +232,10 @@ def _carry_out(
         "removed": removed,
         "kept": reasons,
     }
-    _print_removed(counted(len(removals), "run"), result, as_json)
+    if removals or as_json or not failures:
+        _print_removed(counted(len(removals), "run"), result, as_json)
+    if failures:
+        raise RunnerError("\n".join(failures.values()))
 
 
 def _draw(removals: Sequence[Removal]) -> None:

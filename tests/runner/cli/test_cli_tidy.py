@@ -320,6 +320,29 @@ def test_prune_reports_protected_runs(command, make):
     assert not goes.folder.exists()
 
 
+@pytest.mark.parametrize("as_json", [False, True])
+def test_a_run_that_is_tagged_while_others_are_removed_stays_and_is_named(
+    command, make, monkeypatch, as_json
+):
+    runs = [make(9) for _ in range(3)]
+
+    def confirmed(*_):
+        command("label", runs[1].run_id, "--tag", "keep")
+
+    monkeypatch.setattr(remove, "_confirm", confirmed)
+    result = command("prune", 'name == "some"', *(["--json"] if as_json else []))
+    assert result.exit_code == 2
+    assert f"run {runs[1].run_id} stays: it is tagged keep" in " ".join(result.stderr.split())
+    assert there(command) == {runs[1].run_id}
+    if as_json:
+        values = json.loads(result.stdout)
+        assert [run["run_id"] for run in values["kept"]] == [runs[1].run_id]
+        assert len(values["removed"]) == 2
+        assert values["freed"] == sum(run["bytes"] for run in values["removed"])
+    else:
+        assert "Removed 2 runs" in result.stdout
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [((), "which runs?"), (("--older-than", "soon"), "expected an age"), (("  ",), "which runs?")],
