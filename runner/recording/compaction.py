@@ -6,12 +6,15 @@ alone these hold a few hundred bytes, and their heads and index entries take as 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.actions import Rows, packed
 from runner.recording.blocks import message_record
@@ -42,6 +45,7 @@ def compacted(file: RecordingFile, packing: Packing) -> tuple[RecordingFile, dic
 
     Raises:
         OSError: the new recording cannot be written; the old one is as before.
+        RecordingError: the old one was damaged meanwhile, so the new one would lack messages; it stays.
     """
     with replacing(file.path) as path:
         fresh = RecordingFile(path, file.topics)
@@ -63,11 +67,12 @@ def _compact(file: RecordingFile, fresh: RecordingFile, packing: Packing) -> dic
     ) -> None:
         fresh.add_chunk(encode_chunk(topic, records, times, offsets, packing))
 
-    batches, messages = MessageBatches(write), {}
+    batches, messages, read = MessageBatches(write), {}, Counter[str]()
 
     def in_batches(record: Record) -> Record | None:
         if not isinstance(record, ReadChunk):
             return record
+        read[record.topic.name] += len(record.times)
         if record.topic.message is schema.ACTIONS:
             return None
         if len(record.records) > _SMALL:
@@ -78,9 +83,10 @@ def _compact(file: RecordingFile, fresh: RecordingFile, packing: Packing) -> dic
 
     copy(file.path, in_batches, fresh)
     batches.flush()
+    _require_same(file.path, read, file.message_counts)
     with open_recording(file.path) as recording:
         for phase in recording.phases:
-            topic = phase.steps.actions.topic
+            topic, steps = phase.steps.actions.topic, 0
             messages[topic.name] = 0
             most = min(packing.chunk_steps, max(1, BLOCK_BYTES // phase.steps.row_dtype.itemsize))
             for rows in _in_blocks(phase.steps.rows() if phase.steps.are_actions else (), most):
@@ -90,7 +96,20 @@ def _compact(file: RecordingFile, fresh: RecordingFile, packing: Packing) -> dic
                     topic, message_record(topic, int(log_time[0]), payload), log_time, np.zeros(1, np.uint64)
                 )
                 messages[topic.name] += 1
+                steps += len(rows)
+            _require_same(file.path, {topic.name: steps}, {topic.name: phase.steps.total()})
+    _require_same(file.path, fresh.message_counts, file.message_counts | messages)
     return messages
+
+
+def _require_same(path: Path, found: Mapping[str, int], expected: Mapping[str, int]) -> None:
+    """Compare how many messages, or steps, of each topic a copy has with how many its original has."""
+    for name, count in expected.items():
+        if found.get(name, 0) != count:
+            raise RecordingError(
+                f"{path}: {name}: found {found.get(name, 0):,} to copy, expected {count:,}; it was altered "
+                "while it was recorded, and stays as it is."
+            )
 
 
 def _in_blocks(blocks: Iterable[Rows], size: int) -> Iterator[Rows]:

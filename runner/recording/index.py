@@ -288,16 +288,21 @@ class Index:
         crc = crc32(footer, crc32(summary + offsets))
         return b"".join((data_end, summary, offsets, footer, struct.pack("<I", crc), MCAP0_MAGIC))
 
-    def _statistics(self, topics: Sequence[Topic]) -> Statistics:
+    def count_messages(self) -> dict[int, int]:
+        """Return the number of messages of each channel that has any, by the entries of the chunks."""
         chunks = self.chunks.columns
         counts = {
             topic.channel: int(chunks["messages"][chunks["channel"] == topic.channel].sum())
             for topic in ALL_TOPICS
         }
+        return {channel: n for channel, n in counts.items() if n}
+
+    def _statistics(self, topics: Sequence[Topic]) -> Statistics:
+        chunks, counts = self.chunks.columns, self.count_messages()
         return Statistics(
             attachment_count=len(self.attachments),
             channel_count=len(topics),
-            channel_message_counts={channel: n for channel, n in counts.items() if n},
+            channel_message_counts=counts,
             chunk_count=len(chunks),
             message_count=sum(counts.values()),
             metadata_count=len(self.metadata),

@@ -28,7 +28,7 @@ from runner.recording.records import (
     copied_chunk,
     metadata_record,
 )
-from runner.recording.schema import KINDS, PROFILE, Topic
+from runner.recording.schema import KINDS, PROFILE, TOPIC_OF, Topic
 from runner.util import __version__
 
 _LIBRARY = f"dualtaxi {__version__}"
@@ -82,6 +82,11 @@ class RecordingFile:
     def size(self) -> int:
         """Bytes written so far."""
         return self._index.end
+
+    @property
+    def message_counts(self) -> dict[str, int]:
+        """The number of messages of each topic that has any, by name."""
+        return {TOPIC_OF[channel].name: n for channel, n in self._index.count_messages().items()}
 
     def add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
         """Append a metadata record."""

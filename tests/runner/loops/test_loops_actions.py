@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import time
 
 import gymnasium
 import numpy as np
@@ -25,6 +26,7 @@ from runner.execution.rerecord import rerecord
 from runner.execution.verify import verify
 from runner.export.reports.report import render_report
 from runner.recording.actions import packed, unpacked
+from runner.recording.integrity import survey
 from runner.recording.reader import open_recording
 from runner.replay.whole_steps import whole_steps
 from runner.runs.marks import MARK_FILE
@@ -361,6 +363,27 @@ def test_a_disk_without_space_for_both_keeps_the_small_chunks(tmp_path, monkeypa
     with open_recording(run.recording) as recording:
         assert len(list(recording.train.steps.rows())) > 1
     assert verify(run.recording).verdict == "reproduced"
+
+
+@pytest.mark.parametrize("end", [False, True])
+def test_chunks_that_cannot_be_read_when_a_recording_ends_keep_the_original(tmp_path, end):
+    env = runner.record(gymnasium.make("CartPole-v1"), tmp_path, steps="actions")
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    for step in range(3000):
+        if any(env.step(env.action_space.sample())[2:4]):
+            env.reset()
+        if step % 1000 == 999:
+            time.sleep(0.7)  # a chunk is written
+    path = env.run.recording
+    chunks = list(survey(path).chunks)
+    with path.open("r+b") as file:
+        file.seek(chunks[-1 if end else 1].offset)
+        file.write(b"\xff")  # a kind of record that no reader knows: a walk ends here
+    with pytest.raises(RecordingError, match="to copy, expected"):
+        env.close()
+    assert [file.name for file in path.parent.glob(".*.mcap")] == []
+    assert len(survey(path).chunks) == chunks.index(chunks[-1 if end else 1])
 
 
 def test_a_changed_action_is_found(tmp_path, monkeypatch):
