@@ -64,17 +64,17 @@ def verify_loop(recording: Recording) -> Verification:
     except Diverged as error:
         return with_difference(replace(verification, notes=tuple(notes)), error)
     verification = replace(verification, notes=tuple(notes))
-    if not finished:
-        return verification
-    digests = content_hash(recording).topics()
-    counts = {
+    counts = {  # reads the messages that nothing above has read
         topic.name: recording.table(topic).count() if recording.table(topic) else 0
         for topic in recording.topics
         if topic not in schema.MACHINE_TOPICS
     }
+    if not finished:
+        return verification
+    digests = content_hash(recording).topics()
     if recording.leaves_out_steps:
         stated = recording.result.topic_digests
-        for name in ("/train/step", "/eval/step"):
+        for name in schema.STEP_TOPICS:
             counts[name] = recording.result.messages.get(name, 0)
             digests |= {each: digest for each, digest in stated.items() if each == name}
     expected = {

@@ -128,8 +128,7 @@ class _Block(NamedTuple):
     rows: NDArray[np.void]
     """[steps of each environment, environments]."""
     resets: NDArray[np.void]
-    reset_at: tuple[Ints, Ints]
-    """The place in `rows` that each reset comes before."""
+    """[like `rows`]: the last reset before each step; zeros where there was none."""
     was_reset: Flags
     """[like `rows`]: whether a reset came before a step."""
     only_reset: Flags
@@ -139,6 +138,25 @@ class _Block(NamedTuple):
     def numbers(self) -> range:
         """The numbers of the steps."""
         return range(self.first, self.first + self.rows.size)
+
+
+class _Resets:
+    """The resets of a phase, taken once in their order: memory is bounded, however many there are."""
+
+    def __init__(self, table: TopicChunks) -> None:
+        self._blocks = table.rows()
+        self.left = np.empty(0, table.row_dtype)
+        """What was read and not yet taken."""
+
+    def before(self, step: int) -> Iterator[NDArray[np.void]]:
+        """Yield the next resets in blocks, up to the first at this step or a later one."""
+        while len(self.left) or len(block := next(self._blocks, self.left)):
+            resets = self.left if len(self.left) else block
+            stop = int(np.argmax(np.append(resets["step"] >= step, True)))
+            self.left = resets[stop:]
+            yield resets[:stop]
+            if len(self.left):
+                return
 
 
 class _PhaseCheck:
@@ -162,9 +180,11 @@ class _PhaseCheck:
         self._findings = Findings()
         self._has_states = recording.has_states
         self._start = least_number(recording.spaces["observation"]) if self._has_states else 0
-        self._resets = self._own.resets.rows()
-        self._waiting = np.empty(0, self._own.resets.row_dtype)
-        """The resets that were read, and come after the steps so far."""
+        self._resets, self._numbered_resets = _Resets(self._own.resets), _Resets(self._own.resets)
+        """To find where environments were reset, and to compare with the episodes that follow from it."""
+        self._endings = self._own.episodes.blocks()
+        self._silent_ends, self._last_end = np.empty(0, np.int64), -1
+        """Of the last block of `_endings`: the steps that ended an episode silently, and its last step."""
 
     def check(self) -> Findings:
         """Check all steps, and what comes after the last."""
@@ -184,22 +204,18 @@ class _PhaseCheck:
         return self._findings
 
     def _block(self, first: int, rows: NDArray[np.void]) -> _Block:
-        resets, n = self._resets_before(first + rows.size), self._n
-        step, environment = resets["step"], resets["environment"].astype(np.int64)
-        if ((environment >= self._recording.own_environments) | (step % n != 0) | (step < first)).any():
-            raise Inconsistent(f"/{self._phase}/reset: found resets out of order, or of no environment")
-        at, was_reset = ((step - first) // n, environment % n), np.zeros(rows.shape, np.bool_)
-        was_reset[at] = True
-        return _Block(first, rows, resets, at, was_reset, rows["t"] == RESET_ONLY)
+        resets, was_reset = np.zeros(rows.shape, self._resets.left.dtype), np.zeros(rows.shape, np.bool_)
+        for own in self._resets.before(first + rows.size):
+            step, is_unknown = own["step"], own["environment"] >= self._recording.own_environments
+            if (is_unknown | (step % self._n != 0) | (step < first)).any():
+                raise self._out_of_order()
+            at = self._places(first, own)
+            resets[at], was_reset[at] = own, True  # of several resets at one place the last counts
+        return _Block(first, rows, resets, was_reset, rows["t"] == RESET_ONLY)
 
-    def _resets_before(self, step: int) -> NDArray[np.void]:
-        """Return the next resets, up to the first at this step or a later one."""
-        while not (later := self._waiting["step"] >= step).any():
-            if (block := next(self._resets, None)) is None:
-                break
-            self._waiting = np.concatenate([self._waiting, block])
-        resets, self._waiting = np.split(self._waiting, [np.argmax(np.append(later, True))])
-        return resets
+    def _places(self, first: int, resets: NDArray[np.void]) -> tuple[Ints, Ints]:
+        """Return the places of resets among the rows of a block that begins with step `first`."""
+        return (resets["step"] - first) // self._n, resets["environment"].astype(np.int64) % self._n
 
     def _check_times(self, b: _Block) -> None:
         """Compare the times of steps: each step of either phase takes one tick, so they increase."""
@@ -232,7 +248,9 @@ class _PhaseCheck:
         )
         self._compare("step", b.numbers, "t", rows["t"], episodes.t)
         self._compare("step", b.numbers, "episode", rows["episode"], episodes.number)
-        self._compare("reset", b.resets["reset"], "episode", b.resets["episode"], episodes.number[b.reset_at])
+        for resets in self._numbered_resets.before(b.numbers.stop):
+            expected = episodes.number[self._places(b.first, resets)]
+            self._compare("reset", resets["reset"], "episode", resets["episode"], expected)
         self._check_observations(b)
         self._count_beginnings(b, np.vstack([self._over, over[:-1]]))
         self._compare_episodes(episodes.ended)
@@ -243,12 +261,14 @@ class _PhaseCheck:
     def _is_over(self, b: _Block) -> Flags:
         """Return where a game of several agents ended without the end of any: its episode record says so."""
         is_over = np.zeros(b.rows.shape, np.bool_)
-        if self._learners > 1 and self._n == 1:
-            for block in self._own.episodes.blocks(self._episodes.ended):
-                silent = block["last_step"][~(block["terminated"] | block["truncated"])]
-                is_over[silent[(silent >= b.first) & (silent < b.numbers.stop)] - b.first] = True
-                if block["last_step"][-1] >= b.numbers.stop:
-                    break
+        while self._learners > 1 and self._n == 1:
+            begin, stop = np.searchsorted(self._silent_ends, [b.first, b.numbers.stop])
+            is_over[self._silent_ends[begin:stop] - b.first] = True
+            if self._last_end >= b.numbers.stop or (block := next(self._endings, None)) is None:
+                break
+            is_silent = ~(block["terminated"] | block["truncated"])
+            self._silent_ends = np.sort(block["last_step"][is_silent].astype(np.int64))
+            self._last_end = int(block["last_step"][-1])
         return is_over
 
     def _check_observations(self, b: _Block) -> None:
@@ -256,8 +276,9 @@ class _PhaseCheck:
         rows, names = b.rows, b.rows.dtype.names or ()
         if self._has_states:
             after, given = rows["next_state"].astype(np.int64), np.zeros(rows.shape, np.int64)
-            # Of several resets at one place the last counts.
-            given[b.reset_at] = b.resets["observation"].reshape(len(b.resets)).astype(np.int64) - self._start
+            given[b.was_reset] = (
+                b.resets["observation"][b.was_reset].reshape(-1).astype(np.int64) - self._start
+            )
             before = np.vstack([self._observed, after[:-1]])
             expected = np.where(b.was_reset & ~b.only_reset, given, before)
             if b.only_reset.any():
@@ -265,9 +286,7 @@ class _PhaseCheck:
             self._compare("step", b.numbers, "state", rows["state"], expected)
             self._compare("step", b.numbers, "next_state", after, np.where(b.only_reset, given, after))
         elif b.only_reset.any() and "next_observation" in names:
-            observed = np.zeros(rows.shape, b.resets.dtype["observation"])
-            observed[b.reset_at] = b.resets["observation"]
-            same = _equal(rows["next_observation"][b.only_reset], observed[b.only_reset])
+            same = _equal(rows["next_observation"][b.only_reset], b.resets["observation"][b.only_reset])
             if not same.all():
                 number = b.numbers[np.flatnonzero(b.only_reset)[np.argmin(same)]]
                 expected_value = "that of the reset before it"
@@ -326,16 +345,17 @@ class _PhaseCheck:
 
     def _finish(self, steps: int) -> None:
         """Check the resets after the last step, and that there is nothing else."""
-        rest = self._resets_before(steps + 1)
-        environment = rest["environment"].astype(np.int64)
-        if (environment >= self._recording.own_environments).any() or (rest["step"] != steps).any():
-            raise Inconsistent(f"/{self._phase}/reset: found resets out of order, or of no environment")
-        environment %= self._n
-        own = np.array(list(dict.fromkeys(environment.tolist())), np.int64)
-        self._compare_episodes(self._episodes.interrupt(steps, own))
-        self._compare("reset", rest["reset"], "episode", rest["episode"], self._episodes.episode[environment])
+        for resets in self._resets.before(steps + 1):
+            environment = resets["environment"].astype(np.int64)
+            if (environment >= self._recording.own_environments).any() or (resets["step"] != steps).any():
+                raise self._out_of_order()
+            environment %= self._n
+            first_of_each = np.sort(np.unique(environment, return_index=True)[1])
+            self._compare_episodes(self._episodes.interrupt(steps, environment[first_of_each]))
+            expected = self._episodes.episode[environment]
+            self._compare("reset", resets["reset"], "episode", resets["episode"], expected)
         has_more = {
-            "reset": len(self._waiting) > 0,
+            "reset": len(self._resets.left) > 0,
             "episode": self._own.episodes.count() > self._episodes.ended,
         }
         for name, found in has_more.items():
@@ -347,6 +367,9 @@ class _PhaseCheck:
         if (wrong := np.flatnonzero(found != expected)).size:
             k = wrong[0]
             raise self._wrong(what, numbers[k], name, found.flat[k], expected.flat[k])
+
+    def _out_of_order(self) -> Inconsistent:
+        return Inconsistent(f"/{self._phase}/reset: found resets out of order, or of no environment")
 
     def _wrong(self, what: str, number: int, name: str, found: object, expected: object) -> Inconsistent:
         return Inconsistent(

@@ -160,7 +160,7 @@ class _Salvage:
 
     Args:
         run: its metadata record `run`.
-        stated: messages of each topic, as the run states them; its result is believed rather.
+        stated: messages of each topic, as the run states them; a result in the file replaces these numbers.
     """
 
     def __init__(
@@ -270,8 +270,8 @@ def _missing(stated: Mapping[str, int], found: Mapping[str, int]) -> dict[str, l
 
 def _recorded_counts(summary: Summary) -> dict[str, int]:
     """Return how many messages of each topic were recorded; steps may have been left out."""
-    is_whole = summary.steps_recorded
-    return {name: n for name, n in summary.messages.items() if is_whole or not name.endswith("/step")}
+    left_out = () if summary.steps_recorded else schema.STEP_TOPICS
+    return {name: n for name, n in summary.messages.items() if name not in left_out}
 
 
 _LIKE_A_CHUNK: Final = re.compile(

@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 
 from runner.errors import RecordingError
+from runner.recording import schema
 from runner.recording.digest import ContentHash, combined_digest
 from runner.recording.integrity import check_up_to_cut
 from runner.recording.reader import Recording, open_recording
@@ -120,13 +121,16 @@ def continues(path: Path, earlier: Path) -> bool:
             for records in later.table(topic).records() if left and topic.digested else ():
                 seen.update(topic, memoryview(records)[:left])
                 left -= min(left, len(records))
+                if not left:
+                    break
     return seen.topics() == expected.topics()
 
 
 def _is_stated(result: Summary, seen: dict[str, str]) -> bool:
     """Return whether a result states these digests; those of steps that are not recorded are not compared."""
     if not result.steps_recorded:
-        seen = seen | {name: own for name, own in result.topic_digests.items() if name.endswith("/step")}
+        stated = result.topic_digests
+        seen = seen | {name: stated[name] for name in schema.STEP_TOPICS if name in stated}
     return dict(result.topic_digests) == seen and combined_digest(seen) == result.content_digest
 
 

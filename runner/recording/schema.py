@@ -423,6 +423,8 @@ UNIFORM_TOPICS: Final = (*ALL_BLOCK_TOPICS, *EXTRA_TOPICS)
 
 STEP_MESSAGES: Final = (STEP, TRANSITION)
 """The messages that are a step."""
+STEP_TOPICS: Final = (TRAIN_STEP.name, EVAL_STEP.name)
+"""The names of the topics that a run may leave out."""
 PHASES: Final = {"train": (TRAIN_STEP, TRAIN_EPISODE), "eval": (EVAL_STEP, EVAL_EPISODE)}
 """The step and the episode topic of each phase of a job."""
 PHASE_NAMES: Final = {"train": "training", "eval": "evaluation"}

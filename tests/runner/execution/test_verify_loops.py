@@ -11,12 +11,16 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import Autoreset, TransformReward
 
 import runner
+from runner.errors import RecordingError
 from runner.execution.verify import verify
 from runner.recording import schema
 from runner.recording.blocks import message_record
+from runner.recording.consistency import check_phase
 from runner.recording.digest import ContentHash
 from runner.recording.messages import encode
 from runner.recording.reader import open_recording
+from runner.recording.rewriting import content_of
+from runner.recording.topic_chunks import TopicChunks
 from tests.runner.altering import altered
 from tests.runner.loops.making import Leaving, Rooms, drive, make, parallel, play
 
@@ -261,3 +265,62 @@ def test_descriptions_of_a_loop_that_cannot_be_true_are_refused(tmp_path):
     claimed = {"compression": "zstd", "level": 1, "index": "message", "steps": "all"}
     found = verify(stating("config", recording=claimed, y=0))
     assert "/train/step: found actions alone, expected whole steps" in found.finding
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 2])
+def test_of_several_resets_before_a_step_the_wrong_one_is_named(tmp_path, wrong):
+    envs = SyncVectorEnv([lambda: make("FrozenLake-v1")] * 2)
+    with runner.record_vector(envs, tmp_path) as rec:
+        drive(rec, 20)
+        for _ in range(3):
+            rec.reset(seed=3)
+        drive(rec, 20)
+        rec.reset()
+        rec.reset()
+    with open_recording(rec.run.recording) as recording:
+        resets = recording.train.resets.array()
+    (several,) = (step for step in np.unique(resets["step"]) if np.sum(resets["step"] == step) >= 6)
+    number = int(resets["reset"][resets["step"] == several][2 * wrong])
+    change = setting("episode", number, lambda value: value + 1)
+    assert verify(forged(rec.run.recording, tmp_path / "same.mcap")).sound
+    made = forged(rec.run.recording, tmp_path / "x.mcap", {"/train/reset": change})
+    assert f"/train/reset, reset {number}: episode: found" in verify(made).finding
+
+
+@pytest.mark.parametrize("topic", ["/train/episode", "/train/reset"])
+def test_each_message_is_compared_in_a_time_that_does_not_grow(tmp_path, monkeypatch, topic):
+    read = []
+
+    def counted(original):
+        def blocks(self, *arguments):
+            for block in original(self, *arguments):
+                if self.topic.name == topic:
+                    read.append(len(block))
+                yield block
+
+        return blocks
+
+    with runner.record_parallel(Leaving(), tmp_path, chunk_steps=256) as rec:
+        parallel(rec, 700)
+        for _ in range(300):
+            rec.reset()
+    with open_recording(rec.run.recording) as recording:
+        total = recording.table(recording.topic(topic)).count()
+        monkeypatch.setattr(TopicChunks, "blocks", counted(TopicChunks.blocks))
+        check_phase(recording, "train", complete=True)
+        assert total <= sum(read) <= 4 * total
+
+
+def test_the_digests_of_other_topics_than_steps_are_compared_though_steps_are_left_out(tmp_path):
+    with runner.record(make("CartPole-v1"), tmp_path, steps="none") as env:
+        for _ in play(env, 100):
+            pass
+
+    def add(entries):
+        result = json.loads(entries["json"])
+        digests = result["topic_digests"] | {"/other/step": "00" * 32}
+        return {"json": json.dumps(result | {"topic_digests": digests})}
+
+    assert content_of(env.run.recording)
+    with pytest.raises(RecordingError, match="other content than the digest"):
+        content_of(altered(env.run.recording, tmp_path / "x.mcap", None, None, result=add))
