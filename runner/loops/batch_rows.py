@@ -89,6 +89,8 @@ class BatchRows(VectorRows):
                     unknown = np.empty(len(at), self._resets.dtype["observation"])
                     put_unknown(self._leaves[0], unknown)
                     self._observations[row + at, which] = unknown
+            if self._are_bytes:
+                self._hold(*own[part].ravel(), *seen[part].ravel())
             self._filled += count
             done += count
             if self._filled >= self._room:

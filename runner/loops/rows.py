@@ -72,7 +72,7 @@ class Rows:
         self._state = np.zeros(self._n, np.int64)
         """The observations before the first row, where both spaces are discrete."""
         self._last_position = 0
-        """The steps of the run when the last step of the phase was taken."""
+        """The steps of the run up to the last committed row: of this phase, in a vector of either."""
         self._starts: tuple[int, ...] = ()
         """The least observation and action, where both spaces are discrete."""
         self.reshape(described)
@@ -93,7 +93,7 @@ class Rows:
 
     @property
     def filled(self) -> int:
-        """Steps of single environments that the recorder does not have yet."""
+        """Rows of single environments that the recorder does not have yet, also those that only reset one."""
         return self._filled * self._n
 
     @property

@@ -147,14 +147,14 @@ class VectorRows(Rows):
 
     def _add_resets(self, rows: Ints | int, which: Ints, observations: Array) -> None:
         """Put down resets of environments before these rows, without seeds."""
+        if self._are_bytes:
+            self._hold(*observations)
         start, self._waiting = self._waiting, self._waiting + len(which)
         while self._waiting > len(self._resets):
             self._resets = np.concatenate([self._resets, np.zeros_like(self._resets)])
         added = self._resets[start : self._waiting]
         added["row"], added["environment"], added["observation"] = rows, which, observations
         self.resets += len(which)
-        if self._are_bytes:
-            self._hold(*observations)
 
     def commit(self) -> None:
         """Make the records of what was put down and hand them to the recorder."""

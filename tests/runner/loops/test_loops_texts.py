@@ -23,6 +23,7 @@ from tests.runner.loops.talking import ENVIRONMENTS, MAKERS, said
 from tests.runner.replay.varied import SPACES, Varied
 
 STEPS = 300
+TEXTS = ("observation", "action")
 
 
 def talk(envs, steps=STEPS):
@@ -202,6 +203,20 @@ def test_long_texts_are_written_before_the_block_is_full(tmp_path):
     with open_recording(envs.run.recording) as recording:
         found = texts(recording, "observation", "next_observation")
     assert found == [f"{t}{i}{long}" for t in range(6) for i in range(ENVIRONMENTS)]
+
+
+@pytest.mark.parametrize("field", ["observation", "action"])
+def test_long_texts_in_batches_are_written_before_the_block_is_full(field, tmp_path):
+    long, none = [["ab" * 250_000] * ENVIRONMENTS], np.zeros((1, ENVIRONMENTS))
+    with runner.record_batches(talking.make(), tmp_path) as rec:
+        rec.reset(["begin"] * ENVIRONMENTS)
+        for _ in range(8):
+            seen, done = (long if field == name else [["b"] * ENVIRONMENTS] for name in TEXTS)
+            rec.batch(seen, done, none, none)
+            assert rec._rows.filled <= 3 * ENVIRONMENTS
+    with open_recording(rec.run.recording) as recording:
+        (found,) = set(texts(recording, field, field.replace("obs", "next_obs")))
+    assert found == long[0][0]
 
 
 def test_texts_of_a_game_are_read_back_and_reproduced(tmp_path):
